@@ -12,7 +12,8 @@ PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
 SAME_CAR_RANGES = {"wheelbase": (1.05, "m"), "mass": (1.25, "kg")}
 """Value -> factor by which it may differ for one car, and its unit.
 
-Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % of a small car's mass.
+Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % of a small car's
+mass.
 """
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 from vehest.data.derived import WHEELS, AccelerationFromSpeed
 
-SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate
+# cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below
+# half of that rate
+SHARE_OF_RATE = 0.2
 
 UNKNOWN = {
     "wheel_radius": "rolling radius of the tyres [m]",
@@ -46,7 +48,9 @@ class Derivation:
         }
 
     def in_words(self) -> str:
-        """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel (ratio: of …)``."""
+        """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel
+        (ratio: of …)``.
+        """
         entries = ", ".join(
             "{" + ", ".join(f"{key}: {_as_text(value)}" for key, value in entry.items()) + "}"
             for entry in self.transforms
@@ -60,7 +64,10 @@ class Derivation:
 def derivation_of(
     channel: str, channels: Collection[str], gappy: Collection[str], rate_hz: float
 ) -> Derivation | None:
-    """Derivation of a missing channel from those that are there, some with gaps; None where nothing makes it."""
+    """Derivation of a missing channel from those that are there, some with gaps.
+
+    None where nothing makes it.
+    """
     wheels = tuple(name for wheel in WHEELS if (name := f"wheel_speed_{wheel}") in channels)
     if channel == "vx" and wheels:
         return Derivation(wheels, ({"name": "speed_from_wheels", "wheel_radius": None},))

@@ -1,7 +1,8 @@
 """Errors that a user can act on; each message is one line that names the cause and the remedy.
 
-Functions that read a file raise `MissingError` where it is not there, and `DataError` where it is damaged, more than the limits or lacks
-something. Functions that take plain values of a configuration (``…_from_config``, settings) raise `ConfigurationError`.
+Functions that read a file raise `MissingError` where it is not there, and `DataError` where it is
+damaged, more than the limits or lacks something. Functions that take plain values of a
+configuration (``…_from_config``, settings) raise `ConfigurationError`.
 """
 
 from __future__ import annotations
@@ -71,13 +72,17 @@ def closest(name: str, choices: Iterable[str]) -> str:
 
 
 def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
-    """What was probably meant by an unknown name, to append to a message; empty if no choice is close."""
+    """What was probably meant by an unknown name, to append to a message.
+
+    Empty if no choice is close.
+    """
     close = closest(name, choices)
     return f"; did you mean '{prefix}{close}'?" if close else ""
 
 
 def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]]) -> str:
-    """Message on an option that a family of estimators does not have, with the one that was probably meant.
+    """Message on an option that a family of estimators does not have, with the one that was
+    probably meant.
 
     Parameters
     ----------
@@ -114,7 +119,9 @@ def _spelling(name: str) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Text from a file as it can be shown: control characters but those to keep, and bytes that are no UTF-8, as escapes."""
+    """Text from a file as it can be shown: control characters but those to keep, and bytes that are
+    no UTF-8, as escapes.
+    """
     return "".join(
         character
         if is_printable(character) or character in keep
@@ -124,5 +131,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def is_printable(character: str) -> bool:
-    """Whether a character shows as itself: none that controls a terminal, changes the direction of writing, or has no meaning."""
+    """Whether a character shows as itself: none that controls a terminal, changes the direction of
+    writing, or has no meaning.
+    """
     return unicodedata.category(character) not in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}

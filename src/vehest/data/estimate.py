@@ -38,11 +38,13 @@ QUANTITIES: dict[str, str] = {
     "health": "1",
     "health_reason": "1",
 }
-"""Quantities of an estimate, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
-axle's force per slip angle where there is none, ``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
-innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it. ``band_vy`` and ``band_sideslip`` are
-half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number
-(`vehest.trust`)."""
+"""Quantities of an estimate, with units. ``rim_speed`` is the driven wheels' angular speed times
+their radius; a cornering stiffness is an axle's force per slip angle where there is none,
+``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
+innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at
+it. ``band_vy`` and ``band_sideslip`` are half widths of the calibrated 90 % band, ``health`` is 0
+(valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number (`vehest.trust`).
+"""
 
 IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "band_sideslip"}
 """Columns of written tables in degrees -> the quantity [rad] that each repeats for people."""
@@ -65,8 +67,9 @@ def number_cell(value: float) -> str:
 class Estimate(TimeSeries):
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
-    NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`: a quantity is unknown or of another
-    length, the covariance is not of shape (T, n, n), or its rows have no n different names.
+    NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`:
+    a quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its
+    rows have no n different names.
     """
 
     recording_id: str  # the recording it was made from
@@ -99,7 +102,8 @@ class Estimate(TimeSeries):
         ):
             actual = f"not {shape} and ({', '.join(self.covariance_of)})"
             raise ValueError(
-                f"{subject}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {actual}"
+                f"{subject}: a covariance must be of shape (T, n, n) and covariance_of name n "
+                f"quantities, {actual}"
             )
 
     @property
@@ -130,19 +134,23 @@ class Estimate(TimeSeries):
         return drive_figure(recording, [self], start, stop)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
-        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate."""
+        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
+        NaN outside the estimate.
+        """
         index = self._held_index(times)
         return np.where(index < 0, np.nan, self[name][index])
 
     def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
-        """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate.
+        """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in
+        the future, NaN outside the estimate.
 
         Raises `DataError`: the estimate has no covariance of one of them.
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"
             raise DataError(
-                f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}"
+                f"estimator '{self.estimator}' gives a covariance of {have}, not of "
+                f"{', '.join(names)}"
             )
         index = self._held_index(times)
         rows = [self.covariance_of.index(name) for name in names]

@@ -33,7 +33,8 @@ _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.from
 
 @contextmanager
 def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]:
-    """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
+    """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it
+    is removed.
 
     A file that is there may always be replaced, a folder by ``replace_folder``.
     Raises `MissingError`: the disk is full or the folder cannot be written to.
@@ -68,7 +69,8 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
 def regular_file(path: Path) -> Path:
     """A file that can be read to its end: no folder, pipe or device.
 
-    Raises `MissingError`: there is nothing. Raises `DataError`: it is something else, or cannot be looked at.
+    Raises `MissingError`: there is nothing. Raises `DataError`: it is something else, or cannot be
+    looked at.
     """
     try:
         mode = os.stat(path).st_mode
@@ -95,8 +97,9 @@ def without_links(path: Path) -> Path:
 
 
 def file_name(name: str, ending: str = "") -> str:
-    """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
-    at 100 bytes, and the start of its hash added."""
+    """A name as one component of a path, another for another name: what is no letter, digit or one
+    of ``_-+=.`` is replaced, a name cut at 100 bytes, and the start of its hash added.
+    """
     component = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
     if component != name or not name or len(component.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
@@ -105,7 +108,10 @@ def file_name(name: str, ending: str = "") -> str:
 
 
 def no_room(error: BaseException) -> OSError | None:
-    """The full disk behind an error, also one that a library only words; None where the cause is another."""
+    """The full disk behind an error, also one that a library only words.
+
+    None where the cause is another.
+    """
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in NO_ROOM:
@@ -148,7 +154,10 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Remove files of ended writers in ``folder``; those of running processes stay. Returns their number."""
+    """Remove files of ended writers in ``folder``.
+
+    Those of running processes stay. Returns their number.
+    """
     leftovers = (
         [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)]
         if folder.is_dir()
@@ -160,7 +169,10 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def is_left_over(path: Path) -> bool:
-    """Whether ``path`` was written aside and its process has ended; of another host: whether it is a day old."""
+    """Whether ``path`` was written aside and its process has ended.
+
+    Of another host: whether it is a day old.
+    """
     if not path.name.startswith(ASIDE_PREFIX):
         return False
     process, host = match.groups() if (match := _ASIDE.match(path.name)) else ("0", None)
@@ -175,7 +187,10 @@ def is_left_over(path: Path) -> bool:
 
 
 def aside_of(path: Path, name: str = "") -> Path:
-    """A free place beside ``path`` for this process, for ``path`` itself or another name; files that stay there are removed later."""
+    """A free place beside ``path`` for this process, for ``path`` itself or another name.
+
+    Files that stay there are removed later.
+    """
     return path.with_name(
         f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}"
     )
@@ -193,7 +208,8 @@ def sha256_of(path: Path) -> str:
 
 
 def stamp_of(*paths: Path) -> str:
-    """Hash of names, sizes, times and inodes of files and of all files below folders, but for compiled code; links are followed.
+    """Hash of names, sizes, times and inodes of files and of all files below folders, but for
+    compiled code; links are followed.
 
     Times of inodes show files that were replaced by others of the same size and date.
     """
@@ -219,7 +235,9 @@ def stamp_of(*paths: Path) -> str:
 
 @cache
 def _host() -> str:
-    """Start of a hash of this host's name, since process numbers mean nothing on another host that shares the folder."""
+    """Start of a hash of this host's name, since process numbers mean nothing on another host that
+    shares the folder.
+    """
     return hashlib.sha256(socket.gethostname().encode("utf-8", "surrogateescape")).hexdigest()[:8]
 
 

@@ -1,4 +1,6 @@
-"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one another."""
+"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one
+another.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,10 @@ class FoldsFile:
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
-    """The blocks of recordings, each with the span that names it, in order; `DataError` where laps need a missing speed or yaw rate."""
+    """The blocks of recordings, each with the span that names it, in order.
+
+    `DataError` where laps need a missing speed or yaw rate.
+    """
     blocks = []
     for span, recording in recordings:
         bounds = [recording.start_time, recording.end_time]
@@ -54,7 +59,8 @@ def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) ->
 def fold_of(
     blocks: Sequence[Span], folds: FoldsFile, fold: int, subject: str
 ) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
-    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
+    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and
+    folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
     Raises `ConfigurationError` where there is no such fold, or too few blocks to fill them.
@@ -66,7 +72,10 @@ def fold_of(
     dealt = np.minimum((middles / lengths.sum() * folds.number).astype(np.int64), folds.number - 1)
     empty = sorted(set(range(folds.number)) - set(dealt.tolist()))
     if empty:
-        problem = f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number {empty[0]} stays empty"
+        problem = (
+            f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number "
+            f"{empty[0]} stays empty"
+        )
         raise ConfigurationError(
             f"{subject}: {problem}; take fewer folds, or of: seconds with a shorter block_seconds"
         )
@@ -83,7 +92,11 @@ def fold_of(
 def _joined(
     blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float
 ) -> tuple[Span, ...]:
-    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has another role; dropped where that is all."""
+    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has
+    another role.
+
+    Dropped where that is all.
+    """
     joined: list[tuple[Span, int]] = []
     for block, block_role in zip(blocks, roles, strict=True):
         if joined and block_role == joined[-1][1] and _touch(joined[-1][0], block):

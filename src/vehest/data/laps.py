@@ -12,22 +12,29 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
 POINTS = 8192  # of the path at most
-LEAST_CORRELATION = 0.6  # between the curvatures of a lap and of the next; drivers take other lines, the course stays
-LEAST_SHARE_OF_BEST = 0.9  # of the best correlation, from which the shorter of two periods is taken: two laps repeat too
-MOST_TURN_OFF = 0.8  # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
-STEADY = 0.2  # spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
+# between the curvatures of a lap and of the next; drivers take other lines, the course stays
+LEAST_CORRELATION = 0.6
+# of the best correlation, from which the shorter of two periods is taken: two laps repeat too
+LEAST_SHARE_OF_BEST = 0.9
+# rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
+MOST_TURN_OFF = 0.8
+# spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
+STEADY = 0.2
 INCOMPLETE = 0.005  # share of a lap that a last one may lack and count as complete
-SEARCH = 0.04  # share of a lap by which the next boundary is looked for before and after where it is expected
+# share of a lap by which the next boundary is looked for before and after where it is expected
+SEARCH = 0.04
 
 
 def laps_of(recording: Recording) -> list[tuple[float, float]]:
-    """Start and stop of each complete lap [s], one after another; empty where nothing repeats, as in less than two laps.
+    """Start and stop of each complete lap [s], one after another; empty where nothing repeats, as
+    in less than two laps.
 
     The path is that of ``vx`` and ``yaw_rate``, driven forwards. The first lap begins where the
     recording does, wherever that is on the course.
 
     Args:
-        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks them.
+        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where
+            it lacks them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")
@@ -52,7 +59,8 @@ def _first_of(recording: Recording, *names: str) -> FloatArray:
     name = next((name for name in names if name in recording), None)
     if name is None:
         raise DataError(
-            f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps can be found"
+            f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps "
+            "can be found"
         )
     return np.nan_to_num(recording[name])
 
@@ -64,7 +72,10 @@ def _turns(turned: FloatArray) -> list[int]:
 
 
 def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
-    """Points after which the curvature repeats and the heading is the same again; None where that is never."""
+    """Points after which the curvature repeats and the heading is the same again.
+
+    None where that is never.
+    """
     correlation = _correlations(curvature)
     lags = np.arange(len(correlation))
     sums = np.concatenate([[0.0], np.cumsum(turned)])
@@ -82,7 +93,9 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
 
 
 def _correlations(samples: FloatArray) -> FloatArray:
-    """Pearson's correlation of samples with themselves some points later, for lags up to half of them."""
+    """Pearson's correlation of samples with themselves some points later, for lags up to half of
+    them.
+    """
     number = len(samples)
     size = 1 << (2 * number - 1).bit_length()
     spectrum = np.fft.rfft(samples, size)
@@ -104,7 +117,9 @@ def _correlations(samples: FloatArray) -> FloatArray:
 
 
 def _boundaries(curvature: FloatArray, period: int) -> list[int]:
-    """Points at which laps begin: each a period after the one before, moved to where the two laps fit best."""
+    """Points at which laps begin: each a period after the one before, moved to where the two laps
+    fit best.
+    """
     bounds = [0]
     reach = max(round(SEARCH * period), 1)
     while bounds[-1] + period < len(curvature):

@@ -34,7 +34,8 @@ HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 class Recording(TimeSeries):
     """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
-    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or a senseless rate, start or kind.
+    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or
+    a senseless rate, start or kind.
     """
 
     id: str  # name, unique within its data set
@@ -55,7 +56,8 @@ class Recording(TimeSeries):
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
             bounds = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
             raise DataError(
-                f"recording '{self.id}': the sampling rate must lie {bounds}, not at {self.rate_hz:g} Hz"
+                f"recording '{self.id}': the sampling rate must lie {bounds}, not at "
+                f"{self.rate_hz:g} Hz"
             )
         if not math.isfinite(self.start_time):
             raise DataError(
@@ -74,7 +76,8 @@ class Recording(TimeSeries):
         if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
             shapes = {name: samples.shape for name, samples in frozen.items()}
             raise DataError(
-                f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}"
+                f"recording '{self.id}': channels must hold samples and have one common length, "
+                f"not the shapes {shapes}"
             )
         object.__setattr__(self, "channels", frozen)
         object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
@@ -83,9 +86,13 @@ class Recording(TimeSeries):
             bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
             if len(bad):
                 first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
-                problem = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
+                problem = (
+                    f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} "
+                    f"between {first:.12g} s and {last:.12g} s"
+                )
                 fix = (
-                    "cut the range out (max_gap of the data set ends a recording there), or declare "
+                    "cut the range out (max_gap of the data set ends a recording there), or "
+                    "declare "
                     "the channel in 'gappy' if a gap means 'not measured'"
                 )
                 raise DataError(f"recording '{self.id}': channel '{name}' holds {problem}; {fix}")
@@ -101,7 +108,10 @@ class Recording(TimeSeries):
         return {name: CHANNELS[name].unit for name in self.channels}
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (T,). Raises `DataError`: the recording does not have it."""
+        """Samples of one channel, shape (T,).
+
+        Raises `DataError`: the recording does not have it.
+        """
         if name not in self.channels:
             raise DataError(
                 f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})"
@@ -122,7 +132,11 @@ class Recording(TimeSeries):
     def with_channels(
         self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None
     ) -> Recording:
-        """The same drive with channels (T,) replaced or added: gappy where one that they were made of is; None: as they were."""
+        """The same drive with channels (T,) replaced or added: gappy where one that they were made
+        of is.
+
+        None: as they were.
+        """
         gappy = self.gappy
         if made_of is not None:
             gappy = gappy | set(changed) if gappy & set(made_of) else gappy - set(changed)
@@ -136,12 +150,16 @@ class Recording(TimeSeries):
         return self.select(measured)
 
     def cut(self, start: float, stop: float) -> Recording:
-        """The samples taken in [start, stop) seconds. Raises `DataError`: the range holds no samples."""
+        """The samples taken in [start, stop) seconds.
+
+        Raises `DataError`: the range holds no samples.
+        """
         first, last = self.index_range(start, stop)
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
             raise DataError(
-                f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s"
+                f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and "
+                f"{stop:.12g} s"
             )
         return self.part(slice(first, last))
 
@@ -176,7 +194,9 @@ class Recording(TimeSeries):
         return drive_figure(self, estimates, start, stop)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
-        """First index and end index of the samples taken in [start, stop), clipped to the recording."""
+        """First index and end index of the samples taken in [start, stop), clipped to the
+        recording.
+        """
         tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
         return math.ceil(min(max(first, 0.0), len(self))), math.ceil(min(max(end, 0.0), len(self)))
@@ -196,7 +216,8 @@ def joined(parts: Sequence[Recording]) -> Recording:
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
     """How far from a sample a time may lie and still be that sample's, in samples.
 
-    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s (unix time) 0.24 µs.
+    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s
+    (unix time) 0.24 µs.
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)
@@ -214,7 +235,9 @@ def _immutable(samples: FloatArray) -> FloatArray:
 
 
 def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
-    """Ranges of indices that divide so many samples into parts of about one length, none longer than `LONGEST_PART`."""
+    """Ranges of indices that divide so many samples into parts of about one length, none longer
+    than `LONGEST_PART`.
+    """
     edges = (
         np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1)
         .astype(int)

@@ -29,7 +29,8 @@ def resampled(
     """
     if recording.rate_hz < min(rate_hz * (1 - 1e-9), slowest_hz):
         raise DataError(
-            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed"
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the "
+            f"{rate_hz:g} Hz needed"
         )
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)
@@ -43,7 +44,10 @@ def resampled_parts(
     *,
     slowest_hz: float = math.inf,
 ) -> Iterator[Recording]:
-    """`resampled` for a recording that comes in parts, to the same bits; a preparation with other transforms needs it whole."""
+    """`resampled` for a recording that comes in parts, to the same bits.
+
+    A preparation with other transforms needs it whole.
+    """
     if preparation["transforms"]:
         parts = [joined(list(parts))]
     pending: list[Recording] = []

@@ -1,8 +1,9 @@
 """Validates plain values, as files hold them, against the dataclasses that describe them.
 
-Types are strict: a number is not taken from text, nor a truth value from a number, nor a whole number from one with a point.
-Keys that the dataclass does not have are refused; one that takes further keys has ``__pydantic_config__ = FURTHER_KEYS``. In
-``Annotated[float, "a number up to 5"]`` the text replaces what messages say of the type.
+Types are strict: a number is not taken from text, nor a truth value from a number, nor a whole
+number from one with a point. Keys that the dataclass does not have are refused; one that takes
+further keys has ``__pydantic_config__ = FURTHER_KEYS``. In ``Annotated[float, "a number up to 5"]``
+the text replaces what messages say of the type.
 """
 
 from __future__ import annotations
@@ -39,11 +40,13 @@ def validated(
     """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
     Args:
-        kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or ``ValueError``.
+        kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
+            ``ValueError``.
         subject: first words of a message, ``"'model.yaml'"``; may be empty.
         group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
 
-    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value makes no sense.
+    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value
+    makes no sense.
     """
     above = [group] if group else []
     try:
@@ -57,7 +60,11 @@ def validated(
 
 
 def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
-    """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups in them; `ConfigurationError`."""
+    """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups
+    in them.
+
+    `ConfigurationError`.
+    """
     return validated(kind, _without_names(config, kind), "", error=ConfigurationError, group=group)
 
 
@@ -74,28 +81,38 @@ def _without_names(content: Any, kind: Any) -> Any:
 
 
 def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) -> int:
-    """The version of a file's layout, as the file states it; `DataError` unless it is between ``oldest`` and ``newest``."""
+    """The version of a file's layout, as the file states it.
+
+    `DataError` unless it is between ``oldest`` and ``newest``.
+    """
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise DataError(f"{subject}: format must be a whole number, not {str(version)[:40]!r}")
     if version > newest:
         raise DataError(
-            f"{subject} was written by a newer vehest (format {str(version)[:20]}, this one knows {newest}); update vehest"
+            f"{subject} was written by a newer vehest (format {str(version)[:20]}, this one knows "
+            f"{newest}); update vehest"
         )
     if version < oldest:
         raise DataError(
-            f"{subject} was written by an older vehest (format {version}, this one reads {oldest} to {newest}); make it again"
+            f"{subject} was written by an older vehest (format {version}, this one reads {oldest} "
+            f"to {newest}); make it again"
         )
     return version
 
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Validates lists of a dataclass: pydantic takes a configuration for what holds a dataclass, not for the dataclass itself."""
+    """Validates lists of a dataclass: pydantic takes a configuration for what holds a dataclass,
+    not for the dataclass itself.
+    """
     return TypeAdapter(list[kind], config={**FURTHER_KEYS, "extra": "forbid"})
 
 
 def _plain(value: Any, path: list[str]) -> Any:
-    """Content with text as keys and lists for tuples; a ValueError where a value is not plain, such as a date, or it nests too deep."""
+    """Content with text as keys and lists for tuples.
+
+    A ValueError where a value is not plain, such as a date, or it nests too deep.
+    """
     if len(path) > DEEPEST:
         raise ValueError(f"{path[0]} nests deeper than {DEEPEST} levels")
     if isinstance(value, dict):
@@ -114,11 +131,13 @@ def _plain(value: Any, path: list[str]) -> Any:
         else f"no plain value but a {type(value).__name__}"
     )
     raise ValueError(
-        f"{'.'.join(path) or 'it'} is {problem}, {_shortened(value)}; put it in quotes if it is text"
+        f"{'.'.join(path) or 'it'} is {problem}, {_shortened(value)}; put it in quotes if it is "
+        "text"
     )
 
 
-# Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot hold: characters of plane 16,
+# Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot
+# hold: characters of plane 16,
 # which is for private use, replace them while content is validated.
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _REPLACED = {code: code + 0x100000 for code in range(0xD800, 0xE000)}
@@ -208,7 +227,9 @@ def _shortened(value: Any) -> str:
 
 
 def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
-    """Keys and indices of one of pydantic's locations, which also name choices of unions, as far as the content has them."""
+    """Keys and indices of one of pydantic's locations, which also name choices of unions, as far as
+    the content has them.
+    """
     path: list[str | int] = []
     for part in loc:
         is_item = isinstance(content, list) and isinstance(part, int) and part < len(content)

@@ -1,4 +1,6 @@
-"""Reads splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions, percentages, laps and folds."""
+"""Reads splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions,
+percentages, laps and folds.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,16 @@ Catalogue = Callable[
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
-LEAST_SECONDS = 3.0  # of a piece of limited minutes; shorter ones hold no window after the start that is not scored
+# of a piece of limited minutes; shorter ones hold no window after the start that is not scored
+LEAST_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
 class RangeFile:
-    """A range of conf/split/*.yaml: a recording or a pattern of several; start to stop [s or %] or some laps; else raises `ValueError`."""
+    """A range of conf/split/*.yaml: a recording or a pattern of several.
+
+    Start to stop [s or %] or some laps; else raises `ValueError`.
+    """
 
     dataset: str | None = None
     recording: str | None = None
@@ -53,8 +59,10 @@ class RangeFile:
 
 @dataclass(frozen=True)
 class SplitFile:
-    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in all, as if no more had been recorded with
-    a reference; ``minutes_at`` is the share of them after which these begin."""
+    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in
+    all, as if no more had been recorded with a reference; ``minutes_at`` is the share of them after
+    which these begin.
+    """
 
     name: str = "unnamed"
     title: str | None = None
@@ -85,7 +93,10 @@ def _read(config: Any) -> SplitFile:
 
 
 def _spelt_out(config: Mapping[str, Any], subject: str) -> dict[str, Any]:
-    """Roles in short (``60 %``, ``last lap``) as ranges of all recordings; percentages follow one another, training first."""
+    """Roles in short (``60 %``, ``last lap``) as ranges of all recordings.
+
+    Percentages follow one another, training first.
+    """
     done = 0.0
 
     def ranges(role: str, entries: Any) -> Any:
@@ -102,7 +113,10 @@ def _spelt_out(config: Mapping[str, Any], subject: str) -> dict[str, Any]:
             return [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
         if LAPS.fullmatch(entries) is not None:
             return [{"recordings": "*", "laps": entries}]
-        expected = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
+        expected = (
+            'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not '
+            f"'{entries[:60]}'"
+        )
         raise ConfigurationError(f"{subject}: {role} must be {expected}")
 
     content = {key: value for key, value in config.items() if value is not None}
@@ -119,17 +133,25 @@ def _spelt_out(config: Mapping[str, Any], subject: str) -> dict[str, Any]:
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
     """Build a split from plain values, as conf/split/*.yaml holds them.
 
-    The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps or folds name or cut them.
+    The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps
+    or folds name or cut them.
 
-    Raises `ConfigurationError`: a key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a condition that
-    none meets; or one of them without a catalogue. Raises `DataError`: a recording lacks a channel that a condition looks at.
+    Raises `ConfigurationError`: a key is missing, misspelt or of the wrong type; a pattern that no
+    recording's id matches; a condition that none meets; or one of them without a catalogue. Raises
+    `DataError`: a recording lacks a channel that a condition looks at.
     """
     ranges = _Ranges(_read(config), catalogue)
     return ranges.limited(ranges.split())
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets that a split's plain values draw on, sorted; raises `ConfigurationError` where a range names none."""
+    """Names of the data sets that a split's plain values draw on, sorted.
+
+    Raises
+    ------
+    ConfigurationError
+        A range names none.
+    """
     file = _read(config)
     entries = [
         entry
@@ -142,7 +164,10 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on; it wraps around; ends of seconds are left out."""
+    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on.
+
+    It wraps around; ends of seconds are left out.
+    """
     total = _seconds_of(spans)
     begin = at * total
     upper = _between(spans, begin, min(begin + seconds, total))
@@ -186,7 +211,8 @@ class _Ranges:
             return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
             raise ConfigurationError(
-                f"{self._where}: folds make training, validation and test; leave train, validation and tests out"
+                f"{self._where}: folds make training, validation and test; leave train, validation "
+                "and tests out"
             )
         dataset = file.dataset_of()
         recordings = (
@@ -261,7 +287,8 @@ class _Ranges:
         match = LAPS.fullmatch(words)
         if match is None:
             raise ConfigurationError(
-                f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'"
+                f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not "
+                f"'{words[:60]}'"
             )
         end, number, first, last = match.groups()
         laps = laps_of(self._recording(dataset, name))
@@ -273,7 +300,8 @@ class _Ranges:
                 f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
             )
             raise ConfigurationError(
-                f"{self._where}: recording '{name}' has no '{words.strip()}': {problem}; name times instead"
+                f"{self._where}: recording '{name}' has no '{words.strip()}': {problem}; name "
+                "times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
 
@@ -296,7 +324,8 @@ class _Ranges:
                 [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
             )
             raise ConfigurationError(
-                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {available})"
+                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has "
+                f"{available})"
             )
         return names
 
@@ -304,7 +333,8 @@ class _Ranges:
         if dataset not in self._known:
             if self._catalogue is None:
                 raise ConfigurationError(
-                    f"{self._where}: its patterns and the like need the recordings of data set '{dataset}'"
+                    f"{self._where}: its patterns and the like need the recordings of data set "
+                    f"'{dataset}'"
                 )
             self._known[dataset] = self._catalogue(dataset)
         return self._known[dataset]

@@ -22,7 +22,8 @@ WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
 def check_name(name: str, subject: str) -> None:
-    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or an override.
+    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or
+    an override.
 
     It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
     with none of the last, and has `LONGEST_NAME` characters at most. It is no word or number of
@@ -30,8 +31,10 @@ def check_name(name: str, subject: str) -> None:
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
-            f"{subject}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
-            "'.', begin with none of the last two and not end with '.'; it becomes part of file names"
+            f"{subject}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' "
+            "and "
+            "'.', begin with none of the last two and not end with '.'; it becomes part of file "
+            "names"
         )
     if len(name) > LONGEST_NAME:
         raise ConfigurationError(
@@ -43,7 +46,8 @@ def check_name(name: str, subject: str) -> None:
         )
     if WINDOWS_DEVICE.fullmatch(name.partition(".")[0]):
         raise ConfigurationError(
-            f"{subject}: '{name}' is a device of Windows, not a file; add letters, such as car_{name}"
+            f"{subject}: '{name}' is a device of Windows, not a file; add letters, such as "
+            f"car_{name}"
         )
 
 
@@ -59,7 +63,8 @@ class Span:
     def __post_init__(self) -> None:
         if not self.start < self.stop:
             raise ConfigurationError(
-                f"span of recording '{self.recording}': start {self.start} s is not before stop {self.stop} s"
+                f"span of recording '{self.recording}': start {self.start} s is not before stop "
+                f"{self.stop} s"
             )
 
     def overlaps(self, other: Span) -> bool:
@@ -80,8 +85,8 @@ class Split:
 
     Without training and validation stretches it is for estimators that learn nothing.
 
-    Raises `ConfigurationError`: training without validation stretches or the other way round, no stretch at all, or a stretch that serves
-    two purposes.
+    Raises `ConfigurationError`: training without validation stretches or the other way round, no
+    stretch at all, or a stretch that serves two purposes.
     """
 
     name: str
@@ -101,7 +106,8 @@ class Split:
             check_name(name, f"split '{self.name}': test set")
             if name in (VALIDATION, TRAINING):
                 raise ConfigurationError(
-                    f"split '{self.name}': a test set cannot be called '{name}', as the {name} range is in metrics"
+                    f"split '{self.name}': a test set cannot be called '{name}', as the {name} "
+                    "range is in metrics"
                 )
             if not spans:
                 raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
@@ -117,7 +123,8 @@ class Split:
                         f"{role} and {other_role} share samples of recording '{span.recording}'"
                     )
                     raise ConfigurationError(
-                        f"split '{self.name}': {problem} ({span.describe()} and {other.describe()}); separate the ranges"
+                        f"split '{self.name}': {problem} ({span.describe()} and "
+                        f"{other.describe()}); separate the ranges"
                     )
 
     @property

@@ -1,4 +1,8 @@
-"""Reads YAML, JSON and CSV that describe something, within limits on length, nesting and repetition; damage is one line."""
+"""Reads YAML, JSON and CSV that describe something, within limits on length, nesting and
+repetition.
+
+Damage is one line.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +44,10 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str, subject: str) -> Any:
-    """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
+    """Plain values of YAML.
+
+    Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values.
+    """
     check_yaml_size(text, subject)
     try:
         return yaml.load(text, _Loader)
@@ -51,12 +58,16 @@ def parse_yaml(text: str, subject: str) -> Any:
         LookupError,
     ):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
         raise DataError(
-            f"{subject} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)"
+            f"{subject} cannot be read as YAML (a value is not what its tag, such as !!timestamp, "
+            "says)"
         ) from None
 
 
 def check_yaml_size(text: str, subject: str, max_values: int = MOST_VALUES) -> None:
-    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built; raises `DataError`."""
+    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built.
+
+    Raises `DataError`.
+    """
     try:
         try:
             is_larger = _is_larger(text, max_values, _Loader)
@@ -68,12 +79,15 @@ def check_yaml_size(text: str, subject: str, max_values: int = MOST_VALUES) -> N
         raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     if is_larger:
         raise DataError(
-            f"{subject} nests deeper than {DEEPEST} levels or holds more than {max_values} values, repeated ones included"
+            f"{subject} nests deeper than {DEEPEST} levels or holds more than {max_values} values, "
+            "repeated ones included"
         )
 
 
 def _is_larger(text: str, max_values: int, loader: Any) -> bool:
-    """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as aliases repeat it."""
+    """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as
+    aliases repeat it.
+    """
     sizes: dict[str | None, int] = {}  # of anchored collections
     begun: list[tuple[str | None, int]] = []
     count = 0
@@ -112,7 +126,10 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
-    """Rows of a CSV file whose first line names its columns, such as vehest writes them; `DataError` if one is missing or short."""
+    """Rows of a CSV file whose first line names its columns, such as vehest writes them.
+
+    `DataError` if one is missing or short.
+    """
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
         rows = list(reader)

@@ -30,7 +30,7 @@ class Interval:
     value: float  # the figure; of a difference, negative where the first has the lower loss
     low: float  # lower end of the 95 % interval
     high: float  # its upper end
-    p_value: float  # two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out
+    p_value: float  # two-sided, of no difference; below 0.05 where the interval excludes 0
     error: float = 0.0  # standard error
     dof: float = np.inf  # degrees of freedom of Student's t
 
@@ -46,7 +46,7 @@ class Difference:
 
     mean: Interval  # of their mean losses over all seeds and samples
     median: Interval  # of the medians over seeds of their mean losses over samples
-    root: Interval  # of the square roots of their mean losses, RMSEs where losses are squared errors; NaN where a loss is negative
+    root: Interval  # of the roots of their mean losses (RMSE); NaN where a loss is negative
 
 
 def difference_of_blocks(

@@ -1,6 +1,8 @@
-"""Calibrates a model between training and evaluation: bands, limits of samples and health, from its training and validation ranges.
+"""Calibrates a model between training and evaluation: bands, limits of samples and health, from its
+training and validation ranges.
 
-model, ranges -> estimates through whole ranges from a start of their own, as on a new drive -> `Trust` -> trust.yaml
+model, ranges -> estimates through whole ranges from a start of their own, as on a new drive ->
+`Trust` -> trust.yaml
 
 A calibration knows no evaluation's protocol, and no test range.
 """
@@ -35,7 +37,8 @@ def plan_calibrate(
     output: Path,
     cars: Mapping[str, CarValues],
 ) -> tuple[StagePlan, Callable[[Path], None]] | None:
-    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it; none where a split has no validation range.
+    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it; none where a split
+    has no validation range.
 
     ``cars`` are values of the cars of data sets.
     """
@@ -68,7 +71,10 @@ def _write(
     cars: Mapping[str, CarValues],
     folder: Path,
 ) -> None:
-    """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
+    """Calibrate a model.
+
+    Write trust.yaml into ``folder``, with the reason where bands or health are missing.
+    """
 
     def stretch(span: Span) -> Stretch:
         recording = read_recording(stored_recording(data, span)).cut(

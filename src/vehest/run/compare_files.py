@@ -1,6 +1,8 @@
-"""Scores estimates of any tool, and of vehest's models, beside each other on one recording with a reference.
+"""Scores estimates of any tool, and of vehest's models, beside each other on one recording with a
+reference.
 
-tables, models -> `Estimate` each -> scored where all of them have values, beside v = 0 and a static map -> ranking and verdict
+tables, models -> `Estimate` each -> scored where all of them have values, beside v = 0 and a static
+map -> ranking and verdict
 """
 
 from __future__ import annotations
@@ -128,10 +130,14 @@ def compare_files(
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
         for row in comparison["rows"]
     ]
-    scored = f"scored from {comparison['start']:.6g} to {comparison['stop']:.6g} s at {comparison['rate_hz']:g} Hz"
+    scored = (
+        f"scored from {comparison['start']:.6g} to {comparison['stop']:.6g} s at "
+        f"{comparison['rate_hz']:g} Hz"
+    )
     of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
-        f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
+        f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car "
+        "is slower at "
         f"{100 * comparison['share_below_min_speed']:.1f} % of the samples"
     )
     return comparison | {"findings": findings}, [
@@ -146,7 +152,8 @@ def _check_rows(names: Sequence[str]) -> None:
     for name, count in Counter(names).items():
         if count > 1:
             raise ConfigurationError(
-                f"{count} estimates are called '{name}'; rename a file or leave one out, since the name stands for the row"
+                f"{count} estimates are called '{name}'; rename a file or leave one out, since the "
+                "name stands for the row"
             )
 
 
@@ -170,14 +177,19 @@ def compare_estimates(
     wheelbase: float | None = None,
     trained_here: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
+    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a
+    static map.
 
-    Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m] (`min_sideslip_speed`). The map is fitted on one half
-    of the scored range and scored on the other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by models
-    that were trained on this recording, have rows, the last ones, and are left out of the verdict.
-    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and ``stop`` [s] and ``rate_hz`` of what is
-    scored, ``min_sideslip_speed`` [m/s] and ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
-    Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
+    Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m]
+    (`min_sideslip_speed`). The map is fitted on one half of the scored range and scored on the
+    other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by
+    models that were trained on this recording, have rows, the last ones, and are left out of the
+    verdict.
+    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and
+    ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
+    ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
+    Raises `DataError` without a reference, or with too little or gaps in common,
+    `ConfigurationError` for none or a baseline's name.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
@@ -282,11 +294,13 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
             f"{name} goes from {clock[0]:.6g} to {clock[-1]:.6g} s" for name, clock in times.items()
         )
         raise DataError(
-            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift SECONDS or auto moves tables of other tools)"
+            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift "
+            "SECONDS or auto moves tables of other tools)"
         )
     if reference.rate_hz < LOWEST_RATE:
         raise DataError(
-            f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need {LOWEST_RATE:g} Hz or more"
+            f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need "
+            f"{LOWEST_RATE:g} Hz or more"
         )
     return start, stop
 
@@ -305,7 +319,10 @@ def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Est
 
 
 def _cross_validated_map(reference: Recording, start: float, stop: float) -> FloatArray:
-    """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
+    """Lateral velocity of a static map of the other half of the range [m/s].
+
+    Raises `DataError` where the car turns too little.
+    """
     middle = 0.5 * (start + stop)
     vy = np.zeros(len(reference))
     for fitted, is_tested in (

@@ -1,6 +1,7 @@
 """A comparison of estimators on one split, from its jobs to what a report draws.
 
-jobs -> `plan` (rates, required channels, trainings in groups that fit one batch) -> `Runner.run` -> `collect`
+jobs -> `plan` (rates, required channels, trainings in groups that fit one batch) -> `Runner.run` ->
+`collect`
 """
 
 from __future__ import annotations
@@ -36,24 +37,21 @@ NO_TIME = "not done yet: its training was stopped or out of time; vehest run goe
 NOT_TRAINED = "not trained yet"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
-Note = tuple[
-    str, str
-]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
+Note = tuple[str, str]
+"""Estimator, or ``evaluation``, whose rate was lowered, and how its sentence continues."""
 
 
 @dataclass
 class Comparison:
     """Jobs on one split, and what becomes of them.
 
-    Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of a study are all evaluated under the
-    faults of all.
+    Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of
+    a study are all evaluated under the faults of all.
     """
 
     jobs: Sequence[Job]
     groups: Sequence[Group] = ()  # trainings that fit one batch
-    facts: Sequence[
-        str
-    ] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
+    facts: Sequence[str] = ()  # budgets of trainings, preparation of recordings, lowered rates
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
@@ -96,9 +94,11 @@ class Comparison:
         } | dict.fromkeys(self.unfinished, self.reason_unfinished)
 
     def plan(self, runner: Runner) -> Sequence[Group]:
-        """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.
+        """Fit jobs to the recordings of their split, find those that lack something, and plan
+        groups of trainings; makes data on the way.
 
-        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
+        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done,
+        `DryRunStop` where a dry run would make data.
         """
         usable = self.usable
         labels = dict[Any, str]()
@@ -143,7 +143,8 @@ class Comparison:
                 f"'{command_line('data usable', [name, *location])}'" for name in split.datasets
             )
             raise DataError(
-                f"none of these estimators can be used with the recordings of split '{split.name}'; {failure_messages(usable)}; "
+                "none of these estimators can be used with the recordings of split "
+                f"'{split.name}'; {failure_messages(usable)}; "
                 f"{commands} shows what each estimator needs"
             )
         self._print_failures(checked, runner)
@@ -229,7 +230,10 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
-    """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
+    """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was.
+
+    Raises `DataError`, `ConfigurationError`.
+    """
     if group not in config:
         return config, []
     is_estimator = group == "estimator"
@@ -241,7 +245,8 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):
         raise DataError(
-            f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out for that"
+            f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave "
+            "it out for that"
         )
     lowered = {**config, group: {**config[group], "rate_hz": lowest}}
     if group == "evaluation":
@@ -262,7 +267,8 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
         if key == "steps" or key.endswith("_steps")
     }
     lengths = [
-        f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} s "
+        f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} "
+        "s "
         f"({key}={max(1, round(number * lowest / rate))} keeps that)"
         for key, number in samples.items()
         if isinstance(number, int) and number > 0
@@ -287,7 +293,8 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
 def plan_training(
     config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]
 ) -> TrainJob:
-    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
+    """A training, be it from scratch or from another model's weights, whose digest is then one of
+    its inputs; see `plan_train`.
 
     Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
     """
@@ -311,12 +318,16 @@ def _check_label(job: Job, training: TrainJob, labels: dict[Any, str]) -> None:
 
 
 def name_in_part(part: str, name: str, parts: Collection[str]) -> str:
-    """Name of a training in messages on a study: parts of one study often train the same estimator and seed."""
+    """Name of a training in messages on a study: parts of one study often train the same estimator
+    and seed.
+    """
     return f"{name} in part '{part}'" if len(parts) > 1 else name
 
 
 def label_of(training: TrainJob) -> str:
-    """Name of a training in messages, with the model that it starts from, which its folder's name does not say."""
+    """Name of a training in messages, with the model that it starts from, which its folder's name
+    does not say.
+    """
     return training.plan.label + start_in_words(training.training)
 
 
@@ -354,13 +365,19 @@ def resampling_fact(configs: Sequence[Config]) -> str:
     )
     options = configs[0]["downsample"]
     method = {
-        "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
+        "polyphase": (
+            "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the "
+            "estimators themselves are causal)"
+        ),
         "decimate": "by plain decimation",
     }[options["method"]]
     first = (
         f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
     )
-    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {method}{first}"
+    return (
+        f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the "
+        f"native rate {method}{first}"
+    )
 
 
 def training_facts(configs: Sequence[Config]) -> list[str]:

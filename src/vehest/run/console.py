@@ -52,8 +52,8 @@ class Messages:
     """Lines and bars on standard error; warnings alone if ``quiet``.
 
     Attributes:
-        printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
-            Lines of reused artefacts are printed as one, by `print_reused`.
+        printed: (status, stage, label, detail) of every line, a warning's text in the last; also
+            where nothing is shown. Lines of reused artefacts are printed as one, by `print_reused`.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:

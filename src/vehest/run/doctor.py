@@ -83,7 +83,8 @@ def examine() -> Iterator[Item]:
     yield Item(
         "ok",
         "GPU",
-        f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run on the processor",
+        f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run "
+        "on the processor",
     )
 
 

@@ -1,6 +1,7 @@
 """Runs a trained model on a new recording that has no reference channels.
 
-model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
+model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures
+and a verdict
 """
 
 from __future__ import annotations
@@ -49,14 +50,16 @@ SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one
 SHARPEST_TURN = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
-LARGEST_FROUDE = 400.0  # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
+# vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
+LARGEST_FROUDE = 400.0
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 
 
 def estimate_file(
     words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None
 ) -> dict[str, Any]:
-    """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
+    """Run a model on a recording and write the estimate to ``out``; returns its figures and a
+    verdict.
 
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
@@ -72,7 +75,8 @@ def estimate_file(
     file = Path(words[n_names - 1])
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(
-            f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv"
+            f"'{file}' is a folder; a recording is a file, and comes after the model: vehest "
+            "estimate MODEL lap.csv"
         )
     writes_log = out.suffix.lower() in LOG_SUFFIXES
     _check_output(out, file)
@@ -107,7 +111,8 @@ def estimate_file(
         if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
             remarks.append(
                 f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
-                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the estimate"
+                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the "
+                "estimate"
             )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
@@ -147,7 +152,9 @@ def estimate_file(
 
 
 def _check_output(out: Path, recording: Path) -> None:
-    """Raise `ConfigurationError` where an estimate cannot be written to a path, before anything is computed."""
+    """Raise `ConfigurationError` where an estimate cannot be written to a path, before anything is
+    computed.
+    """
     if out.suffix.lower() in LOG_SUFFIXES:
         check_log_name(recording, out)
     else:
@@ -166,7 +173,8 @@ def model_for_car(
     Returns
     -------
     tuple
-        Folder, model, calibration, and whether bands are for another car: by the answer ``same_vehicle``,
+        Folder, model, calibration, and whether bands are for another car: by the answer
+            ``same_vehicle``,
         by values of the car, and by its name where a data set is named.
     """
     folder, model, trust = open_model(name, options.output, say)
@@ -189,7 +197,10 @@ def findings_of(
     accepted: Sequence[str],
     of_all_channels: Sequence[Finding] | None = None,
 ) -> list[Finding]:
-    """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
+    """Findings in the channels that a model reads, given those of all channels, if they are known.
+
+    Raises `DataError` on contradictions.
+    """
     read = [name for name in model.channels if name in recording]
     if of_all_channels is not None and (
         set(read) == set(recording.channels)
@@ -209,7 +220,11 @@ def findings_of(
 
 
 def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Finding]:
-    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
+    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a
+    wheelbase [m].
+
+    None: not known.
+    """
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
     speed = recording["vx"]
@@ -264,7 +279,10 @@ class _Report:
         self.reasons: Counter[float] = Counter()
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
-        """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
+        """The parts, once they are checked.
+
+        Raises `DataError` as `findings_of` does, and where it is strict.
+        """
         for part, of_all_channels in parts:
             findings = findings_of(part, self.model, self.accepted, of_all_channels)
             if self.strict and findings:
@@ -348,7 +366,10 @@ class _Report:
 
     @property
     def outside_training(self) -> str:
-        """Share of the drive outside the range of the training, and its channels; empty if there is none."""
+        """Share of the drive outside the range of the training, and its channels.
+
+        Empty if there is none.
+        """
         return domain_verdict(self.health, self.outside) if self.health is not None else ""
 
     def verdict(self) -> str:

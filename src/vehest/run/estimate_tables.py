@@ -45,7 +45,9 @@ SPELLINGS = {
         "betahat",
     ),
 }
-"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and units aside."""
+"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and
+units aside.
+"""
 OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
 """Columns that estimates of vehest have, and those of other tools do not."""
 DEFAULT_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
@@ -54,15 +56,23 @@ AUTO = "auto"
 
 
 def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
-    """Columns from ``QUANTITY=COLUMN`` words; raises `ConfigurationError` for an unknown quantity or no column."""
+    """Columns from ``QUANTITY=COLUMN`` words.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown quantity or no column.
+    """
     columns = []
     for word in words:
         quantity, _, text = word.partition("=")
         if quantity not in CHANNELS_OF_QUANTITIES:
             meant = suggestion(quantity, CHANNELS_OF_QUANTITIES) or ";"
             raise ConfigurationError(
-                f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an estimate{meant} "
-                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column sideslip=Beta:deg"
+                f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an "
+                f"estimate{meant} "
+                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column "
+                "sideslip=Beta:deg"
             )
         if not text.strip("-"):
             raise ConfigurationError(f"--column {printable(word)} names no column")
@@ -91,8 +101,8 @@ def read_estimate_table(
     """Read v or β from a table of any tool, or of ``vehest estimate``.
 
     Columns are found by name, whatever their case; a unit in brackets or at the end of a name
-    counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's u.
-    Prints a warning where unit or sign contradict the recording.
+    counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's
+    u. Prints a warning where unit or sign contradict the recording.
 
     Parameters
     ----------
@@ -116,7 +126,8 @@ def read_estimate_table(
     names = column_names(file, layout)
     if is_parquet(file) and OF_VEHEST.intersection(names):
         complain(
-            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            f"warning: '{file}' has columns of 'vehest estimate' "
+            f"({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
             "description: another program has written it anew; it is read like another tool's table"
         )
     declared = _columns_of(file, names, columns)
@@ -180,7 +191,9 @@ def _columns_of(
 
 
 def _plain_names(name: str) -> set[str]:
-    """A column's name without case, blanks, underscores and what is in brackets, with and without the unit that it ends in."""
+    """A column's name without case, blanks, underscores and what is in brackets, with and without
+    the unit that it ends in.
+    """
     bare = re.sub(r"[\[(].*?[\])]", "", name).strip()
     forms = {bare, re.sub(r"[_\s]+[^_\s]+$", "", bare) if unit_in_name(bare) else bare}
     if bare.lower().rpartition("_")[2] in TIME_UNITS:
@@ -201,7 +214,13 @@ def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
 
 
 def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
-    """The unit that is stated or in a column's name, or the default; raises `DataError` for an unknown one."""
+    """The unit that is stated or in a column's name, or the default.
+
+    Raises
+    ------
+    DataError
+        An unknown one.
+    """
     text = stated or written_unit(name)
     if quantity == "time" and not text and (last := name.lower().rpartition("_")[2]) in TIME_UNITS:
         text = last if "_" in name else ""
@@ -211,14 +230,16 @@ def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
     if unit is None:
         accepted = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
         raise DataError(
-            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known are {accepted}); "
+            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known "
+            f"are {accepted}); "
             "convert it, or rename the column"
         )
     try:
         factor_to_si(unit, DEFAULT_UNITS[quantity])
     except DataError:
         raise DataError(
-            f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of {quantity.removesuffix('_ref')}; "
+            f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of "
+            f"{quantity.removesuffix('_ref')}; "
             "name its unit, as in --column sideslip=NAME:deg"
         ) from None
     return unit
@@ -239,14 +260,17 @@ def _seconds(file: Path, table: Recording, drive: Recording, shift: float | None
     except DataError as error:
         raise DataError(f"'{file}': {error}") from None
     note(
-        f"'{file}': shifted by {estimated.seconds:.3f} s, where it correlates best with the reference "
+        f"'{file}': shifted by {estimated.seconds:.3f} s, where it correlates best with the "
+        "reference "
         f"({estimated.correlation:.3f}); this compensates for a delay of the estimate as well"
     )
     return estimated.seconds
 
 
 def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recording) -> None:
-    """Print a warning where an estimate has another unit or sign than its column says, by the channels of the recording."""
+    """Print a warning where an estimate has another unit or sign than its column says, by the
+    channels of the recording.
+    """
     (channel,) = table.channels
     measured = drive.without_references()
     values = np.interp(measured.time, table.time, table[channel], left=np.nan, right=np.nan)
@@ -261,5 +285,6 @@ def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recordin
         )
         if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
             complain(
-                f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
+                f"warning: '{file}': column '{printable(column)}', read as {channel}: "
+                f"{finding.message}"
             )

@@ -1,8 +1,10 @@
 """Evaluates fitted estimators: estimates and metrics, all read on one grid of times.
 
-model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate -> metrics.csv, timings.csv, blocks.csv
+model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate ->
+metrics.csv, timings.csv, blocks.csv
 
-Every fault adds rows under a condition of its own; without faults, key and files are those of an evaluation that knows none.
+Every fault adds rows under a condition of its own; without faults, key and files are those of an
+evaluation that knows none.
 """
 
 from __future__ import annotations
@@ -82,7 +84,8 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
         or min(speeds.values() if isinstance(speeds, dict) else [speeds or 0.0], default=0.0) < 0
     ):
         raise ConfigurationError(
-            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and min_sideslip_speed must not be negative"
+            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and "
+            "min_sideslip_speed must not be negative"
         )
     if protocol.sequence_seconds is not None:
         samples = protocol.sequence_seconds * protocol.rate_hz
@@ -91,19 +94,24 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
             or abs(samples - round(samples)) > 1e-6
         ):
             raise ConfigurationError(
-                f"evaluation.sequence_seconds must be longer than skip_seconds ({protocol.skip_seconds:g} s) and a whole number of "
+                "evaluation.sequence_seconds must be longer than skip_seconds "
+                f"({protocol.skip_seconds:g} s) and a whole number of "
                 f"samples at {protocol.rate_hz:g} Hz, not {protocol.sequence_seconds:g} s"
             )
     if protocol.initial_state and protocol.warm_up_seconds > 0:
         raise ConfigurationError(
-            f"evaluation.initial_state gives the state at the first sample of a {protocol.piece}, so estimates cannot start "
+            f"evaluation.initial_state gives the state at the first sample of a {protocol.piece}, "
+            "so estimates cannot start "
             f"{protocol.warm_up_seconds:g} s earlier; set evaluation.warm_up_seconds=0"
         )
     return protocol
 
 
 def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> dict[str, Any]:
-    """Options of an evaluation that enter its key: those that differ from their defaults; without faults none of theirs."""
+    """Options of an evaluation that enter its key: those that differ from their defaults.
+
+    Without faults none of theirs.
+    """
     options: dict[str, Any] = {"protocol": changed_options(protocol)}
     return options | ({"faults": [changed_options(fault) for fault in faults]} if faults else {})
 
@@ -124,12 +132,19 @@ class Evaluation:
     def of(
         self, model: Artefact, calibration: Artefact | None
     ) -> tuple[StagePlan, Callable[[Path], None]]:
-        """The evaluation of a model, as `artefacts.make` takes it; raises `ConfigurationError` where it was trained on a test range."""
+        """The evaluation of a model, as `artefacts.make` takes it.
+
+        Raises
+        ------
+        ConfigurationError
+            It was trained on a test range.
+        """
         for name, spans in self.split.tests.items():
             for learnt in learnt_spans(model):
                 if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
-                        f"test set '{name}' shares samples with the ranges that {model.label} was trained or chosen on "
+                        f"test set '{name}' shares samples with the ranges that {model.label} was "
+                        "trained or chosen on "
                         f"({learnt.describe()}); test it on something else"
                     )
         inputs = {"model": model.digest} | (
@@ -206,7 +221,10 @@ def scored_spans(split: Split) -> list[Span]:
 def _write(
     evaluation: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path
 ) -> None:
-    """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
+    """Estimate and score every range, under faults too.
+
+    Write estimates, metrics and, in a file of their own, times into ``folder``.
+    """
     estimator = load_model(model.folder)
     protocol = evaluation.protocol
     without_fit = (
@@ -268,7 +286,9 @@ def _rows_of_parts(
     scored: Sequence[Scored],
     bands: Bands | None,
 ) -> list[dict[str, Any]]:
-    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
+    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of
+    bands, over all samples and by regime.
+    """
     protocol = evaluation.protocol
     masks = []
     turns = []
@@ -389,7 +409,9 @@ def _estimates(
 def _floors(
     estimator: Estimator, evaluation: Evaluation, spans: Sequence[Span]
 ) -> dict[str, float]:
-    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
+    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as
+    they are known.
+    """
     drives = drives_of(spans, evaluation.reference, evaluation.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
     floors = {"floor_reference": reference_floor(drives)} | (
@@ -419,7 +441,10 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
 def _training_rows(
     evaluation: Evaluation, model: Artefact, estimator: Estimator
 ) -> list[dict[str, Any]]:
-    """Errors on the training ranges; none where the reference has gaps there or nothing was learnt."""
+    """Errors on the training ranges.
+
+    None where the reference has gaps there or nothing was learnt.
+    """
     spans = [span for span in learnt_spans(model, "train") if span.dataset in evaluation.data]
     if not spans:
         return []
@@ -440,12 +465,20 @@ def _training_rows(
 
 
 def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
-    """Metrics of an evaluation, or its times, with `COLUMNS`; raises `DataError` where the file is damaged."""
+    """Metrics of an evaluation, or its times, with `COLUMNS`.
+
+    Raises
+    ------
+    DataError
+        The file is damaged.
+    """
     return read_frame(folder / file, COLUMNS, numbers=("value",))
 
 
 def test_figures(folder: Path) -> dict[str, float]:
-    """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
+    """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` ->
+    value.
+    """
     tables = [read_metrics(folder, file) for file in (METRICS, TIMINGS)]
     table = nominal_rows(pd.concat([part for part in tables if len(part)], ignore_index=True))
     tested = table[~table["test_set"].isin((VALIDATION, TRAINING))]
@@ -455,7 +488,9 @@ def test_figures(folder: Path) -> dict[str, float]:
 
 
 def fault_figures(folder: Path) -> dict[str, float]:
-    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` -> value."""
+    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` ->
+    value.
+    """
     return {
         ".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): row["value"]
         for row in read_metrics(folder).to_dict("records")

@@ -1,4 +1,5 @@
-"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them, and errors of estimates under them.
+"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them,
+and errors of estimates under them.
 
 each range with the fault injected -> guarded estimate, as online -> errors and flags
 """
@@ -61,7 +62,11 @@ class FaultSettings:
         return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
 
     def within(self, start: float, length: float, position: int) -> Fault:
-        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length`` [s] long; each draws anew."""
+        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length``
+        [s] long.
+
+        Each draws anew.
+        """
         drawn = np.random.default_rng([self.seed, position])
         delay = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
         duration = math.inf if self.duration is None else self.duration
@@ -71,14 +76,19 @@ class FaultSettings:
 
 
 def faults_of(config: Config) -> tuple[FaultSettings, ...]:
-    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
+    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of
+    ``fault``.
+
+    Raises as `all_of` does.
+    """
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
     if not isinstance(listed, list) or not all(
         isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed
     ):
         raise ConfigurationError(
-            "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]; "
+            "faults must be a list of faults, each with its kind, for example [{kind: bias, "
+            "channel: ay, severity: mild}]; "
             f"kinds: {', '.join(kinds)}"
         )
     named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
@@ -107,12 +117,19 @@ def _settings(content: Mapping[str, Any]) -> FaultSettings:
 
 
 def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
-    """Faults of several configurations together, each once; raises `ConfigurationError` where two different ones have one name."""
+    """Faults of several configurations together, each once.
+
+    Raises
+    ------
+    ConfigurationError
+        Two different ones have one name.
+    """
     by_condition: dict[str, FaultSettings] = {}
     for fault in (fault for group in faults for fault in group):
         if by_condition.setdefault(fault.condition, fault) != fault:
             raise ConfigurationError(
-                f"two faults are both called {fault.condition}: they differ in start or duration; give them different seeds too, "
+                f"two faults are both called {fault.condition}: they differ in start or duration; "
+                "give them different seeds too, "
                 f"or evaluate them one after the other"
             )
     return tuple(by_condition.values())
@@ -121,7 +138,10 @@ def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ..
 def check_channels(
     faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]
 ) -> None:
-    """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
+    """Raise `ConfigurationError` where a scored recording lacks a faulty channel.
+
+    No samples are read.
+    """
     spans = (*split.validation, *split.test_spans) if faults else ()
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
         channels = stored_summary(stored_recording(data, Span(dataset, recording))).channels
@@ -145,12 +165,15 @@ def errors_under(
     *,
     other_vehicle: bool,
 ) -> dict[str, dict[str, float]]:
-    """Errors of guarded estimates with a fault injected into each piece; estimates that it makes missing count as infinite.
+    """Errors of guarded estimates with a fault injected into each piece; estimates that it makes
+    missing count as infinite.
 
-    A piece is a range or sequence, its samples with a warm-up before it, and the state to start from, if any.
+    A piece is a range or sequence, its samples with a warm-up before it, and the state to start
+    from, if any.
 
     Returns:
-        Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of bands and health where there is a trust.
+        Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of
+        bands and health where there is a trust.
     """
     guarded: list[Estimate] = []
     counted: list[Estimate] = []

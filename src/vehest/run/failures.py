@@ -49,10 +49,12 @@ def _of_machine(error: Exception) -> MissingError | None:
             return MissingError("the working folder has been removed; change to another")
     if isinstance(error, OSError) and error.filename is not None:
         return MissingError(
-            f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions"
+            f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and "
+            "their permissions"
         )
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return MissingError(
-            "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter recordings, smaller networks"
+            "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter "
+            "recordings, smaller networks"
         )
     return None

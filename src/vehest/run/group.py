@@ -16,6 +16,7 @@ from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
 from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.car import CarValues
 from vehest.data.splits import Split
+from vehest.estimators.base import Estimator, FitRecord
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.calibrate import plan_calibrate
@@ -68,11 +69,14 @@ class Group:
         return f"{label} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
 
     def run(self, should_stop: Callable[[], bool], on_progress: Report) -> list[Member]:
-        """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+        """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far,
+        marked as interrupted.
 
-        An artefact that another process is making is taken from it once it is done; those that no process makes come first.
+        An artefact that another process is making is taken from it once it is done; those that no
+        process makes come first.
 
-        On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
+        On one thread, that of matrix products included: recursions over small states gain nothing
+        from more, and groups run side by side.
         """
 
         def artefact_of(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
@@ -114,7 +118,10 @@ class Group:
     def existing(
         self, plan: StagePlan, warn: Callable[[str], None] = lambda text: None
     ) -> Artefact | None:
-        """The artefact of a plan, if it is there and not to be made anew; ``warn`` is told of a damaged one."""
+        """The artefact of a plan, if it is there and not to be made anew.
+
+        ``warn`` is told of a damaged one.
+        """
         return None if plan.stage in self.force else find(plan, warn)
 
 
@@ -134,7 +141,9 @@ def _member(
     model: Artefact | None,
     artefact_of: Callable[[StagePlan, Callable[[Path], None]], Artefact | None],
 ) -> Member:
-    """A member whose model is calibrated, then evaluated, as far as ``artefact_of`` gives artefacts."""
+    """A member whose model is calibrated, then evaluated, as far as ``artefact_of`` gives
+    artefacts.
+    """
     if model is None or model.status != "complete":
         return Member(job, model)
     calibration = evaluation = None
@@ -155,7 +164,9 @@ def _member(
 
 
 def _compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
-    """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
+    """While kernels of calibration and evaluation are not in the compile cache, one process
+    compiles them, and others wait for it.
+    """
     missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
     return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
 
@@ -195,7 +206,12 @@ def _train(
         if record.interrupted and not record.metrics.get("best_epoch", 1):
             continue  # nothing learnt yet; the checkpoint knows where to go on
 
-        def write(folder: Path, job: TrainJob = job, estimator=estimator, record=record) -> Status:  # type: ignore[no-untyped-def]
+        def write(
+            folder: Path,
+            job: TrainJob = job,
+            estimator: Estimator = estimator,
+            record: FitRecord = record,
+        ) -> Status:
             write_model(job, estimator, record, folder)
             return "interrupted" if record.interrupted else "complete"
 

@@ -1,6 +1,7 @@
 """Finds a car's numbers on its drives with the self-calibrating filter, without any reference.
 
-drives, each from the filter's priors -> means and deviations at its end -> what the drives add to the priors, together -> `CarRecord`
+drives, each from the filter's priors -> means and deviations at its end -> what the drives add to
+the priors, together -> `CarRecord`
 """
 
 from __future__ import annotations
@@ -51,12 +52,19 @@ MEANINGS = {
     "grip": "lateral acceleration at the rear axle's limit",
 }
 AGREEMENT = 0.95
-"""Quantile of χ² within which the values of several drives count as those of one car; beyond it the number is not identified."""
-LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b and C
+"""Quantile of χ² within which the values of several drives count as those of one car.
+
+Beyond it the number is not identified.
+"""
+# s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b
+# and C
+LATENESS = 0.03
 
 
 class Normal(NamedTuple):
-    """A number's mean and standard deviation, and what a yaw rate that is late by `LATENESS` adds to the mean."""
+    """A number's mean and standard deviation, and what a yaw rate that is late by `LATENESS` adds
+    to the mean.
+    """
 
     mean: Any
     deviation: Any
@@ -64,9 +72,11 @@ class Normal(NamedTuple):
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
-    """Run the filter that comes with vehest over drives of one car, and write the car's record, YAML; raises `VehestError`.
+    """Run the filter that comes with vehest over drives of one car, and write the car's record,
+    YAML; raises `VehestError`.
 
-    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter, ``estimator.KEY=VALUE``.
+    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter,
+    ``estimator.KEY=VALUE``.
     """
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
@@ -134,19 +144,28 @@ def in_words(record: CarRecord) -> TerminalTable:
 
 
 def _excitation(deviation: float, at_start: float) -> str:
-    """How much the drives have excited a number: the share of the prior's variance that they removed."""
+    """How much the drives have excited a number: the share of the prior's variance that they
+    removed.
+    """
     return f"{100.0 * max(0.0, 1.0 - (deviation / at_start) ** 2):.0f} %"
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
-    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where it is too short or has gaps."""
+    """Numbers after a drive, grip by its logarithm, and mean offsets.
+
+    Raises
+    ------
+    DataError
+        It is too short or has gaps.
+    """
     drive = prepared_recording(model, recording)
     samples = np.column_stack([drive[name] for name in model.channels])
     if len(samples) < 2:
         raise DataError(f"recording '{recording.id}' is too short to identify anything")
     if not np.isfinite(samples).all():
         raise DataError(
-            f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them"
+            f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a "
+            "part without them"
         )
     turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
     on_time, early, late = (
@@ -187,7 +206,10 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
 
 
 def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float]:
-    """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
+    """Of log a_max, over the filters that have one.
+
+    The bank resolves half a step between its limits.
+    """
     logs = np.log(model.grips)
     weights = np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
@@ -197,7 +219,13 @@ def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float
 
 
 def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
-    """The record of a car from `posterior_of` its drives; raises `DataError` where a number is not of a car."""
+    """The record of a car from `posterior_of` its drives.
+
+    Raises
+    ------
+    DataError
+        A number is not of a car.
+    """
     prior = prior_of(model)
     combined = {
         name: together(prior[name], {drive: numbers[name] for drive, numbers in drives.items()})
@@ -215,9 +243,11 @@ def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]
 
 
 def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
-    """The prior and what each drive adds to it, weighted by information; deviations hold the yaw rate's lateness, which drives share.
+    """The prior and what each drive adds to it, weighted by information; deviations hold the yaw
+    rate's lateness, which drives share.
 
-    The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT` none of them identifies the number.
+    The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT`
+    none of them identifies the number.
     """
     mean, deviation, of_lateness = (
         np.array([normal for normal in drives.values() if normal.deviation < prior.deviation])
@@ -248,7 +278,9 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
 
 
 def without_prior(prior: Normal, posterior: Normal) -> tuple[Any, Any]:
-    """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation is below the prior's."""
+    """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation
+    is below the prior's.
+    """
     information = 1.0 / posterior.deviation**2 - 1.0 / prior.deviation**2
     return prior.mean + (
         posterior.mean - prior.mean

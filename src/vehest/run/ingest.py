@@ -1,6 +1,7 @@
 """First stage: raw files, or a simulation, to recordings in the store.
 
-data set -> its files, fetched where they are missing -> source -> recording -> checks -> one Parquet file each
+data set -> its files, fetched where they are missing -> source -> recording -> checks -> one
+Parquet file each
 """
 
 from __future__ import annotations
@@ -44,7 +45,13 @@ PROSE = frozenset(
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """The artefact of an ingest; raises `VehestError` where raw files are missing or the data set's configuration makes no sense."""
+    """The artefact of an ingest.
+
+    Raises
+    ------
+    VehestError
+        Raw files are missing or the data set's configuration makes no sense.
+    """
     dataset: Mapping[str, Any] = config["dataset"]
     if missing := missing_keys(dict(dataset)):
         raise ConfigurationError(
@@ -75,7 +82,8 @@ def write_ingest(
 ) -> None:
     """Read every recording, check it, and write it into ``folder``.
 
-    Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
+    Recordings of slow sources are made side by side and kept beside the artefacts until all are
+    done: an interrupted run goes on.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
@@ -125,7 +133,9 @@ def write_ingest(
 
 
 def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataError:
-    """The first failure with its recording, the names of other recordings that failed, and its exit code."""
+    """The first failure with its recording, the names of other recordings that failed, and its exit
+    code.
+    """
     (recording_id, first), *further_failures = failures
     place = f"data set '{dataset}', recording '{recording_id}'"
     message = first.message if first.message.startswith(place) else f"{place}: {first.message}"
@@ -143,7 +153,10 @@ def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: o
 
 
 def _make(source: Source, recording_id: str, folder: Path) -> None:
-    """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
+    """Read, check and write a recording.
+
+    Raises `DataError` where a check finds an error that the data set does not accept.
+    """
     recording = source.read(recording_id)
     refuse_errors(
         recording,
@@ -159,20 +172,31 @@ def parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store, by its id; raises `DataError` where that cannot be a file's name or would lead elsewhere."""
+    """The file of a recording in the store, by its id.
+
+    Raises
+    ------
+    DataError
+        That cannot be a file's name or would lead elsewhere.
+    """
     if (
         not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id)
         or len(os.fsencode(recording_id)) > LONGEST_ID
     ):
         raise DataError(
-            f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
-            f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
+            f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's "
+            "name in the store, "
+            f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden "
+            "one"
         )
     return f"{recording_id}.parquet"
 
 
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
-    """Configuration of a simulated data set's ingest; override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`."""
+    """Configuration of a simulated data set's ingest.
+
+    Override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`.
+    """
     spelt_out = [
         f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override
         for override in overrides
@@ -187,7 +211,11 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
 
 
 def outcome_of(ingested: Artefact) -> dict[str, Any]:
-    """Number and hours of drives, and names of those that span, left the road or ended before their manoeuvre did; raises `DataError`."""
+    """Number and hours of drives, and names of those that span, left the road or ended before their
+    manoeuvre did.
+
+    Raises `DataError`.
+    """
     drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
     flags = {drive.id: drive.provenance["flags"] for drive in drives}
     return {
@@ -200,7 +228,10 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
 
 
 def _datasets_with_download() -> list[str]:
-    """Names of the data sets whose files can be fetched; those whose configuration cannot be read are left out."""
+    """Names of the data sets whose files can be fetched.
+
+    Those whose configuration cannot be read are left out.
+    """
     names = []
     for name in choices("dataset"):
         with suppress(ConfigurationError):
@@ -210,15 +241,20 @@ def _datasets_with_download() -> list[str]:
 
 
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
-    """Fetch a data set's missing files and record or compare the others' checksums; raises as `Download.fetch`, or `ConfigurationError`."""
+    """Fetch a data set's missing files and record or compare the others' checksums.
+
+    Raises as `Download.fetch`, or `ConfigurationError`.
+    """
     from vehest.sources.download import download_of
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
         downloadable = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
-            f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"put them into its folder by hand, or declare download in its file; data sets that do: {downloadable}"
+            f"data set '{source.name}' does not say where its files can be fetched from "
+            "(download); "
+            "put them into its folder by hand, or declare download in its file; data sets that "
+            f"do: {downloadable}"
         )
     download = download_of(source)
     if dry_run:

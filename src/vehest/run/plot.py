@@ -36,7 +36,9 @@ WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
 
 
 def check_plot_name(out: Path) -> None:
-    """Raise `ConfigurationError` where a picture cannot be written to a path, before it is drawn."""
+    """Raise `ConfigurationError` where a picture cannot be written to a path, before it is
+    drawn.
+    """
     if out.suffix.lower() not in WRITERS:
         raise ConfigurationError(
             f"'{out}': pictures are written as {', '.join(WRITERS)}; name such a file"

@@ -1,4 +1,5 @@
-"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard error.
+"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard
+error.
 
 outcome of a study -> `TerminalSummary`: tables, and figures as JSON -> `emit`
 """
@@ -45,7 +46,9 @@ class TerminalTable:
 
 @dataclass(frozen=True)
 class TerminalSummary:
-    """Tables of a study, a note below them (may be empty), the file of its report, and the figures of ``--json`` as JSON."""
+    """Tables of a study, a note below them (may be empty), the file of its report, and the figures
+    of ``--json`` as JSON.
+    """
 
     tables: tuple[TerminalTable, ...]
     note: str
@@ -58,17 +61,25 @@ class OutputClosed(Exception):
 
 
 def open_streams() -> None:
-    """Replace streams that were closed at the start by a null device; let the others show any character, as an escape if need be."""
+    """Replace streams that were closed at the start by a null device.
+
+    Let the others show any character, as an escape if need be.
+    """
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process lives)
+            mode = "r" if name == "stdin" else "w"
+            null_device = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 (never closed)
+            setattr(sys, name, null_device)
         elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
 def emit(as_json: bool, outcome: Any, lines: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key; raises `MissingError`."""
+    """Print the outcome of a command, as one JSON object or in lines and tables.
+
+    By default a line for each key; raises `MissingError`.
+    """
     if as_json:
         echo(as_json_text(outcome), keep="\n")
         return
@@ -110,7 +121,10 @@ def _print_table(content: TerminalTable) -> None:
 
 
 def echo(text: str, keep: str = "") -> None:
-    """Print a line on standard output, control characters as escapes except for those in ``keep``; errors as of `emit`."""
+    """Print a line on standard output, control characters as escapes except for those in ``keep``.
+
+    Errors as of `emit`.
+    """
     try:
         typer.echo(printable(text, keep))
     except BrokenPipeError:
@@ -145,7 +159,10 @@ def finding_in_words(finding: Finding) -> str:
 
 
 def as_json_text(outcome: Any) -> str:
-    """An outcome as JSON; numbers that are not finite become null, unprintable characters their escapes."""
+    """An outcome as JSON.
+
+    Numbers that are not finite become null, unprintable characters their escapes.
+    """
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -196,7 +213,8 @@ def summary_of_leaderboard(
         share = float(rows["share_below_min_speed"].iloc[0])
         if share > 0:
             notes.append(
-                f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the samples, where the car is slower than "
+                f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the "
+                "samples, where the car is slower than "
                 f"{rows['min_sideslip_speed'].iloc[0]}"
             )
         if rows["rmse_sideslip_low"].isna().all():
@@ -231,7 +249,10 @@ def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
         kind.upper() if kind == "simulated" else kind
         for kind in dict.fromkeys(artefacts.part.kinds.values())
     )
-    title = f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
+    title = (
+        f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval "
+        f"(Student's t); {kinds} data"
+    )
     records = _records(artefacts.table)
     figures = {
         "chosen": next((row for row in records if row["chosen"]), None),

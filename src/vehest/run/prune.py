@@ -2,8 +2,9 @@
 
 output root -> artefacts, checkpoints, leftovers -> `unused_artefacts` -> `remove_unused`
 
-An artefact is listed if its code is not today's, if it is damaged, or if its inputs are not in the output root; trainings stay without
-their recordings, which can be made again. Only folders whose manifest gives their own name are artefacts; links are left alone.
+An artefact is listed if its code is not today's, if it is damaged, or if its inputs are not in the
+output root; trainings stay without their recordings, which can be made again. Only folders whose
+manifest gives their own name are artefacts; links are left alone.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     """List everything in an output root that no current configuration can reuse, stage by stage.
 
     Returns:
-        ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written to.
+        ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written
+        to.
     """
     artefacts = _artefacts(output)
     readable = [artefact for artefact in artefacts.values() if artefact is not None]
@@ -70,7 +72,10 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
 
 
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
-    """Remove files and folders, each renamed first so that no half is found; ``on_removed`` is called after each; raises `MissingError`."""
+    """Remove files and folders, each renamed first so that no half is found.
+
+    ``on_removed`` is called after each; raises `MissingError`.
+    """
     for path in paths:
         aside = aside_of(path)
         try:
@@ -97,7 +102,10 @@ def _artefacts(output: Path) -> dict[Path, Artefact | None]:
 
 
 def _reason(artefact: Artefact | None, present: set[str]) -> str:
-    """Why an artefact cannot be reused; empty where it can, and where its estimator or study is not installed."""
+    """Why an artefact cannot be reused.
+
+    Empty where it can, and where its estimator or study is not installed.
+    """
     if artefact is None:
         return DAMAGED
     if not artefact.code.startswith(f"{artefact.stage}="):  # of a vehest without versions

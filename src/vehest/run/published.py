@@ -1,10 +1,13 @@
-"""Compares published results with today's versions, configuration and raw files, without models or an output root.
+"""Compares published results with today's versions, configuration and raw files, without models or
+an output root.
 
-study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date, stale with its causes, or not known
+study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date,
+stale with its causes, or not known
 
-A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and raw files, which the keys of a study
-therefore hold instead. What of the configuration matters, each stage says for both (`training_options`, `evaluation_options`); titles and
-descriptions are in no key of a study.
+A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and
+raw files, which the keys of a study therefore hold instead. What of the configuration matters, each
+stage says for both (`training_options`, `evaluation_options`); titles and descriptions are in no
+key of a study.
 """
 
 from __future__ import annotations
@@ -143,15 +146,19 @@ def in_words(verdict: Mapping[str, Any]) -> str:
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
+    """Compare the recorded keys of published studies with those of today's code, configuration and
+    raw files.
 
-    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each with ``what`` (``train ksnn``) and one of
-    `CAUSES`, and a ``note`` on what was not compared, or why the state is not known.
-    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
+    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
+    with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
+    why the state is not known.
+    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name
+    of no pipeline or published study.
     """
     if content_overrides(overrides):
         raise ConfigurationError(
-            f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides"
+            f"'{content_overrides(overrides)[0]}' changes the results, which are published without "
+            "overrides"
         )
     published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
     if not (names or published):
@@ -169,10 +176,12 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
 
 
 def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Compare all published studies as `check_published`, and those that are not up to date with the list of those that may be stale.
+    """Compare all published studies as `check_published`, and those that are not up to date with
+    the list of those that may be stale.
 
-    Returns the same, each with ``failure``, empty for a study as it should be. A listed study with keys of other stages than today's, or
-    without keys, is stale without a look at its configuration, which takes a minute for all.
+    Returns the same, each with ``failure``, empty for a study as it should be. A listed study with
+    keys of other stages than today's, or without keys, is stale without a look at its
+    configuration, which takes a minute for all.
     """
     reasons = _stale_list()
     verdicts = []
@@ -214,7 +223,10 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
 
 
 def _stale_list() -> dict[str, str]:
-    """Study -> why it may still be stale; raises `ConfigurationError` for anything but text by study."""
+    """Study -> why it may still be stale.
+
+    Raises `ConfigurationError` for anything but text by study.
+    """
     file = RESULTS / STALE_LIST
     content = read_yaml(file) if file.is_file() else {}
     if not isinstance(content, dict) or not all(
@@ -288,7 +300,10 @@ def _outcome(
 
 
 def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when results were published and its cause; a note on what was not compared."""
+    """Pairs of what differs from when results were published and its cause.
+
+    A note on what was not compared.
+    """
     runner = Runner(
         Path(str(next(iter(jobs.values()))[0].config["output"])),
         Messages(quiet=True),

@@ -80,14 +80,16 @@ def published_in(folder: Path) -> Published | None:
 def publish_study(
     publication: Publication | None, report: Artefact, messages: Messages
 ) -> Path | None:
-    """Copy a study's report without pages and times to results/STUDY, with keys in its provenance; returns the folder, if it is published.
+    """Copy a study's report without pages and times to results/STUDY, with keys in its provenance;
+    returns the folder, if it is published.
 
     CSV files are published with six significant digits (`published_content`).
 
     A published report stays that shows data which this run could not read, or more trainings with
     the same keys. Where keys and all other files are the same, the provenance stays that of the
     first run with these results.
-    Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds something else or is reached by a link.
+    Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds
+    something else or is reached by a link.
     """
     if publication is None:
         return None
@@ -117,8 +119,9 @@ def publish_study(
 
 
 def uncommitted_changes() -> str:
-    """Files that determine results and differ from the last commit, in words; empty where there are none, or no git
-    checkout."""
+    """Files that determine results and differ from the last commit, in words; empty where there are
+    none, or no git checkout.
+    """
     command = ["git", "status", "--porcelain", "--untracked-files=all", "--", *SOURCES_OF_RESULTS]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
@@ -136,7 +139,9 @@ def uncommitted_changes() -> str:
 
 
 def check_results_folder(folder: Path) -> None:
-    """Raise `ConfigurationError` where a study cannot be published in a folder: it is reached by a link, or holds something else."""
+    """Raise `ConfigurationError` where a study cannot be published in a folder: it is reached by a
+    link, or holds something else.
+    """
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(
             f"'{folder}' leads elsewhere through a link; remove the link or set publish: false"
@@ -147,7 +152,8 @@ def check_results_folder(folder: Path) -> None:
     names = {file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()}
     if PROVENANCE not in names and names - {PUBLISHED_WEIGHTS}:
         raise ConfigurationError(
-            f"'{folder}' holds files that vehest did not publish; move them away or set publish: false"
+            f"'{folder}' holds files that vehest did not publish; move them away or set publish: "
+            "false"
         )
 
 
@@ -189,7 +195,9 @@ def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
 
 
 def published_content(file: Path) -> bytes:
-    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits, which other machines reproduce."""
+    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits,
+    which other machines reproduce.
+    """
     if file.suffix != ".csv":
         return file.read_bytes()
     text = io.StringIO(newline="")

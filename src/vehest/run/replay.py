@@ -51,7 +51,10 @@ def replay_log(
     write_dbc: Path | None = None,
     quiet: bool = True,
 ) -> dict[str, Any]:
-    """Replay a log and let a model estimate; returns its figures. The options are those of ``vehest replay``; raises `VehestError`."""
+    """Replay a log and let a model estimate.
+
+    Returns its figures. The options are those of ``vehest replay``; raises `VehestError`.
+    """
     bus = Bus(interface, channel, _speed(speed))
     estimates = EstimateFrames(_identifier(identifier))
     if bus.speed is None and interface != "virtual":
@@ -106,7 +109,9 @@ def replay_log(
 def _signals(
     described: Mapping[str, Any] | None, dbc: Path | None, signals: str, model: Estimator
 ) -> BusSignals:
-    """The signals of a model's channels: from the configuration of a data set, if any, or by their names in a DBC."""
+    """The signals of a model's channels: from the configuration of a data set, if any, or by their
+    names in a DBC.
+    """
     named = [word for word in signals.split(",") if word.strip()]
     if described is not None:
         if named:

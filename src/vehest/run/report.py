@@ -1,7 +1,8 @@
 """Last stage: evaluations, or recordings alone, to tables, figures and pages.
 
-comparisons, data sets -> StudyArtefacts -> the study's module -> report.md, report.html, tables, figures, metrics.csv
-comparison of a sweep -> table of jobs -> SweepArtefacts -> `vehest.studies.sweep` -> report.md, sweep.csv, summary.csv, heat maps
+comparisons, data sets -> StudyArtefacts -> the study's module -> report.md, report.html, tables,
+figures, metrics.csv comparison of a sweep -> table of jobs -> SweepArtefacts ->
+`vehest.studies.sweep` -> report.md, sweep.csv, summary.csv, heat maps
 """
 
 from __future__ import annotations
@@ -80,10 +81,12 @@ def draw_report(
     trials: Sequence[Trial] = (),
     search_remarks: Sequence[str] = (),
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent.
+    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a
+    comparison are named as absent.
 
-    Trials of searches are in no part, so that a report is the same whether they were trained here or published before. The weights of an
-    incomplete study include all that were published before, so that no training is lost.
+    Trials of searches are in no part, so that a report is the same whether they were trained here
+    or published before. The weights of an incomplete study include all that were published before,
+    so that no training is lost.
     """
     is_complete = not any(part.unfinished for part in comparisons.values())
     comparisons = {name: part for name, part in comparisons.items() if name not in study.trials}
@@ -185,9 +188,11 @@ def draw_report(
 def _write(
     artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path
 ) -> None:
-    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a comparison metrics.csv and timings.csv.
+    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a
+    comparison metrics.csv and timings.csv.
 
-    On one thread, as groups are trained, so that it has the same last digits whether trainings came before or not.
+    On one thread, as groups are trained, so that it has the same last digits whether trainings came
+    before or not.
     """
     from vehest.report.document import write_documents
 
@@ -227,7 +232,9 @@ def _write(
 def _recordings(
     comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]
 ) -> dict[str, str]:
-    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate, or shown."""
+    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate,
+    or shown.
+    """
     digests = {}
     for part in comparisons.values():
         for span in scored_spans(part.evaluation.split):
@@ -289,7 +296,9 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
 
 
 def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedModel]:
-    """Models in which estimators that share a title have their variant behind it, so that tables, legends and verdicts distinguish them."""
+    """Models in which estimators that share a title have their variant behind it, so that tables,
+    legends and verdicts distinguish them.
+    """
     names: dict[str, set[tuple[str, str]]] = {}
     for model in models:
         names.setdefault(model.title, set()).add(model.name)
@@ -302,7 +311,10 @@ def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedMode
 
 
 def _timings_of(part: PartArtefacts) -> pd.DataFrame:
-    """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s]; in no published file."""
+    """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s].
+
+    In no published file.
+    """
     tables = []
     for model in part.models:
         times = read_metrics(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
@@ -326,7 +338,10 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
 def draw_sweep(
     study: Study, comparison: Comparison, runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
+    """Draw a sweep, unless its report is there, and sum it up for the terminal.
+
+    A failed job has a row with its reason.
+    """
     configs = [job.config for job in comparison.jobs if "estimator" in job.config]
     conditions = dict.fromkeys(
         fault.condition for config in configs if (fault := chosen_fault(config)) is not None
@@ -408,7 +423,10 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
 def _figures(
     member: Member | None, sets: Sequence[str], fault: FaultSettings | None
 ) -> dict[str, Any]:
-    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one; NaN where it failed."""
+    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one.
+
+    NaN where it failed.
+    """
     columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(["n_parameters", "epochs", *columns], float("nan"))

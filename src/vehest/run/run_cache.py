@@ -1,9 +1,12 @@
-"""Remembers the keys of a finished study or sweep, so that it is recognised without the libraries that compute them.
+"""Remembers the keys of a finished study or sweep, so that it is recognised without the libraries
+that compute them.
 
-command, environment, files that determine keys -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
+command, environment, files that determine keys -> `RunCache.load` -> Record -> printed; finished
+run -> `RunCache.save`
 
-A record in the output root holds a hash of these inputs, the key of each artefact and the printed summary. Inputs that are unchanged
-have unchanged keys, and `valid_artefact` decides by them; otherwise the study runs in full, which computes the keys.
+A record in the output root holds a hash of these inputs, the key of each artefact and the printed
+summary. Inputs that are unchanged have unchanged keys, and `valid_artefact` decides by them;
+otherwise the study runs in full, which computes the keys.
 """
 
 from __future__ import annotations
@@ -80,8 +83,10 @@ class RunCache:
         name: of the pipeline, or its path; of the sweep, if it was given.
 
     Attributes:
-        file: of the record; none where the output root depends on more than overrides and environment.
-        inputs: hash of the command, files and variables that determine keys, but raw files; empty if these are not all that does.
+        file: of the record; none where the output root depends on more than overrides and
+            environment.
+        inputs: hash of the command, files and variables that determine keys, but raw files; empty
+            if these are not all that does.
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
@@ -104,7 +109,9 @@ class RunCache:
         self.inputs = self._inputs()
 
     def load(self) -> tuple[Record, list[Artefact]] | None:
-        """The finished study and its artefacts, if nothing has changed since and all of it is there."""
+        """The finished study and its artefacts, if nothing has changed since and all of it is
+        there.
+        """
         if self.file is None or not self.file.is_file():
             return None
         output = self.file.parents[1]
@@ -126,7 +133,10 @@ class RunCache:
         return (record, artefacts) if is_complete else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
-        """The finished study, notes printed first, published as a run in full would; none without a valid record, or under force."""
+        """The finished study, notes printed first, published as a run in full would.
+
+        None without a valid record, or under force.
+        """
         finished = None if options.force else self.load()
         if finished is None:
             return None
@@ -152,7 +162,10 @@ class RunCache:
         raw: dict[str, str],
         publication: Publication | None,
     ) -> None:
-        """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: stamps from before reading."""
+        """Record a finished study, unless runs are left to track or files changed meanwhile.
+
+        ``raw``: stamps from before reading.
+        """
         tracker = runner.tracker
         output = runner.output
         if (
@@ -228,7 +241,9 @@ def _configuration(pipeline: str) -> Iterator[Path]:
 
 
 def _code() -> Iterator[Path]:
-    """Folders, or files, of vehest and of every package that offers it estimators, sources or studies."""
+    """Folders, or files, of vehest and of every package that offers it estimators, sources or
+    studies.
+    """
     points = metadata.entry_points()
     packages = {
         point.module.partition(".")[0]

@@ -1,6 +1,8 @@
-"""Runs stages into one output root: existing artefacts are reused, missing ones are made, every step is printed.
+"""Runs stages into one output root: existing artefacts are reused, missing ones are made, every
+step is printed.
 
-Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups -> launcher -> members -> tracking
+Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups -> launcher ->
+members -> tracking
 """
 
 from __future__ import annotations
@@ -53,7 +55,10 @@ ALL = "all groups"  # bar above those of trainings
 
 @dataclass(eq=False)
 class Runner:
-    """Runs stages into one output root; in a dry run `DryRunStop` is raised where something would have to be made."""
+    """Runs stages into one output root.
+
+    In a dry run `DryRunStop` is raised where something would have to be made.
+    """
 
     output: Path
     messages: Messages
@@ -105,7 +110,9 @@ class Runner:
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
 
     def dataset_config(self, name: str, config: Config) -> Config:
-        """The configuration of a data set's ingest, with the root and output of another command's."""
+        """The configuration of a data set's ingest, with the root and output of another
+        command's.
+        """
         root = [] if config.get("root") is None else [f"root={quoted(config['root'])}"]
         return self._once(
             "dataset",
@@ -123,7 +130,15 @@ class Runner:
         ]
 
     def look_for_files(self, config: Config) -> None:
-        """Make sure that the raw files of every data set of a split are here; read nothing; raises `MissingError` where some are not."""
+        """Make sure that the raw files of every data set of a split are here.
+
+        Read nothing.
+
+        Raises
+        ------
+        MissingError
+            Some are not.
+        """
         for dataset in self.datasets_of(config):
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()
@@ -132,7 +147,10 @@ class Runner:
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
-        """The split of a configuration; where it names or cuts recordings by rules, its data sets are ingested for it."""
+        """The split of a configuration.
+
+        Where it names or cuts recordings by rules, its data sets are ingested for it.
+        """
 
         def recordings_of(name: str) -> Mapping[str, Reader]:
             ingested = self._ingested(name, config)
@@ -146,7 +164,11 @@ class Runner:
         )
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
-        """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
+        """Channels and rates of the recordings of every data set of a split, which are ingested for
+        it.
+
+        No samples are read.
+        """
 
         def read(name: str) -> tuple[RecordingSummary, ...]:
             ingested = self._ingested(name, config)
@@ -158,10 +180,11 @@ class Runner:
         }
 
     def warn_of_references(self, split: Split, config: Config) -> None:
-        """Warn once of each recording of a split whose reference has another sign or unit, is stuck or impossible.
+        """Warn once of each recording of a split whose reference has another sign or unit, is stuck
+        or impossible.
 
-        The stored recordings are checked, so that a warning does not depend on which run has ingested them. References of a simulation
-        are right.
+        The stored recordings are checked, so that a warning does not depend on which run has
+        ingested them. References of a simulation are right.
         """
         spans = (*split.train, *split.validation, *split.test_spans)
         for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
@@ -195,7 +218,9 @@ class Runner:
         return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
 
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
-        """How estimates are scored, with the lowest speed of sideslip on each data set, by its car."""
+        """How estimates are scored, with the lowest speed of sideslip on each data set, by its
+        car.
+        """
         cars = self.cars(config, datasets)
         return protocol_from_config(config["evaluation"]).with_wheelbases(
             {name: car.wheelbase for name, car in cars.items()}
@@ -204,7 +229,9 @@ class Runner:
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
-        """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
+        """How a configuration is evaluated: against references that are resampled like everything,
+        but never filtered further.
+        """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
         references = self.data_for(
@@ -250,13 +277,15 @@ class Runner:
         return artefact
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
-        """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
+        """Train and evaluate groups, side by side where there are cores; where members of a group
+        fail by their data, each is tried alone.
 
-        Raises `MissingError` where no member is there and a command has to be run first, `Stopped` at a signal; finished artefacts stay.
+        Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
+        at a signal; finished artefacts stay.
 
         Returns:
-            Key of a training -> its member, and key of a training -> why it failed. Where the time is up, members lack what was not
-            made, and trainings that were not begun are in neither.
+            Key of a training -> its member, and key of a training -> why it failed. Where the time
+            is up, members lack what was not made, and trainings that were not begun are in neither.
         """
         if self.weights is not None and TRAIN not in self.force:
             self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
@@ -298,7 +327,9 @@ class Runner:
         return members, failures
 
     def _without_trainings(self, groups: Sequence[Group]) -> list[Group]:
-        """Those jobs of groups that take no time to train: the model exists, or is learnt at once."""
+        """Those jobs of groups that take no time to train: the model exists, or is learnt at
+        once.
+        """
         reduced = [
             replace(
                 group,
@@ -384,7 +415,10 @@ class Runner:
         return {member.job.plan.key: member for member in outcome}
 
     def _publish_weights(self, members: Iterable[Member]) -> None:
-        """Add the models of finished trainings to the published weights, if they are to be; once there is no room, no more."""
+        """Add the models of finished trainings to the published weights, if they are to be.
+
+        Once there is no room, no more.
+        """
         models = [
             member.model
             for member in members
@@ -407,7 +441,10 @@ class Runner:
         elif news is None:
             bars.step(name, 0, 1, "starting")
         else:
-            note = f"{news.active}/{news.members} active, best validation loss {news.best_validation_loss:.4g}"
+            note = (
+                f"{news.active}/{news.members} active, best validation loss "
+                f"{news.best_validation_loss:.4g}"
+            )
             bars.step(name, news.epoch, news.max_epochs, note)
 
     def _print_waiting(self, waiting: Waiting) -> None:
@@ -445,5 +482,6 @@ def _in_words(artefact: Artefact) -> tuple[str, str]:
         return "note", f"no bands: {trust.about.note}"
     return (
         "done",
-        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
+        f"bands by {trust.bands.n_blocks} "
+        f"{'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
     )

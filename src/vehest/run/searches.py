@@ -1,8 +1,10 @@
 """Searches of a study: what each trial reached on the validation range, and which one that chooses.
 
-planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations -> `trials_of` -> `remarks_on` parts -> report
+planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations ->
+`trials_of` -> `remarks_on` parts -> report
 
-A search is finished where the file has all of its trials with today's keys: then none of them is trained, wherever the study runs.
+A search is finished where the file has all of its trials with today's keys: then none of them is
+trained, wherever the study runs.
 """
 
 from __future__ import annotations
@@ -48,7 +50,11 @@ DIGITS = 6  # significant ones of a validation value, as in published CSV files
 def published_values(
     study: Study, comparisons: Mapping[str, Comparison], path: Path
 ) -> dict[str, float]:
-    """Validation value of each trial of those searches that a published file has in full, with today's keys; raises `DataError`."""
+    """Validation value of each trial of those searches that a published file has in full, with
+    today's keys.
+
+    Raises `DataError`.
+    """
     if not path.is_file():
         return {}
     values = {
@@ -71,7 +77,9 @@ def published_values(
 def trials_of(
     study: Study, comparisons: Mapping[str, Comparison], published: Mapping[str, float]
 ) -> list[Trial]:
-    """The trials of every search of which all have a value: a published one, or that of their evaluation."""
+    """The trials of every search of which all have a value: a published one, or that of their
+    evaluation.
+    """
     finished: list[Trial] = []
     for names in study.searches.values():
         trials = []
@@ -93,9 +101,11 @@ def trials_of(
 def remarks_on(
     study: Study, comparisons: Mapping[str, Comparison], trials: Sequence[Trial]
 ) -> list[str]:
-    """A line for each part and search where the part trains what was searched for, with other options than those chosen.
+    """A line for each part and search where the part trains what was searched for, with other
+    options than those chosen.
 
-    What was searched for is a job that differs from the trials in nothing but the options that they try, and the seed.
+    What was searched for is a job that differs from the trials in nothing but the options that they
+    try, and the seed.
     """
     remarks: dict[str, None] = {}
     for chosen in (trial for trial in trials if trial.chosen):
@@ -113,7 +123,8 @@ def remarks_on(
                 is_searched = _compared(config, tried) == _compared(best, tried)
                 if is_searched and _compared(config) != _compared(best):
                     remarks[
-                        f"part '{name}' does not use what the search '{chosen.search}' chose by {chosen.metric} "
+                        f"part '{name}' does not use what the search '{chosen.search}' chose by "
+                        f"{chosen.metric} "
                         f"on validation: {chosen.options}"
                     ] = None
     return list(remarks)
@@ -132,7 +143,10 @@ def _options(study: Study, name: str) -> tuple[str, ...]:
 
 
 def _planned_trial(study: Study, name: str, comparisons: Mapping[str, Comparison]) -> Trial | None:
-    """A trial before it has a value; none where its recordings are not here or it cannot be trained."""
+    """A trial before it has a value.
+
+    None where its recordings are not here or it cannot be trained.
+    """
     if name not in comparisons:
         return None
     comparison = comparisons[name]
@@ -169,7 +183,8 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
     rows = table[(table["metric"] == trial.metric) & (table["test_set"] == VALIDATION)]
     if len(rows) != 1:
         raise DataError(
-            f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a validation range"
+            f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a "
+            "validation range"
         )
     return float(rows["value"].iloc[0])
 

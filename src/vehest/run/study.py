@@ -1,6 +1,7 @@
 """Reads what a study compares, from a file or from a command's overrides, and composes its jobs.
 
-pipelines/*.yaml -> `read_study` -> Study -> `jobs_of` -> part -> jobs, each a configuration; a sweep's overrides -> `sweep_of` -> both
+pipelines/*.yaml -> `read_study` -> Study -> `jobs_of` -> part -> jobs, each a configuration; a
+sweep's overrides -> `sweep_of` -> both
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, short_names, shown_value
 
-FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
+FORMS = (
+    "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; "
+    "datasets, each once"
+)
 SAME_IN_A_PART = ("split", "evaluation", "downsample")
 SINGLE_VALUED = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
@@ -66,7 +70,10 @@ class Search:
 
 @dataclass(frozen=True)
 class Part:
-    """One comparison of a study: sweeps of trainings on one split; docs/cli.md says what the keys mean."""
+    """One comparison of a study: sweeps of trainings on one split.
+
+    Docs/cli.md says what the keys mean.
+    """
 
     split: str = ""
     sweeps: Sweeps = ()
@@ -98,7 +105,10 @@ class PipelineFile:
 
 @dataclass(frozen=True)
 class Study(PipelineFile):
-    """A pipeline or a sweep as it is run; the only part of a study that is not in parts is called ``""``, and has no title."""
+    """A pipeline or a sweep as it is run.
+
+    The only part of a study that is not in parts is called ``""``, and has no title.
+    """
 
     file: Path = Path()
     command: str = ""  # that makes it, without where data come from and results go
@@ -114,7 +124,9 @@ class Study(PipelineFile):
 
     @property
     def shows_failed(self) -> bool:
-        """Whether its report can leave out failed jobs: it is not in parts, or its module says so."""
+        """Whether its report can leave out failed jobs: it is not in parts, or its module says
+        so.
+        """
         return (
             not self.parts
             or "" in self.parts
@@ -151,7 +163,10 @@ def failure_messages(jobs: Iterable[Job]) -> str:
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
-    """Read a pipeline by path or name; ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`."""
+    """Read a pipeline by path or name.
+
+    ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`.
+    """
     file, content = _content_of(name, location_overrides(overrides))
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     datasets = [*read.datasets, *read.optional_datasets]
@@ -169,11 +184,13 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
         if not part.split or not part.sweeps or not all(part.sweeps):
             subject = f"part '{key}'" if key else "it"
             raise ConfigurationError(
-                f"'{file}': {subject} needs split and sweeps; sweeps must be a list of lists of overrides"
+                f"'{file}': {subject} needs split and sweeps; sweeps must be a list of lists of "
+                "overrides"
             )
     if read.report not in study_names():
         raise ConfigurationError(
-            f"'{file}': there is no study module '{read.report}'; there are: {', '.join(study_names())}"
+            f"'{file}': there is no study module '{read.report}'; there are: "
+            f"{', '.join(study_names())}"
         )
     takes = getattr(study_module(read.report), "TAKES", "")
     if stated_forms != ["split" if takes == "folds" else takes]:
@@ -235,7 +252,8 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
     candidates = [tuple(job) for sweep in search.candidates for job in expand(sweep)]
     if len(candidates) < 2:
         raise ConfigurationError(
-            f"{subject} needs candidates, a list of lists of overrides with two combinations or more"
+            f"{subject} needs candidates, a list of lists of overrides with two combinations or "
+            "more"
         )
     if len(part.sweeps) != 1 or count(part.sweeps[0]) != 1:
         raise ConfigurationError(
@@ -322,7 +340,8 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
     number = folds.get("number", FoldsFile.number) if isinstance(folds, dict) else None
     if not isinstance(number, int) or number < 1:
         raise ConfigurationError(
-            f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, of: laps}}"
+            f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, "
+            f"of: laps}}"
         )
     check_jobs(number, f"the folds of '{file.name}' stand")
     return {
@@ -334,11 +353,16 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key; raises `ConfigurationError`."""
+    """Every job of a pipeline.
+
+    Further overrides apply to the sweeps, or data sets, that have their key; raises
+    `ConfigurationError`.
+    """
     unit, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
         raise ConfigurationError(
-            f"'{fixed}' belongs to the study; copy '{study.file.name}' to pipelines/ under another name and change that there"
+            f"'{fixed}' belongs to the study; copy '{study.file.name}' to pipelines/ under another "
+            "name and change that there"
         )
     matching = {
         override
@@ -423,13 +447,16 @@ def _part_jobs(
     for key in SAME_IN_A_PART:
         if any(job.config[key] != jobs[0].config[key] for job in jobs):
             raise ConfigurationError(
-                f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own"
+                f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of "
+                "its own"
             )
     return jobs
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
+    """Those overrides that change what comes out: not where data come from, where results go, or
+    tracking.
+    """
     return [
         override
         for override in overrides
@@ -438,9 +465,11 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
-    """A study with one sweep: all combinations of overrides over their seeds, in the order of the command; raises `ConfigurationError`.
+    """A study with one sweep: all combinations of overrides over their seeds, in the order of the
+    command; raises `ConfigurationError`.
 
-    A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
+    A combination that its estimator refuses stays in the list with the reason. By default the study
+    is named after estimators and split.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")
@@ -458,7 +487,8 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
         for key in swept:
             if key.split(".")[0] in SINGLE_VALUED:
                 raise ConfigurationError(
-                    f"'{key}' takes one value in a sweep, whose combinations are compared with each other; run one sweep a value"
+                    f"'{key}' takes one value in a sweep, whose combinations are compared with "
+                    "each other; run one sweep a value"
                 )
         unseeded = [override for override in overrides if key_of(override) != "seed"]
         combinations = [
@@ -478,7 +508,8 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
     split = str(usable[0]["split"]["name"])
     study = (
         name
-        or f"{'_'.join(dict.fromkeys(str(config['estimator']['name']) for config in usable))}-{split}"
+        or "_".join(dict.fromkeys(str(config["estimator"]["name"]) for config in usable))
+        + f"-{split}"
     )
     check_name(study, "--name")
     words = [*map(shlex.quote, content_overrides(overrides)), *(["--name", study] if name else [])]

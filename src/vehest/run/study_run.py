@@ -1,6 +1,8 @@
-"""Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is printed and published.
+"""Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is
+printed and published.
 
-jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
+jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> results/ and
+`RunCache.save`
 """
 
 from __future__ import annotations
@@ -83,7 +85,9 @@ MAX_NAMED = 6  # trainings in one message
 def open_runner(
     config: Config, options: RunOptions, stages: Collection[str], study: str = ""
 ) -> Iterator[Runner]:
-    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
+    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs
+    under a study, if there is one.
+    """
     messages = Messages(quiet=options.quiet)
     stop = StopSignals()
     output = Path(config["output"])
@@ -122,18 +126,22 @@ def run_study(
     sweep: bool = False,
     only_report: bool = False,
 ) -> Ran:
-    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that overrides changed is not published.
+    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that
+    overrides changed is not published.
 
     Args:
-        name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
+        name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the
+            estimators and the split.
         overrides: for all jobs that have their key; of a sweep, with several values.
         cache: keeps the finished study.
         sweep: whether the overrides make a sweep.
         only_report: train and evaluate nothing.
 
     Raises:
-        JobsFailedError: some jobs of a study in parts, or all of another, failed; finished artefacts are kept.
-        DataError: recordings lack what some job of a study in parts, or all of another, needs; nothing was trained.
+        JobsFailedError: some jobs of a study in parts, or all of another, failed; finished
+            artefacts are kept.
+        DataError: recordings lack what some job of a study in parts, or all of another, needs;
+            nothing was trained.
         MissingError: raw files are missing, or ``only_report`` and a training is.
         DryRunStop: in a dry run.
     """
@@ -242,7 +250,10 @@ def run_study(
 
 
 def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeights:
-    """The published weights of a study, which each training adds to; raises `ConfigurationError` where it is not published so."""
+    """The published weights of a study, which each training adds to.
+
+    Raises `ConfigurationError` where it is not published so.
+    """
     changes = content_overrides(overrides)
     if not study.publish or changes:
         why = f"leave out '{changes[0]}'" if changes else "it needs publish: true"
@@ -257,7 +268,9 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
 
 
 def _trains_missing(study: Study, overrides: Sequence[str], options: RunOptions) -> bool:
-    """Whether a run trains what is missing: as its option says, else unless the study is published without some trainings."""
+    """Whether a run trains what is missing: as its option says, else unless the study is published
+    without some trainings.
+    """
     if options.train_missing is not None:
         return options.train_missing
     trains = options.force or options.retrain or options.publish_weights
@@ -268,7 +281,9 @@ def _trains_missing(study: Study, overrides: Sequence[str], options: RunOptions)
 
 
 def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None:
-    """Print how many trainings neither exist here nor are published, before the first of them begins."""
+    """Print how many trainings neither exist here nor are published, before the first of them
+    begins.
+    """
     if runner.weights is None or not runner.weights.path.is_file() or runner.train_first:
         return
     plans = {
@@ -291,7 +306,9 @@ def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
-    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time."""
+    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in
+    time.
+    """
     if minutes is None:
         return None
     if not minutes > 0:
@@ -305,7 +322,10 @@ def _first(jobs: Sequence[Job]) -> Config:
 
 
 def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
-    """Part -> its planned jobs, before anything is trained; optional parts whose raw files are missing are left out."""
+    """Part -> its planned jobs, before anything is trained.
+
+    Optional parts whose raw files are missing are left out.
+    """
     comparisons: dict[str, Comparison] = {}
     for name, part in study.parts.items():
         try:
@@ -319,14 +339,16 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
             runner.messages.warn(f"{error}; the study goes on without part '{name}'")
     if study.parts and not comparisons:
         raise MissingError(
-            f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER"
+            f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give "
+            "root=FOLDER"
         )
     for comparison in comparisons.values():
         with suppress(DryRunStop):
             comparison.plan(runner)
             if not comparison.evaluation.split.test_spans:
                 raise ConfigurationError(
-                    f"split '{comparison.evaluation.split.name}' has no test ranges to compare estimators on"
+                    f"split '{comparison.evaluation.split.name}' has no test ranges to compare "
+                    "estimators on"
                 )
     reasons = failure_messages(
         job for comparison in comparisons.values() for job in comparison.jobs
@@ -337,7 +359,9 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
 
 
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
-    """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
+    """An ingested data set of a study of recordings alone, or an optional one whose raw files are
+    missing.
+    """
     dataset = config["dataset"]
     title, licence, citation = (
         " ".join(str(dataset.get(key, dataset["name"])).split())
@@ -365,7 +389,10 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
 def _error_of(
     study: Study, comparisons: Mapping[str, Comparison], runner: Runner
 ) -> JobsFailedError | None:
-    """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
+    """The error that a study ends with after its report.
+
+    Raised at once where there is nothing to report, or not without what failed.
+    """
     reasons: dict[str, list[str]] = {}
     for name, failure in (
         pair for comparison in comparisons.values() for pair in named_failures(comparison.jobs)
@@ -399,7 +426,8 @@ def _error_of(
         raise error
     if nothing:
         raise DataError(
-            f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}"
+            "no estimator was done in this time; the same command goes on with: "
+            f"{', '.join(unfinished)}"
         )
     if unfinished and not runner.dry_run:
         going_on = command_line("run" if study.file.name else "sweep", study.words)
@@ -414,7 +442,10 @@ def _error_of(
 
 
 def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
+    """Train and calibrate one estimator.
+
+    Empty where it was stopped before its first epoch was over; raises `VehestError`.
+    """
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
         members, failures = runner.run(Comparison([Job(config)]).plan(runner))
@@ -438,7 +469,11 @@ def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, 
 def evaluate_model(
     overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Evaluate a model by folder or start of its name, or the one that overrides train, on the tests of a split; raises `MissingError`."""
+    """Evaluate a model by folder or start of its name, or the one that overrides train, on the
+    tests of a split.
+
+    Raises `MissingError`.
+    """
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)
@@ -459,7 +494,8 @@ def evaluate_model(
             if (model_found := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
-                    f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
+                    f"{plan.label} has not been trained; run '{command_line('train', training)}' "
+                    "first"
                 )
             assert group.evaluation is not None
             trained = model_found
@@ -476,7 +512,9 @@ def evaluate_model(
 
 
 def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Artefact | None:
-    """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
+    """The calibration of a model: made on the split that it is evaluated on if it was trained
+    there, else looked for.
+    """
     learnt = learnt_spans(model)
     calibration = None
     if model.status == "complete" and (

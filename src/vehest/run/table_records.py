@@ -1,10 +1,13 @@
-"""Records of tables in results/ that a command outside pipelines made, and their comparison with today's code and raw files.
+"""Records of tables in results/ that a command outside pipelines made, and their comparison with
+today's code and raw files.
 
-command -> `record_tables` -> ``tables`` and ``keys`` in provenance.json of the folder -> `changes_of_tables` -> `vehest report --check`
+command -> `record_tables` -> ``tables`` and ``keys`` in provenance.json of the folder ->
+`changes_of_tables` -> `vehest report --check`
 
-A key is named ``TABLE: WHAT``. WHAT is ``content`` (the table as it was written), ``script FILE`` (the line ``VERSION = "…"`` of the
-script that made it), ``data DATASET`` (its ingest and raw files), ``files PATTERN`` (raw files below VEHEST_DATA that belong to no data
-set) or a stage with a name, ``train ksnn``.
+A key is named ``TABLE: WHAT``. WHAT is ``content`` (the table as it was written), ``script FILE``
+(the line ``VERSION = "…"`` of the script that made it), ``data DATASET`` (its ingest and raw
+files), ``files PATTERN`` (raw files below VEHEST_DATA that belong to no data set) or a stage with a
+name, ``train ksnn``.
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ VERSION_LINE = re.compile(r'^VERSION = "(.+?)"', re.MULTILINE)
 
 
 class RowKeys(NamedTuple):
-    """Keys of a table's groups of rows, where a command may make some groups alone, as ``--only gru``.
+    """Keys of a table's groups of rows, where a command may make some groups alone, as ``--only
+    gru``.
 
     Attributes
     ----------
@@ -57,14 +61,17 @@ def record_tables(
     Args:
         tables: files just written, all in one folder; files that are not there are left out.
         command: what makes them again.
-        determined_by: what else all numbers follow from, as in the names of keys. While rows of an earlier run
-            stay, a recorded key of it stays too: the table is stale until all rows are made with today's.
+        determined_by: what else all numbers follow from, as in the names of keys. While rows of an
+            earlier run stay, a recorded key of it stays too: the table is stale until all rows are
+            made with today's.
         without_keys: what of them was made before keys were recorded.
-        rows: further keys, each of some rows; groups without a recorded key are named as ``without_keys``.
+        rows: further keys, each of some rows; groups without a recorded key are named as
+            ``without_keys``.
 
     Raises:
-        MissingError: raw files that the numbers follow from are not here, as where a record is written
-            after the tables; without their digest the tables would be stale wherever the files are.
+        MissingError: raw files that the numbers follow from are not here, as where a record is
+            written after the tables; without their digest the tables would be stale wherever the
+            files are.
     """
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
@@ -140,7 +147,10 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str] = (),
 ) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when tables were made and its cause; a note on what was not compared."""
+    """Pairs of what differs from when tables were made and its cause.
+
+    A note on what was not compared.
+    """
     changes = []
     missing = []
     for key, then in keys.items():

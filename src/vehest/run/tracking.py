@@ -1,6 +1,8 @@
-"""Logs trainings, calibrations and evaluations to MLflow, one run an artefact, found again by its tags.
+"""Logs trainings, calibrations and evaluations to MLflow, one run an artefact, found again by its
+tags.
 
-One process writes. When the store does not answer, work goes on without it, and the next run logs the missing artefacts.
+One process writes. When the store does not answer, work goes on without it, and the next run logs
+the missing artefacts.
 """
 
 from __future__ import annotations
@@ -60,7 +62,10 @@ class Tracker:
 
     @property
     def store(self) -> str:
-        """Name of the local store in the output root; empty where nothing is tracked, or a server has the runs."""
+        """Name of the local store in the output root.
+
+        Empty where nothing is tracked, or a server has the runs.
+        """
         return STORE if self.config.get("name") == "mlflow" and not self.config.get("uri") else ""
 
     def log(self, *artefacts: Artefact | None) -> None:
@@ -77,7 +82,8 @@ class Tracker:
         except Exception as error:  # results matter more than any failure of a tracking server
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
             self.warn(
-                f"logging to MLflow at {printable(self._address)} failed ({why}); going on without tracking, the next run makes up for it"
+                f"logging to MLflow at {printable(self._address)} failed ({why}); going on without "
+                "tracking, the next run makes up for it"
             )
 
     def _log(self, artefact: Artefact) -> None:

@@ -70,12 +70,22 @@ class TrainJob:
 
 
 def estimator_rate(config: Mapping[str, Any]) -> float:
-    """The rate that the estimator of a configuration works at [Hz]; raises `ConfigurationError` for a wrong setting."""
+    """The rate that the estimator of a configuration works at [Hz].
+
+    Raises
+    ------
+    ConfigurationError
+        A wrong setting.
+    """
     return new_estimator(config["estimator"]).settings.rate_hz
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
+    """A training and its artefact.
+
+    Raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a
+    recording.
+    """
     estimator = new_estimator(config["estimator"])
     seed = config["seed"]
     options = training_options(config)
@@ -85,7 +95,8 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         split = replace(split, train=(), validation=())
     elif not split.train:
         raise ConfigurationError(
-            f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' learns; take another split"
+            f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' "
+            "learns; take another split"
         )
     ranges = {
         "train": [_plain(span) for span in split.train],
@@ -116,7 +127,11 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
 
 
 def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a training that enter its key: those that differ from their defaults, and the seed; raises `ConfigurationError`."""
+    """Options of a training that enter its key: those that differ from their defaults, and the
+    seed.
+
+    Raises `ConfigurationError`.
+    """
     estimator = new_estimator(config["estimator"])
     training: Any = settings_from_config(estimator.training_type, config["training"], "training")
     changed = changed_options(training)
@@ -138,7 +153,13 @@ def _plain(span: Span) -> dict[str, str]:
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone; raises `DataError` where recordings do not fit the estimator."""
+    """Train the jobs of one group together, each as if it were alone.
+
+    Raises
+    ------
+    DataError
+        Recordings do not fit the estimator.
+    """
     first = jobs[0]
     members = [new_estimator(job.estimator) for job in jobs]
     for member, job in zip(members, jobs, strict=True):
@@ -156,7 +177,9 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
-    """Write a fitted estimator, its history, its figures and, in a file of their own, its times into ``folder``."""
+    """Write a fitted estimator, its history, its figures and, in a file of their own, its times
+    into ``folder``.
+    """
     about = {
         "seed": job.seed,
         "trained_on": [span.describe() for span in job.split.train],
@@ -223,7 +246,9 @@ def trained_rate(model: Artefact) -> float:
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
-    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles."""
+    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those
+    of the named roles.
+    """
 
     def ranges(config: Mapping[str, Any]) -> list[Span]:
         return [
@@ -251,7 +276,9 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
 
 
 def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as
+    `pretrained_folder` or a saved model.
+    """
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != STAGE:

@@ -20,7 +20,8 @@ FAULTS = "3"  # of an evaluation's faults, likewise
 
 
 def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
-    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or study by name, and of ``faults``.
+    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or
+    study by name, and of ``faults``.
 
     Raises `ConfigurationError` where the name is unknown.
     """
@@ -37,7 +38,8 @@ def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
 
 
 def is_of_other_stages(code: str) -> bool:
-    """Whether a recorded version names another version of a stage than today's, or is a hash of code, as versions were before.
+    """Whether a recorded version names another version of a stage than today's, or is a hash of
+    code, as versions were before.
 
     Versions of classes are not compared.
     """

@@ -1,6 +1,7 @@
 """The study of one car: estimators trained on some ranges of its drives and compared on others.
 
-Used by the pipelines ``ferrari_drive`` and ``quickstart``. `documents` makes the report, `leaderboard` the table in it.
+Used by the pipelines ``ferrari_drive`` and ``quickstart``. `documents` makes the report,
+`leaderboard` the table in it.
 """
 
 from __future__ import annotations
@@ -110,7 +111,8 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 
 
 def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> Document:
-    """The report of a comparison: verdict, figures of the first test set, minutes of reference; then the appendices.
+    """The report of a comparison: verdict, figures of the first test set, minutes of reference;
+    then the appendices.
 
     Parameters
     ----------
@@ -196,17 +198,21 @@ def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
 
 
 def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
-    """One row per test set and (estimator, variant), the lowest RMSE(β) over all seeds of a test set first.
+    """One row per test set and (estimator, variant), the lowest RMSE(β) over all seeds of a test
+    set first.
 
-    ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 % interval over blocks of the drive and seeds;
-    ``_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
-    figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on the validation range (the lower seed of
-    two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to best) are
-    corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
-    ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``, at which sideslip is not scored.
-    ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol passes the true
-    initial state, else ``own``.
-    Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
+    ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 %
+    interval over blocks of the drive and seeds; ``_median``, ``_min``, ``_max`` and ``_std``
+    (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
+    figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on
+    the validation range (the lower seed of two equals): test data choose nothing. ``beats_zero``,
+    ``beats_static_map`` and ``against_best`` (difference to best) are corrected by Holm
+    (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there
+    is none. ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``,
+    at which sideslip is not scored. ``epochs`` is NaN for a method without. ``start`` is
+    ``reference`` if the protocol passes the true initial state, else ``own``. Sideslip in deg,
+    velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation
+    metrics.
     """
     runs = runs_of(artefacts)
     start = "reference" if artefacts.protocol.initial_state else "own"
@@ -280,7 +286,10 @@ def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
         for span in spans[:3]
     )
     if len(spans) > 3:
-        ranges = f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
+        ranges = (
+            f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} "
+            "recordings"
+        )
     return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {ranges})"
 
 
@@ -290,7 +299,10 @@ def data_sentence(artefacts: PartArtefacts) -> str:
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
         kind = next(iter(kinds.values()))
-        return f"**{kind.capitalize()} data:** every number here comes from {kind} recordings ({'; '.join(titles.values())})."
+        return (
+            f"**{kind.capitalize()} data:** every number here comes from {kind} recordings "
+            f"({'; '.join(titles.values())})."
+        )
     parts = "; ".join(f"{titles[dataset]} ({kind})" for dataset, kind in kinds.items())
     return f"**Real and simulated data:** {parts}."
 
@@ -304,7 +316,10 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
         if len(counts) == 1
         else f"{counts[0]} to {counts[-1]} seeds each"
     )
-    words = f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with {seeds}, {len(artefacts.models)} fits in all"
+    words = (
+        f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with "
+        f"{seeds}, {len(artefacts.models)} fits in all"
+    )
     runs = runs_of(artefacts)
     epochs = np.array(
         [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]
@@ -331,18 +346,25 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     ]
 
 
-CHOICE = "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing."
+CHOICE = (
+    "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. "
+    "Test data choose nothing."
+)
 
 
 def how_it_was_made(
     artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)
 ) -> tuple[str, Table]:
-    """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table ``ranges``."""
+    """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table
+    ``ranges``.
+    """
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values. Estimators may "
-        f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never "
+        "interpolated from later values. Estimators may "
+        f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first "
+        f"{protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored, for anyone.{protocol.start_description}",
         f"Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike."
         f"{protocol.describe_sideslip(artefacts.split.datasets)}{_describe_excluded(artefacts)}",
@@ -463,7 +485,8 @@ def _figures_of(
     remark = ""
     if len(rows) < len(finite):
         remark = (
-            f" Figures of signals show {len(rows)} of them: those with the lowest RMSE(v) on validation, the best on the test "
+            f" Figures of signals show {len(rows)} of them: those with the lowest RMSE(v) on "
+            "validation, the best on the test "
             "and the recommended one."
         )
     opening: list[Block] = [busiest_block(signals, file)]
@@ -512,7 +535,9 @@ def _sections_of_test(
 
 
 def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
-    """Section ``Minutes of reference``: how much was recorded for each role, and how hard it was driven."""
+    """Section ``Minutes of reference``: how much was recorded for each role, and how hard it was
+    driven.
+    """
     split = artefacts.split
     roles = {
         "training": split.train,
@@ -545,7 +570,10 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
         "sideslip_99": Column("|β|, 99 % [deg]", decimals=1),
     }
     frame = pd.DataFrame(rows)
-    caption = "Minutes of recording with a reference of v, and 99th percentiles of lateral acceleration and sideslip in them."
+    caption = (
+        "Minutes of recording with a reference of v, and 99th percentiles of lateral "
+        "acceleration and sideslip in them."
+    )
     columns = {name: column for name, column in columns.items() if name in frame}
     return ["## Minutes of reference", Table("minutes", caption, frame, columns)]
 
@@ -571,7 +599,8 @@ def _forest(
         for row in board.to_dict("records")
     ]
     caption = (
-        f"RMSE(β) of every estimator over all its seeds with its 95 % interval, on {_describe_test_set(artefacts, test_set)}. "
+        "RMSE(β) of every estimator over all its seeds with its 95 % interval, on "
+        f"{_describe_test_set(artefacts, test_set)}. "
         "Filled: the best and those that are not significantly worse."
     )
     return Figure(f"forest_{file_of(test_set)}", caption, forest_figure(rows))
@@ -592,10 +621,14 @@ def _leaderboard_table(
     ]
     ranked = Table(
         name,
-        f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
-        "another drive of this kind and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
-        "validation. The difference to the best, and whether an estimator is significantly better than zero and the static map: "
-        "paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v that remains unexplained."
+        f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the "
+        "lowest first, with its 95 % interval for "
+        "another drive of this kind and another training; training, validation, RMSE(v) and FVU "
+        "are those of the seed chosen on "
+        "validation. The difference to the best, and whether an estimator is significantly better "
+        "than zero and the static map: "
+        "paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v "
+        "that remains unexplained."
         f"{bound if has_bound else ''}",
         frame,
         {
@@ -623,7 +656,8 @@ def _leaderboard_table(
     )
     seeds = Table(
         f"{name}_seeds",
-        "RMSE(β) of single seeds: the one chosen on validation, median, lowest, highest and sample standard deviation (s.d.); p99 and peak "
+        "RMSE(β) of single seeds: the one chosen on validation, median, lowest, highest and sample "
+        "standard deviation (s.d.); p99 and peak "
         "are the 99th percentile and the maximum of the absolute error of β of the chosen one.",
         frame,
         {
@@ -646,7 +680,8 @@ def _leaderboard_table(
 def _drawn_rows(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
     """At most `MOST_SHOWN` rows in the order of the board, picked by validation.
 
-    Where an estimator is ``named``, it comes first, and the best on the test is among them, since the verdict names both.
+    Where an estimator is ``named``, it comes first, and the best on the test is among them, since
+    the verdict names both.
     """
     ours = (
         (board["estimator"] == named[0]) & (board["variant"] == named[1])
@@ -680,7 +715,8 @@ def _training(
     if not runs:
         return []
     caption = (
-        "Loss over the epochs of each chosen seed: mean squared error of v on training and validation ranges. The marker is where the "
+        "Loss over the epochs of each chosen seed: mean squared error of v on training and "
+        "validation ranges. The marker is where the "
         "validation loss is lowest, whose weights are kept."
     )
     return ["## Training", Figure("learning", caption, figures.learning_curves(runs))]

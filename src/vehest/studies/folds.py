@@ -1,6 +1,8 @@
-"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated by a model that was not trained on it.
+"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated
+by a model that was not trained on it.
 
-Used by pipelines whose split has ``folds``. Errors of all folds count together, so that the whole recording decides, not one segment of it.
+Used by pipelines whose split has ``folds``. Errors of all folds count together, so that the whole
+recording decides, not one segment of it.
 """
 
 from __future__ import annotations
@@ -30,7 +32,11 @@ VERSION = "3"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as the appendix; raises `DataError`."""
+    """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as
+    the appendix.
+
+    Raises `DataError`.
+    """
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
@@ -80,7 +86,9 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
-    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold."""
+    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors
+    in every fold.
+    """
     groups = [
         {
             name: {model.seed: model for model in models}
@@ -113,7 +121,9 @@ def overview(
     titles: Mapping[Name, str],
     parts: Sequence[str],
 ) -> pd.DataFrame:
-    """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands, and its error in each fold [deg]."""
+    """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands,
+    and its error in each fold [deg].
+    """
     rows = []
     for name in ranking.order:
         seeds = folds[name]
@@ -169,8 +179,10 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         **{part: Column(part.replace("_", " "), decimals=decimals) for part in parts},
     }
     caption = (
-        "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
-        "difference to best, and whether an estimator is significantly better than zero and the static map: paired, corrected by Holm."
+        "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over "
+        "blocks of the drives and seeds. The "
+        "difference to best, and whether an estimator is significantly better than zero and the "
+        "static map: paired, corrected by Holm."
     )
     frame = board.drop(columns=["estimator", "variant"]).assign(
         interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]

@@ -1,8 +1,10 @@
-"""The study of a user's car: which estimator is recommended on it and with which error; then the comparison as of any drive.
+"""The study of a user's car: which estimator is recommended on it and with which error; then the
+comparison as of any drive.
 
-Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was recorded; further ones, with
-``split.minutes``, make the curve of how much reference is needed. `documents` makes the report, `leaderboard` the table in it, `verdict`
-what the terminal says at the end.
+Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was
+recorded; further ones, with ``split.minutes``, make the curve of how much reference is needed.
+`documents` makes the report, `leaderboard` the table in it, `verdict` what the terminal says at the
+end.
 """
 
 from __future__ import annotations
@@ -39,7 +41,10 @@ Verdict = tuple[
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Verdict, figures and next commands; then the appendices: what was not compared and the whole comparison."""
+    """Verdict, figures and next commands.
+
+    Then the appendices: what was not compared and the whole comparison.
+    """
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
     commands = "\n".join(_commands(artefacts, verdicts))
@@ -75,7 +80,9 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
-    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be expected, and what it beats."""
+    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be
+    expected, and what it beats.
+    """
     recommendation = recommendation_of(part, test_set)
     sentences = recommendation.describe(_reach(part, test_set))
     if not recommendation.ranking.order:
@@ -89,7 +96,9 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
 
 
 def _comparison_with_plain(recommendation: Recommendation) -> str:
-    """How the recommended estimator compares with the plain ones other than the baselines, which it beats."""
+    """How the recommended estimator compares with the plain ones other than the baselines, which it
+    beats.
+    """
     ranking = recommendation.ranking
     name = recommendation.model.name if recommendation.model is not None else ranking.order[0]
     sentences = {
@@ -138,14 +147,23 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
         for angles in (counted, left_out)
     )
     words = f"{fixed(share, 0)} % of the test is scored"
-    words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
+    words += (
+        f", without the first {protocol.skip_seconds:g} s of its {len(scored)} "
+        f"{protocol.piece}{'s' if len(scored) > 1 else ''}"
+    )
     if largest_hidden > largest:
-        words += f", **which contain the largest sideslip** ({fixed(largest_hidden, 1)}°; scored: up to {fixed(largest, 1)}°)"
+        words += (
+            f", **which contain the largest sideslip** ({fixed(largest_hidden, 1)}°; scored: up "
+            f"to {fixed(largest, 1)}°)"
+        )
     if n_slow:
         speed = protocol.describe_min_sideslip_speed(
             span.dataset for span in part.split.tests[test_set]
         )
-        words += f"; in {fixed(100.0 * n_slow / len(counted), 1)} % of that the car is slower than {speed}, and only v is scored"
+        words += (
+            f"; in {fixed(100.0 * n_slow / len(counted), 1)} % of that the car is slower than "
+            f"{speed}, and only v is scored"
+        )
     return f"{words}."
 
 
@@ -163,7 +181,8 @@ def _commands(artefacts: StudyArtefacts, verdicts: Mapping[str, Verdict]) -> lis
     name = models[0][0].model_folder.name
     dataset = models[0][1]
     return [
-        f"vehest estimate {name} YOUR_LOG dataset={dataset}{location} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
+        f"vehest estimate {name} YOUR_LOG dataset={dataset}{location} -o beta.csv   # v, β, "
+        "bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name}{location} -o on_the_car    # the same in C99",
         f"{artefacts.report_command}                 # this report again",
     ]
@@ -185,7 +204,9 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
 
 
 def _hard_driving(part: PartArtefacts) -> str:
-    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one over the root of the time."""
+    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one
+    over the root of the time.
+    """
     split = part.split
     spans = (*split.train, *split.validation, *split.test_spans)
     ay = _samples(part, spans, "ay")
@@ -194,7 +215,8 @@ def _hard_driving(part: PartArtefacts) -> str:
     minutes = float((np.abs(ay) > HARD).sum()) / part.protocol.rate_hz / 60.0
     if minutes < 0.5:
         return (
-            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above {HARD:g} m/s²: record at least ten minutes "
+            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above {HARD:g} m/s²: "
+            "record at least ten minutes "
             "of harder driving."
         )
     return (
@@ -204,7 +226,10 @@ def _hard_driving(part: PartArtefacts) -> str:
 
 
 def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatArray:
-    """Samples of a channel over ranges, at the evaluation rate, end to end; none where a recording lacks it."""
+    """Samples of a channel over ranges, at the evaluation rate, end to end.
+
+    None where a recording lacks it.
+    """
     samples = []
     for span in spans:
         file = part.references.get((span.dataset, span.recording))
@@ -218,7 +243,10 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
 
 
 def not_compared(part: PartArtefacts) -> list[str]:
-    """Families that were not compared, each with the channels that its plainest form lacks; those that failed or had no time come first."""
+    """Families that were not compared, each with the channels that its plainest form lacks.
+
+    Those that failed or had no time come first.
+    """
     lines = [f"{name}: {reason}" for name, reason in part.failed.items()]
     compared = {model.estimator for model in part.models} | {
         name.split("-")[0] for name in part.failed

@@ -1,7 +1,9 @@
-"""The study of how many minutes with a reference an estimator needs, over several cars: its error over the minutes, a learning curve.
+"""The study of how many minutes with a reference an estimator needs, over several cars: its error
+over the minutes, a learning curve.
 
-Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and ``split.minutes_at``, and in whether trainings
-start from another model (``training.start_from``). Minutes count training and validation together, since both need the sensor.
+Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and
+``split.minutes_at``, and in whether trainings start from another model (``training.start_from``).
+Minutes count training and validation together, since both need the sensor.
 """
 
 from __future__ import annotations
@@ -109,7 +111,10 @@ class Curve:
 
 
 def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
-    """A curve for every test set of parts that share it; test sets with a single amount of reference make none."""
+    """A curve for every test set of parts that share it.
+
+    Test sets with a single amount of reference make none.
+    """
     groups: dict[tuple[str, tuple[Span, ...]], list[PartArtefacts]] = {}
     for part in parts:
         for test_set, spans in part.split.tests.items():
@@ -208,15 +213,18 @@ def minutes_of(part: PartArtefacts) -> float:
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """Sentences, figure and table of a curve; ``name`` ends the files' names."""
     caption = (
-        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference for training and "
-        f"validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
+        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a "
+        "reference for training and "
+        "validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: "
+        "zero-sideslip baseline."
     )
     return [
         _in_words(curve),
         Figure(f"reference_minutes_{name}", caption, _figure(curve)),
         Table(
             f"reference_minutes_{name}",
-            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive times seeds. The last column: compared with "
+            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive "
+            "times seeds. The last column: compared with "
             f"the same estimator from scratch on as many minutes, corrected by Holm.",
             pd.DataFrame(rows_of_curve(curve)),
             COLUMNS,
@@ -225,7 +233,9 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
 
 
 def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
-    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and how it stands to one from scratch."""
+    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and
+    how it stands to one from scratch.
+    """
     rows: list[dict[str, object]] = []
     for point in curve.points:
         if point.estimator != BASELINES[0]:
@@ -249,18 +259,24 @@ def _against_scratch(curve: Curve, point: Point) -> str:
 
 
 def _lines(curve: Curve) -> list[list[Point]]:
-    """Points by estimator and start, each with more minutes than the one before; none of the zero-sideslip baseline."""
+    """Points by estimator and start, each with more minutes than the one before.
+
+    None of the zero-sideslip baseline.
+    """
     groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
     return [list(points) for key, points in groups if key[0] != BASELINES[0]]
 
 
 def _in_words(curve: Curve) -> str:
-    """Errors with the fewest and the most minutes of reference, and significant effects of starting from another model."""
+    """Errors with the fewest and the most minutes of reference, and significant effects of starting
+    from another model.
+    """
     sentences = []
     for first, *_, last in (points for points in _lines(curve) if len(points) > 1):
         origin = "" if first.start == SCRATCH else f" ({first.start})"
         sentences.append(
-            f"{first.title}{origin}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
+            f"{first.title}{origin}: {fixed(curve.ranking.rmse[first.name], 2)}° after "
+            f"{first.minutes:g} min of reference, "
             f"{fixed(curve.ranking.rmse[last.name], 2)}° after {last.minutes:g} min."
         )
     better = [
@@ -275,7 +291,10 @@ def _in_words(curve: Curve) -> str:
         sentences.append(
             f"Starting from another model, the error is {' and '.join(effects)}."
             if effects
-            else "Starting from another model makes no significant difference to starting from scratch with any amount."
+            else (
+                "Starting from another model makes no significant difference to starting from "
+                "scratch with any amount."
+            )
         )
     return f"**{curve.title}.** " + " ".join(sentences)
 

@@ -1,7 +1,8 @@
 """Tables and heat maps of a sweep: every combination of settings, over its seeds.
 
-`SweepArtefacts.table` has a row a combination, `build` makes the report. The mean over seeds comes with a 95 % confidence interval from
-Student's t distribution. The combination is chosen on the validation range; tests choose nothing.
+`SweepArtefacts.table` has a row a combination, `build` makes the report. The mean over seeds comes
+with a 95 % confidence interval from Student's t distribution. The combination is chosen on the
+validation range; tests choose nothing.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
 Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
-"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and column of those with a frame."""
+"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and
+column of those with a frame.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,10 @@ class SweepArtefacts:
     keys: Sequence[
         str
     ]  # those that take several values, the seed aside, in the order of the command
-    # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
-    # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
+    # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status``
+    # (``done`` or ``failed``), ``error``,
+    # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for
+    # each set of `sets`; those of a
     # combination with a fault count the samples while it lasts
     jobs: pd.DataFrame
 
@@ -64,11 +69,13 @@ class SweepArtefacts:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """One row a combination, in the order of the jobs: its number, title, keys, parameters, seeds that are done and failed.
+        """One row a combination, in the order of the jobs: its number, title, keys, parameters,
+        seeds that are done and failed.
 
-        For each set ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed)
-        [deg]. ``chosen`` is the lowest mean on the validation range among those of which no seed failed; none where nothing was validated,
-        or where combinations differ in faults, the mildest of which would win.
+        For each set ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``,
+        half its 95 % interval (NaN for one seed) [deg]. ``chosen`` is the lowest mean on the
+        validation range among those of which no seed failed; none where nothing was validated, or
+        where combinations differ in faults, the mildest of which would win.
         """
         rows = []
         for number, jobs in self.jobs.groupby("combination", sort=False):
@@ -98,7 +105,9 @@ class SweepArtefacts:
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
+    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was
+    made.
+    """
     part = artefacts.part
     blocks: list[Block] = [
         data_sentence(part),
@@ -119,7 +128,8 @@ def build(artefacts: SweepArtefacts) -> Document:
 
 
 def interval(values: FloatArray) -> tuple[float, float]:
-    """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t distribution with n - 1 degrees of freedom.
+    """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t
+    distribution with n - 1 degrees of freedom.
 
     Returns:
         Mean and half interval; NaN where there are no values, half NaN for one value.
@@ -136,7 +146,10 @@ def interval(values: FloatArray) -> tuple[float, float]:
 
 
 def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
-    """A summary as a terminal shows it: headers, and rows of cells; the chosen combination has a star."""
+    """A summary as a terminal shows it: headers, and rows of cells.
+
+    The chosen combination has a star.
+    """
     names = short_names(artefacts.keys)
     table = artefacts.table
     header = ["", *(names.values() or ["estimator"]), "parameters", "seeds", *artefacts.sets]
@@ -160,7 +173,10 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
 
 
 def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
-    """A heat map for each set, where two numeric keys vary and any others are booleans; else none."""
+    """A heat map for each set, where two numeric keys vary and any others are booleans.
+
+    Else none.
+    """
     table = artefacts.table
     varied = [key for key in artefacts.keys if table[key].nunique() > 1]
     switches = [
@@ -187,8 +203,10 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
             panels.append(_panel(rows, title, name, numeric, cells))
         set_text = _set_in_words(name)
         caption = (
-            f"RMSE(β) on {set_text} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
-            f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
+            f"RMSE(β) on {set_text} over {across} and {up} ({_kinds(artefacts, name)}). In each "
+            "cell the mean over seeds and, "
+            "below it, half its 95 % confidence interval. The frame marks the combination chosen "
+            "on the validation range."
         )
         ticks = [[str(value) for value in values] for values in cells]
         figure = heat_map(panels, ticks[0], ticks[1], across, up, f"RMSE(β), {name} [deg]")
@@ -237,7 +255,10 @@ def heat_map(
     row_label: str,
     quantity: str,
 ) -> MatplotlibFigure:
-    """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
+    """Panels, (R, C) each, on one scale of colours, the darker the larger.
+
+    Logarithmic where the largest value is 20 times the smallest.
+    """
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
@@ -330,10 +351,16 @@ def _kinds(artefacts: SweepArtefacts, name: str) -> str:
 
 def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     if any(key.split(".")[0] == "fault" for key in artefacts.keys):
-        return "No combination is chosen: the combinations differ in faults, which are conditions of the evaluation and no settings."
+        return (
+            "No combination is chosen: the combinations differ in faults, which are conditions "
+            "of the evaluation and no settings."
+        )
     table = artefacts.table
     if not table["chosen"].any():
-        return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
+        return (
+            "No combination is chosen: there is no finite error on a validation range, and tests "
+            "choose nothing."
+        )
     row = table[table["chosen"]].iloc[0]
     names = short_names(artefacts.keys)
     settings = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
@@ -350,7 +377,10 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     half = float(row[f"{METRIC}_half.{VALIDATION}"])
     if len(table) > 1 and math.isfinite(half):
         close = int((table[f"{METRIC}.{VALIDATION}"] <= mean + half).sum()) - 1
-        words += f" {close} of the other {len(table) - 1} combinations have a mean on the validation range within its interval."
+        words += (
+            f" {close} of the other {len(table) - 1} combinations have a mean on the validation "
+            "range within its interval."
+        )
     return words
 
 
@@ -383,14 +413,20 @@ def _budget(jobs: pd.DataFrame) -> str:
         if len(epochs)
         else ""
     )
-    counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
+    counts = (
+        f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: "
+        f"{len(done)} of {len(jobs)} jobs done"
+    )
     return f"Budget: {counts}{took}"
 
 
 INTERVAL_AND_CHOICE = (
-    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
-    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
-    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
+    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ "
+    "s/√n, from Student's t distribution "
+    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what "
+    "another drive or car would",
+    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a "
+    "failed seed. Test data choose nothing",
     "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
 )
 
@@ -414,5 +450,8 @@ def _table(artefacts: SweepArtefacts) -> Table:
             frame[key] = [shown_value(value) for value in frame[key]]
         else:
             columns[key] = Column(names[key], each=True)
-    caption = "All combinations in the order of the command: mean RMSE(β) over seeds, and half its 95 % confidence interval."
+    caption = (
+        "All combinations in the order of the command: mean RMSE(β) over seeds, and half its 95 "
+        "% confidence interval."
+    )
     return Table("combinations", caption, frame, {**columns, "chosen": Column("on validation")})

@@ -1,6 +1,8 @@
-"""The study of several vehicles, each tested by estimators that have learnt on others: which family carries over from which cars to which.
+"""The study of several vehicles, each tested by estimators that have learnt on others: which family
+carries over from which cars to which.
 
-A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles carry no interval over vehicles.
+A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles
+carry no interval over vehicles.
 """
 
 from __future__ import annotations
@@ -60,7 +62,11 @@ REFERENCES = (
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how it was made; raises `DataError`."""
+    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how
+    it was made.
+
+    Raises `DataError`.
+    """
     parts = artefacts.parts
     rankings = {
         (name, test_set): ranking_of(part, test_set)
@@ -69,8 +75,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     }
     board = overview(parts, rankings)
     caption = (
-        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an estimator is better than it. The "
-        "vertical line in each row is the static map, whose two numbers are fitted on the same ranges."
+        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, "
+        "an estimator is better than it. The "
+        "vertical line in each row is the static map, whose two numbers are fitted on the same "
+        "ranges."
     )
     blocks: list[Block] = [
         Figure("transfer", caption, _drawn(board)),
@@ -97,7 +105,9 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def overview(
     parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
 ) -> pd.DataFrame:
-    """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its interval [deg], and what it beats."""
+    """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its
+    interval [deg], and what it beats.
+    """
     nothing: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
     nothing |= dict.fromkeys(
         (*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING
@@ -126,7 +136,10 @@ def overview(
 
 
 def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str, float]:
-    """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m]; NaN where the point is known."""
+    """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m].
+
+    NaN where the point is known.
+    """
     metrics = part.metrics
     rows = metrics[
         (metrics["condition"] == "best_lever_arm")
@@ -147,7 +160,9 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
 
 
 def carried_over(board: pd.DataFrame) -> str:
-    """Sentences: on which vehicles an estimator is significantly better than zero and the static map."""
+    """Sentences: on which vehicles an estimator is significantly better than zero and the static
+    map.
+    """
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     tested = board[~board["estimator"].isin(BASELINES)]
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
@@ -159,15 +174,22 @@ def carried_over(board: pd.DataFrame) -> str:
         if len(names) == len(rows) == len(places):
             everywhere.append(str(title))
         lines.append(
-            f"- {title}: {len(names)} of {len(rows)}{f' ({listed(places_beaten)})' if places_beaten else ''}"
+            f"- {title}: {len(names)} of "
+            f"{len(rows)}{f' ({listed(places_beaten)})' if places_beaten else ''}"
         )
     if everywhere:
-        first = f"On every one of {len(places)} tests {listed(everywhere)} are significantly better than zero and the static map."
+        first = (
+            f"On every one of {len(places)} tests {listed(everywhere)} are significantly better "
+            "than zero and the static map."
+        )
     else:
-        first = f"**No estimator is significantly better than both zero and the static map on each of the {len(places)} tests.**"
+        first = (
+            "**No estimator is significantly better than both zero and the static map on each "
+            f"of the {len(places)} tests.**"
+        )
     return (
-        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten significantly:\n\n"
-        + "\n".join(lines)
+        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which "
+        "both are beaten significantly:\n\n" + "\n".join(lines)
     )
 
 
@@ -188,8 +210,10 @@ def _matrix(board: pd.DataFrame) -> Table:
         for title, row in rows.items():
             row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
-        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * significantly better than zero and the "
-        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
+        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. "
+        "* significantly better than zero and the "
+        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite "
+        "error. Inputs may differ from "
         "vehicle to vehicle under one name; they are listed in the pipeline's file."
     )
     return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
@@ -207,7 +231,9 @@ def _cell(row: Mapping[Any, Any]) -> str:
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
-    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the static map as a vertical line."""
+    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the
+    static map as a vertical line.
+    """
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     names = list(
         dict.fromkeys(
@@ -309,14 +335,18 @@ def _part(
         "beats_zero": Column("beats zero"),
         "beats_static_map": Column("beats static map"),
     }
-    caption = f"{as_text(part.title)}: baselines first, then by error. Differences are paired over blocks and seeds, corrected by Holm."
+    caption = (
+        f"{as_text(part.title)}: baselines first, then by error. Differences are paired over "
+        "blocks and seeds, corrected by Holm."
+    )
     if board["rmse_sideslip_best_lever"].notna().any():
         columns |= {
             "rmse_sideslip_best_lever": Column("with the best lever [deg]", decimals=decimals),
             "lever_arm": Column("lever [m]", decimals=2),
         }
         caption += (
-            " Where the reference was measured is not known: the best lever arm, within 0.5 m, takes off the part of an error that is "
+            " Where the reference was measured is not known: the best lever arm, within 0.5 m, "
+            "takes off the part of an error that is "
             "one alone; it is chosen on the test, of each estimator for itself."
         )
     return [*blocks, Table(f"leaderboard_{name}", caption, table, columns)]

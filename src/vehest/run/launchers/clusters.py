@@ -1,9 +1,12 @@
-"""Groups as tasks of a Ray cluster, or as jobs of a SLURM queue through submitit; each can also be tried on this machine alone.
+"""Groups as tasks of a Ray cluster, or as jobs of a SLURM queue through submitit; each can also be
+tried on this machine alone.
 
-Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts in the driver's output root
+Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts
+in the driver's output root
 
-Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine, submitit a job whose time is up; both go
-on from the last checkpoint. Machines that do not share the output root get inputs through Ray's object store and return artefacts.
+Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine,
+submitit a job whose time is up; both go on from the last checkpoint. Machines that do not share the
+output root get inputs through Ray's object store and return artefacts.
 """
 
 from __future__ import annotations
@@ -60,7 +63,10 @@ class NotShared(Exception):
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A group with the driver's paths, relative ones by ``folder``; a machine that sees ``mark`` shares the output root."""
+    """A group with the driver's paths, relative ones by ``folder``.
+
+    A machine that sees ``mark`` shares the output root.
+    """
 
     position: int
     group: Group
@@ -90,9 +96,11 @@ def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
 
 
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
-    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where machines share the output root.
+    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where
+    machines share the output root.
 
-    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
+    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with
+    neither a shared root nor copies.
     """
     versions = versions_here()
     unlike = [
@@ -102,7 +110,8 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
     ]
     if unlike:
         raise MissingError(
-            f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine"
+            f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every "
+            "machine"
         )
     shared = spec.mark.is_dir()
     if not shared and copies is None:
@@ -160,7 +169,10 @@ def pack(folders: set[Path]) -> Files:
 
 
 def unpack(packed: Files) -> None:
-    """Put artefacts in their places, each whole or not at all, unless they are there; raises `DataError` or `MissingError`."""
+    """Put artefacts in their places, each whole or not at all, unless they are there.
+
+    Raises `DataError` or `MissingError`.
+    """
     for folder, files in packed.items():
         if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
             remove_leftovers(folder.parent)
@@ -172,7 +184,10 @@ def unpack(packed: Files) -> None:
 
 
 class RayLauncher:
-    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default ``RAY_ADDRESS``, else a Ray of its own."""
+    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's.
+
+    By default ``RAY_ADDRESS``, else a Ray of its own.
+    """
 
     def __init__(
         self, address: str | None, jobs: int | None, output: Path, messages: Messages
@@ -247,7 +262,8 @@ class RayLauncher:
             )
         except Exception as error:  # ConnectionError, RuntimeError, ValueError, … by what is wrong
             raise MissingError(
-                f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one"
+                f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head "
+                "starts one"
             ) from error
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
@@ -315,7 +331,13 @@ def _line(error: BaseException) -> str:
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """What jobs ask the queue for; raises `ConfigurationError` unless each is NAME=VALUE of `PARAMETERS`, positive where it must be."""
+    """What jobs ask the queue for.
+
+    Raises
+    ------
+    ConfigurationError
+        Unless each is NAME=VALUE of `PARAMETERS`, positive where it must be.
+    """
     parameters: dict[str, Any] = {
         "mem_gb": 2.0,
         "timeout_min": 60,
@@ -342,7 +364,10 @@ def _positive(name: str, text: str) -> float:
 
 
 class SlurmTask:
-    """A job; submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again."""
+    """A job.
+
+    Submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again.
+    """
 
     def __call__(self, spec: TaskSpec) -> Done:
         """Run a group until it is done or the driver asks for its end."""
@@ -356,7 +381,9 @@ class SlurmTask:
 
 
 class SlurmLauncher:
-    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of this machine."""
+    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of
+    this machine.
+    """
 
     def __init__(
         self,
@@ -368,7 +395,8 @@ class SlurmLauncher:
     ) -> None:
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise MissingError(
-                "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local"
+                "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it "
+                "with --address local"
             )
         self._cluster = cluster
         self._parameters = parameters

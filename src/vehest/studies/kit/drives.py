@@ -1,4 +1,6 @@
-"""Noise floor and Cramér-Rao bound of a test set, errors by regime and calibrated bands, as blocks of a report."""
+"""Noise floor and Cramér-Rao bound of a test set, errors by regime and calibrated bands, as blocks
+of a report.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ _FIGURES = (
 
 
 def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
-    """The reference's spread and noise, then the bounds without and with the car by set of inputs, of those that were measured."""
+    """The reference's spread and noise, then the bounds without and with the car by set of inputs,
+    of those that were measured.
+    """
     drives = drives_of(part.split.tests[test_set], part.reference, part.protocol)
     spread = reference_spread(drives)
     floors: list[tuple[str, str, Floor | None]] = [
@@ -76,10 +80,14 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
             )
     return Table(
         name,
-        f"Noise floor and Cramér-Rao bound of test set `{test_set}`, root mean square over the scored samples: the reference, the white noise "
-        f"in it (slow or smoothed errors are not included), and the posterior Cramér-Rao bound of causal estimators by their inputs. "
-        f"Bounds from kinematics alone use no parameters of the car; the others use its axles, with 23 % uncertainty of the tyres' "
-        f"stiffness and model errors as large as on this drive. An error below a bound shows that an estimator uses more information on "
+        f"Noise floor and Cramér-Rao bound of test set `{test_set}`, root mean square over the "
+        "scored samples: the reference, the white noise "
+        "in it (slow or smoothed errors are not included), and the posterior Cramér-Rao bound of "
+        "causal estimators by their inputs. "
+        "Bounds from kinematics alone use no parameters of the car; the others use its axles, "
+        "with 23 % uncertainty of the tyres' "
+        "stiffness and model errors as large as on this drive. An error below a bound shows that "
+        "an estimator uses more information on "
         f"the car than the bound's model.",
         pd.DataFrame(rows),
         {
@@ -126,9 +134,12 @@ def regime_table(
     }
     return Table(
         name,
-        f"RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets the share of samples. Straight: yaw rate "
-        f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
-        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {MIN_REGIME_SECONDS:g} s are left out.",
+        "RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets "
+        "the share of samples. Straight: yaw rate "
+        f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than "
+        f"{TRANSIENT['yaw_rate']:g} rad/s² or lateral "
+        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than "
+        f"{MIN_REGIME_SECONDS:g} s are left out.",
         pd.DataFrame(rows),
         {
             "title": Column("estimator"),
@@ -151,7 +162,10 @@ def band_blocks(
     lines: Mapping[Name, Line],
     file: str,
 ) -> list[Block]:
-    """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands."""
+    """Table ``bands_FILE`` and figure ``reliability_FILE``.
+
+    Nothing where no estimator has bands.
+    """
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows = []
     drawn = []
@@ -182,9 +196,12 @@ def band_blocks(
         return []
     table = Table(
         f"bands_{file}",
-        f"Calibrated 90 % bands of β on test set `{test_set}`: coverage, with the 95 % interval over blocks of the drive and the 10 "
-        f"and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full width; interval score and CRPS, which "
-        f"penalise wide bands; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and over how "
+        f"Calibrated 90 % bands of β on test set `{test_set}`: coverage, with the 95 % interval "
+        "over blocks of the drive and the 10 "
+        "and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full "
+        "width; interval score and CRPS, which "
+        "penalise wide bands; intraclass correlation of squared errors, 1 where an error lasts "
+        "for a whole manoeuvre; and over how "
         f"many equal manoeuvres the errors are spread.",
         pd.DataFrame(rows),
         {
@@ -202,7 +219,8 @@ def band_blocks(
     )
     figure = Figure(
         f"reliability_{file}",
-        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, with 95 % intervals over blocks. "
+        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, "
+        "with 95 % intervals over blocks. "
         f"On the diagonal, coverage is as stated; above it, bands are too wide.",
         reliability_figure(LEVELS, drawn),
     )

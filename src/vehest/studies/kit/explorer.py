@@ -1,4 +1,6 @@
-"""All signals of a test set for the page of a report: what was measured, the reference, estimates with bands and health, the course."""
+"""All signals of a test set for the page of a report: what was measured, the reference, estimates
+with bands and health, the course.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ from vehest.trust.record import TRUST, read_trust
 
 MOST_INPUTS = 16
 DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
-RECKONED = "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and drifts the longer it gets."
+RECKONED = (
+    "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and "
+    "drifts the longer it gets."
+)
 
 
 def explorer_of(
@@ -35,7 +40,8 @@ def explorer_of(
     Args:
         shown: (estimator, variant) -> model, title and looks, in the order of the board.
         scored: (estimator, variant) -> estimate and reference of each range, or sequence.
-        axis: first time [s], label of the time axis, samples between two ranges, and a range that deserves a button [s].
+        axis: first time [s], label of the time axis, samples between two ranges, and a range that
+            deserves a button [s].
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
@@ -118,7 +124,8 @@ def health_over(
     artefacts: PartArtefacts,
     gap: int,
 ) -> FloatArray | None:
-    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2 invalid, over all ranges.
+    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2
+    invalid, over all ranges.
 
     None where the model has no health, or reads another rate than that of the evaluation.
     """

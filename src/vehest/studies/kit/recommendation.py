@@ -1,4 +1,6 @@
-"""Which estimator of a comparison is recommended: one rule for the page, the Markdown report and the terminal."""
+"""Which estimator of a comparison is recommended: one rule for the page, the Markdown report and
+the terminal.
+"""
 
 from __future__ import annotations
 
@@ -61,18 +63,29 @@ class Recommendation:
             missing = [BASELINE_TITLES[baseline] for baseline in ranking.missing_baselines]
             if missing:
                 return f"**No estimator is recommended**: none was compared with {listed(missing)}."
-            return f"**No estimator is recommended**: none of these is significantly better than {baselines}."
+            return (
+                "**No estimator is recommended**: none of these is significantly better than "
+                f"{baselines}."
+            )
         title = self.titles[self.model.name]
-        expected = f"RMSE(β) {figure_of(ranking, self.model.name)}{f' for {condition}' if condition else ''}"
+        expected = (
+            "RMSE(β) "
+            f"{figure_of(ranking, self.model.name)}{f' for {condition}' if condition else ''}"
+        )
         if ranking.winner is not None:
             return (
-                f"**Recommended: {title}**, expected {expected}: it is significantly better than every "
+                f"**Recommended: {title}**, expected {expected}: it is significantly better than "
+                "every "
                 f"other estimator, {baselines}."
             )
         if len(ranking.recommendable) == 1:
-            return f"**Recommended: {title}**, expected {expected}: of these it alone is significantly better than {baselines}."
+            return (
+                f"**Recommended: {title}**, expected {expected}: of these it alone is "
+                f"significantly better than {baselines}."
+            )
         return (
-            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} estimators among these that are "
+            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} "
+            "estimators among these that are "
             f"significantly better than {baselines}, it has the lowest RMSE(v) on validation."
         )
 
@@ -80,9 +93,10 @@ class Recommendation:
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
     """What to recommend after a test set.
 
-    Recommended is the estimator that is significantly better than all others (`Ranking.winner`); without one, of those in
-    `Ranking.recommendable`, the one with the lowest RMSE(v) on validation. None is recommended where none is significantly
-    better than the zero-sideslip baseline and the static map, or where the test cannot rank estimators.
+    Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
+    without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.
+    None is recommended where none is significantly better than the zero-sideslip baseline and the
+    static map, or where the test cannot rank estimators.
 
     Raises
     ------
@@ -105,7 +119,10 @@ def plain_text(markdown: str) -> str:
 
 
 def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str]:
-    too_few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {MIN_BLOCKS} are needed"
+    too_few = (
+        f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at "
+        f"least {MIN_BLOCKS} are needed"
+    )
     return [*([too_few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
 
 

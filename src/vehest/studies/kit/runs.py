@@ -20,7 +20,11 @@ Runs = dict[
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
-    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by run and test set; raises `DataError`."""
+    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by
+    run and test set.
+
+    Raises `DataError`.
+    """
     nominal = nominal_rows(artefacts.metrics)
     columns = (
         nominal[name].tolist()
@@ -34,7 +38,8 @@ def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
             math.isnan(number) or math.isnan(run.get(metric, math.nan)) or run[metric] == number
         ):
             raise DataError(
-                f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on '{test_set}' is both {run[metric]:g} and "
+                f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on "
+                f"'{test_set}' is both {run[metric]:g} and "
                 f"{number:g}; give models that differ in more than the seed different variants"
             )
         if not math.isnan(number):
@@ -58,10 +63,15 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing; raises `DataError`."""
+    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data
+    choose nothing.
+
+    Raises `DataError`.
+    """
     if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
         raise DataError(
-            f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"
+            f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to "
+            "choose one by; evaluate it there"
         )
     validation = values_of(runs, name, seeds, VALIDATION, "rmse_vy")
     return seeds[int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))]

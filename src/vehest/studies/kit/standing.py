@@ -1,4 +1,6 @@
-"""Where the candidates of a comparison stand to each other and to the baselines: columns of a table, and sentences."""
+"""Where the candidates of a comparison stand to each other and to the baselines: columns of a
+table, and sentences.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,11 @@ BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the stat
 
 
 def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without infinite errors; raises `DataError`."""
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without
+    infinite errors.
+
+    Raises `DataError`.
+    """
     segments = {
         name: [model.segments(test_set) for model in models]
         for name, models in by_name(artefacts.models).items()
@@ -32,7 +38,9 @@ def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
-    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and ``against_best`` in words."""
+    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and
+    ``against_best`` in words.
+    """
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
     columns: dict[str, str | float] = {"rmse_sideslip_low": low, "rmse_sideslip_high": high}
     for baseline in BASELINES:
@@ -78,7 +86,9 @@ def figure_of(ranking: Ranking, name: Name) -> str:
 
 
 def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in Markdown."""
+    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in
+    Markdown.
+    """
     best = ranking.order[0]
     words = f"**Best: {titles[best]}, {figure_of(ranking, best)}.**"
     if ranking.n_blocks < MIN_BLOCKS:
@@ -95,12 +105,17 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
 
 
 def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: str) -> str:
-    """The best estimator, those that are not significantly worse, and whether it beats the baselines."""
+    """The best estimator, those that are not significantly worse, and whether it beats the
+    baselines.
+    """
     if not ranking.order:
         return f"No estimator has a finite sideslip error on {test_text}."
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, test_text)}"
-    return f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} {basis_sentence(ranking, test_text)}"
+    return (
+        f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} "
+        f"{basis_sentence(ranking, test_text)}"
+    )
 
 
 def _baselines_sentence(ranking: Ranking) -> str:
@@ -126,6 +141,8 @@ def basis_sentence(ranking: Ranking, test_text: str) -> str:
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."
     return (
-        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, "
-        f"corrected by Holm. Effective number of blocks, by the squared error of the best: {ranking.effective_blocks:.0f}."
+        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
+        f"{ranking.block_seconds:.3g} s and over seeds, "
+        "corrected by Holm. Effective number of blocks, by the squared error of the best: "
+        f"{ranking.effective_blocks:.0f}."
     )

@@ -1,4 +1,6 @@
-"""What trainings and online steps took, for the page alone: a time is never the same twice, and so no published file holds one."""
+"""What trainings and online steps took, for the page alone: a time is never the same twice, and so
+no published file holds one.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,20 @@ from vehest.report.document import Column, Table
 
 NAME = ("estimator", "variant")
 CAPTION = (
-    "Medians over seeds, wall time on the machine that `provenance.json` names, where others may have worked at the same time; an online "
-    "step is one sample through `step()`. Every figure is in `timings.csv` beside this page, in seconds."
+    "Medians over seeds, wall time on the machine that `provenance.json` names, where others may "
+    "have worked at the same time; an online "
+    "step is one sample through `step()`. Every figure is in `timings.csv` beside this page, in "
+    "seconds."
 )
 
 
 def timings_of_study(
     parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]],
 ) -> list[str | Table]:
-    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title); nothing where it is not known."""
+    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title).
+
+    Nothing where it is not known.
+    """
     rows = [row for part in parts for row in _rows(*part)]
     if not rows:
         return []

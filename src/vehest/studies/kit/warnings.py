@@ -1,4 +1,6 @@
-"""Warnings of a comparison: tests without sideslip, trainings that ended early, test ranges of another kind."""
+"""Warnings of a comparison: tests without sideslip, trainings that ended early, test ranges of
+another kind.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
-LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly distinguishes estimators
+# deg, root mean square of the reference, below which a test hardly distinguishes estimators
+LITTLE_SIDESLIP = 0.5
 CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
 SILENT = 0.7  # bound over the reference itself, above which a drive adds no information on v
 MIN_RATIO_OF_PERCENTILES = (
@@ -24,7 +27,10 @@ MIN_RATIO_OF_PERCENTILES = (
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
-    """Sentences, each about one test set or one estimator, those first that are left out; none where there is nothing to warn of."""
+    """Sentences, each about one test set or one estimator, those first that are left out.
+
+    None where there is nothing to warn of.
+    """
     left_out = [
         f"{as_code(name)} is left out: {as_text(reason)}"
         for name, reason in artefacts.failed.items()
@@ -48,13 +54,15 @@ def _slow_tests(artefacts: PartArtefacts) -> list[str]:
         if _lowest(runs, test_set, "share_below_min_speed") == 1.0:
             speed = artefacts.protocol.describe_min_sideslip_speed(span.dataset for span in spans)
             sentences.append(
-                f"Test set `{test_set}`: sideslip is not scored, since the car is slower than {speed} throughout; RMSE(v) counts all samples."
+                f"Test set `{test_set}`: sideslip is not scored, since the car is slower than "
+                f"{speed} throughout; RMSE(v) counts all samples."
             )
     return sentences
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
-    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs with little information on it; none if it can.
+    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs with little
+    information on it; none if it can.
 
     An error below the bound shows that an estimator uses information that the bound does not.
     """
@@ -68,7 +76,8 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     )
     if min(bound, error) > SILENT * level:
         clauses.append(
-            f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the zero-sideslip baseline {level:.2g}°"
+            f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the "
+            f"zero-sideslip baseline {level:.2g}°"
         )
     return clauses
 
@@ -82,7 +91,9 @@ def _lowest(runs: Runs, test_set: str, metric: str) -> float:
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
-    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its tail [deg]."""
+    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its
+    tail [deg].
+    """
     size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
     return float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))
 
@@ -94,14 +105,18 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
         level = float(np.sqrt(np.mean(np.square(sideslip))))
         if level < LITTLE_SIDESLIP:
             sentences.append(
-                f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the time below "
-                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide the order."
+                f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the "
+                "time below "
+                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide "
+                "the order."
             )
     return sentences
 
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
-    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain little information on v."""
+    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain
+    little information on v.
+    """
     runs = runs_of(artefacts)
     sentences = list[str]()
     for test_set, spans in artefacts.split.tests.items():
@@ -111,7 +126,8 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
         )
         if error < CLOSE * noise:
             sentences.append(
-                f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
+                f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of "
+                f"the reference, at least {noise:.2g}°; "
                 f"errors of the reference may decide the order."
             )
         if math.isnan(bound):
@@ -119,7 +135,8 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
         level = _level(artefacts, spans)
         if min(bound, error) > SILENT * level:
             sentences.append(
-                f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their inputs is {bound:.2g}°, and the error of "
+                f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their "
+                f"inputs is {bound:.2g}°, and the error of "
                 f"the zero-sideslip baseline {level:.2g}°."
             )
     return sentences
@@ -150,11 +167,13 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
                 short.append(f"{word} ({tested_level / trained_level:.2g} times)")
         if exceeded:
             sentences.append(
-                f"Test set `{test_set}` goes beyond the training ranges in {listed(exceeded)}: estimators extrapolate there."
+                f"Test set `{test_set}` goes beyond the training ranges in {listed(exceeded)}: "
+                "estimators extrapolate there."
             )
         if short:
             sentences.append(
-                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than the training."
+                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: "
+                "it is easier than the training."
             )
         kinds = [
             artefacts.kinds_of(tested_level) for tested_level in (spans, artefacts.split.train)
@@ -177,11 +196,13 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
             estimators.append(
-                f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)"
+                f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} "
+                f"of {len(models)} seeds)"
             )
     return (
         [
-            f"Training ended at its limit, and longer training may lower the error: {listed(estimators)}."
+            "Training ended at its limit, and longer training may lower the error: "
+            f"{listed(estimators)}."
         ]
         if estimators
         else []
@@ -203,7 +224,9 @@ def _divergence(artefacts: PartArtefacts) -> list[str]:
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
-    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where sideslip is scored and measured."""
+    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where
+    sideslip is scored and measured.
+    """
     parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
