@@ -460,11 +460,18 @@ def estimate(
     Columns named like channels, in SI units, need no more; others are described once by `vehest new
     NAME lap.csv`, then add `dataset=NAME`.
     """
+    from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
-    from vehest.run.plot import estimate_and_plot
 
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    outcome = estimate_and_plot(words, out, plot, strict=strict, car=car)
+    if plot is not None:
+        from vehest.run.plot import check_plot_of_estimate, plot_estimate
+
+        check_plot_of_estimate(out, plot)
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    if plot is not None:
+        plot_estimate(words, out, plot)
+        outcome["plot"] = str(plot)
     emit(as_json, outcome, summary_lines(outcome))
 
 

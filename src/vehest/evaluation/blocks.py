@@ -43,6 +43,11 @@ class Segments:
         return len(self.piece)
 
     @property
+    def is_finite(self) -> bool:
+        """Whether every scored sideslip has a finite error."""
+        return math.isfinite(float(self.squared_error_sideslip.sum()))
+
+    @property
     def with_sideslip(self) -> Segments:
         """Those in which sideslip is scored."""
         chosen = self.sideslip_samples > 0

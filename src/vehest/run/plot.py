@@ -16,7 +16,6 @@ from vehest.data.recording import Recording
 from vehest.inference.reading import read_checked, without_references
 from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
 from vehest.report.style import MatplotlibFigure
-from vehest.run.estimate import estimate_file
 from vehest.run.estimate_tables import read_estimate_table
 
 
@@ -47,22 +46,20 @@ def check_plot_name(out: Path) -> None:
         raise ConfigurationError(f"'{out}' is a folder; name a file")
 
 
-def estimate_and_plot(
-    words: Sequence[str], out: Path, picture: Path | None, *, strict: bool, car: Path | None
-) -> dict[str, Any]:
-    """Estimate as `estimate_file` does; where a picture is named, draw what it wrote."""
-    if picture is None:
-        return estimate_file(words, out, strict=strict, car=car)
+def check_plot_of_estimate(out: Path, picture: Path) -> None:
+    """Raise `ConfigurationError` where an estimate at ``out`` cannot be drawn to a path."""
     check_plot_name(picture)
     if out.suffix.lower() != ".parquet":
         raise ConfigurationError(
             f"--plot needs the estimate as .parquet, which has its bands and health, not as '{out}'"
         )
-    outcome = estimate_file(words, out, strict=strict, car=car)
+
+
+def plot_estimate(words: Sequence[str], out: Path, picture: Path) -> None:
+    """Draw an estimate that `vehest.run.estimate.estimate_file` wrote from the same words."""
     has_model = len(words) > 1 and is_file_name(words[1])
     recording, *overrides = words[1:] if has_model else words
     plot_files([recording, str(out), *overrides], picture)
-    return outcome | {"plot": str(picture)}
 
 
 def plot_files(

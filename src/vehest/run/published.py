@@ -30,7 +30,7 @@ from vehest.run.evaluate import evaluation_options
 from vehest.run.evaluate_faults import all_of, faults_of
 from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
-from vehest.run.runner import Runner
+from vehest.run.runner import Stages
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
 from vehest.run.table_records import changes_of_tables
@@ -49,11 +49,11 @@ def keys_of_study(
     study: Study,
     jobs: Jobs,
     absent: Collection[str],
-    runner: Runner,
+    stages: Stages,
     inputs: Mapping[str, Mapping[str, str]],
 ) -> Keys:
     """Keys of everything that determines the results of a study."""
-    ingests = _ingests(study, jobs, absent, runner)
+    ingests = _ingests(study, jobs, absent, stages)
     keys: Keys = {}
     for name, config in ingests.items():
         content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
@@ -66,19 +66,19 @@ def keys_of_study(
     for part in (name for name in study.parts if name not in absent):
         configs = [job.config for job in jobs[part]]
         keys |= {
-            f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs, runner)
+            f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs, stages)
         }
     return keys | {"report": {CODE: code_of("report", study.report)}}
 
 
 def _ingests(
-    study: Study, jobs: Jobs, absent: Collection[str], runner: Runner
+    study: Study, jobs: Jobs, absent: Collection[str], stages: Stages
 ) -> dict[str, Config]:
     configs = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
         return configs
     return {
-        name: runner.dataset_config(name, config)
+        name: stages.dataset_config(name, config)
         for config in configs.values()
         for name in dataset_names(config["split"])
     }
@@ -91,11 +91,11 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
     }
 
 
-def _of_jobs(configs: Sequence[Config], runner: Runner) -> Iterator[tuple[str, dict[str, str]]]:
+def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
     faults = all_of(map(faults_of, configs))
-    protocol = runner.protocol(first, dataset_names(first["split"]))
+    protocol = stages.protocol(first, dataset_names(first["split"]))
     rates = sorted({*map(estimator_rate, configs), protocol.rate_hz})
     preparation = changed_options(
         validated(Preparation, first["downsample"], "", error=ConfigurationError)
@@ -304,22 +304,22 @@ def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple
 
     A note on what was not compared.
     """
-    runner = Runner(
+    stages = Stages(
         Path(str(next(iter(jobs.values()))[0].config["output"])),
         Messages(quiet=True),
         StopSignals(),
     )
-    ingests = _ingests(study, jobs, published.absent, runner)
+    ingests = _ingests(study, jobs, published.absent, stages)
     inputs = {}
     for name, config in ingests.items():
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
-    today = keys_of_study(study, jobs, published.absent, runner, inputs)
+    today = keys_of_study(study, jobs, published.absent, stages, inputs)
     changes = changed_keys(published.keys, today)
     parts = _firsts(study, jobs)
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):
-            runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
+            stages.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
             changes.append((f"{name}, which was not here", DATA))
     return changes, f"data not checked, raw files not here: {', '.join(missing)}" if missing else ""

@@ -54,8 +54,8 @@ ALL = "all groups"  # bar above those of trainings
 
 
 @dataclass(eq=False)
-class Runner:
-    """Runs stages into one output root.
+class Stages:
+    """Runs single stages into one output root: recordings at each rate, split and protocol.
 
     In a dry run `DryRunStop` is raised where something would have to be made.
     """
@@ -66,29 +66,22 @@ class Runner:
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     dry_run: bool = False
-    tracker: Tracker = field(
-        default_factory=lambda: Tracker({}, Path(), print)
-    )  # by default it logs nothing
-    launcher: Launcher = field(default_factory=LocalLauncher)
-    until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
-    weights: PublishedWeights | None = (
-        None  # of a published study, which are taken instead of training
-    )
-    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
-    train_first: str = ""  # command to run first where a training is missing; empty to train here
-    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
-    artefacts: dict[Path, Artefact] = field(
-        default_factory=dict
-    )  # those found or made so far, by folder
-    _known: dict[tuple[str, str], Any] = field(default_factory=dict)
+    artefacts: dict[Path, Artefact] = field(default_factory=dict)  # used so far, by folder
+    _results: dict[tuple[str, str], Any] = field(default_factory=dict)
 
     def _once(self, kind: str, of: Any, make: Callable[[], Value]) -> Value:
         """The value of ``make``, which is called the first time alone."""
         key = kind, json.dumps(of, sort_keys=True)
-        if key not in self._known:
-            self._known[key] = make()
-        value: Value = self._known[key]
+        if key not in self._results:
+            self._results[key] = make()
+        value: Value = self._results[key]
         return value
+
+    def print_waiting(self, waiting: Waiting) -> None:
+        """Print which process makes an artefact that this one waits for."""
+        self.messages.line(
+            "wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it"
+        )
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate."""
@@ -263,7 +256,7 @@ class Runner:
             raise DryRunStop
         if artefact is None:
             artefact = ensured(
-                plan, write, plan.stage in self.force, self.stop.requested, self._print_waiting
+                plan, write, plan.stage in self.force, self.stop.requested, self.print_waiting
             )
             self.stop.raise_if_requested()
             assert artefact is not None
@@ -275,6 +268,19 @@ class Runner:
         self.messages.line(REUSED if artefact.skipped else "done", plan.stage, plan.label, detail)
         self.artefacts[plan.folder] = artefact
         return artefact
+
+
+@dataclass(eq=False)
+class Runner(Stages):
+    """Trains, calibrates and evaluates groups by a launcher, and tracks what was made."""
+
+    tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # logs nothing
+    launcher: Launcher = field(default_factory=LocalLauncher)
+    until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
+    weights: PublishedWeights | None = None  # published ones, used instead of training
+    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
+    train_first: str = ""  # command to run first where a training is missing; empty to train here
+    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
         """Train and evaluate groups, side by side where there are cores; where members of a group
@@ -350,7 +356,7 @@ class Runner:
                 partial(weights.write, plan.key),
                 False,
                 self.stop.requested,
-                self._print_waiting,
+                self.print_waiting,
             )
             self.stop.raise_if_requested()
         if published:
@@ -437,7 +443,7 @@ class Runner:
         """Draw the progress of a group, or print for whom it waits."""
         name = groups[at].name
         if isinstance(news, Waiting):
-            self._print_waiting(news)
+            self.print_waiting(news)
         elif news is None:
             bars.step(name, 0, 1, "starting")
         else:
@@ -446,11 +452,6 @@ class Runner:
                 f"{news.best_validation_loss:.4g}"
             )
             bars.step(name, news.epoch, news.max_epochs, note)
-
-    def _print_waiting(self, waiting: Waiting) -> None:
-        self.messages.line(
-            "wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it"
-        )
 
 
 def _in_words(artefact: Artefact) -> tuple[str, str]:

@@ -107,8 +107,8 @@ def open_runner(
         options.jobs or default_jobs(),
         forced,
         options.dry_run,
-        tracker,
-        launcher,
+        tracker=tracker,
+        launcher=launcher,
     )
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         try:

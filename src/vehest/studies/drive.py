@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -45,7 +46,15 @@ from vehest.studies.kit.drawings import (
 )
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.recommendation import plain_text, recommendation_of
-from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
+from vehest.studies.kit.runs import (
+    Name,
+    by_name,
+    chosen_seed,
+    of_model,
+    runs_of,
+    value_of_run,
+    values_of,
+)
 from vehest.studies.kit.standing import (
     BEST,
     NOT_SIGNIFICANT,
@@ -230,31 +239,30 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
                 metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY
             }
             of_chosen = {metric: values[seeds.index(seed)] for metric, values in of_seeds.items()}
+            chosen = of_chosen.pop("rmse_sideslip")
+            finite = name in ranking.order and math.isfinite(chosen)
+            value_of = partial(value_of_run, runs, name, seed)
             row: dict[str, object] = {
                 "estimator": name[0],
                 "variant": name[1],
                 "title": models[0].title,
                 "test_set": test_set,
-            }
-            row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
-            row |= {"min_sideslip_speed": min_speed}
-            chosen = of_chosen.pop("rmse_sideslip")
-            finite = name in ranking.order and math.isfinite(chosen)
-            row |= {
+                "seed": seed,
+                "n_seeds": len(seeds),
+                "start": start,
+                "min_sideslip_speed": min_speed,
                 "rmse_sideslip": ranking.rmse[name] if finite else math.nan,
                 "rmse_sideslip_chosen": chosen,
-            }
-            row |= {**standing_columns(ranking, name), **_spread_of(of_seeds["rmse_sideslip"])}
-            row |= {
-                f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0]
-                for role in (TRAINING, VALIDATION)
-            }
-            row |= {
+                **standing_columns(ranking, name),
+                **_spread_of(of_seeds["rmse_sideslip"]),
+                "rmse_sideslip_training": value_of(TRAINING, "rmse_sideslip"),
+                "rmse_sideslip_validation": value_of(VALIDATION, "rmse_sideslip"),
                 "rmse_vy": of_chosen["rmse_vy"],
-                "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0],
+                "rmse_vy_validation": value_of(VALIDATION, "rmse_vy"),
+                **of_chosen,
+                _BOUND: value_of(test_set, _BOUND),
+                **{metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL},
             }
-            row |= {**of_chosen, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
-            row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
             placed.append((ranking.order.index(name) if finite else math.inf, row))
         rows += [row for _, row in sorted(placed, key=lambda pair: pair[0])]
     board = pd.DataFrame(rows)

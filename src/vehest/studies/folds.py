@@ -104,11 +104,7 @@ def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[lis
             [group[name][seed].segments(TEST) for group in groups]
             for seed in sorted(groups[0][name])
         ]
-        if all(
-            math.isfinite(float(models.squared_error_sideslip.sum()))
-            for folds in seeds
-            for models in folds
-        ):
+        if all(fold.is_finite for folds in seeds for fold in folds):
             segments[name] = seeds
     if not segments:
         raise DataError("no estimator has finite errors in all folds")

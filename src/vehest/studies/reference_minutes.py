@@ -155,7 +155,7 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     finite = {
         name: trained
         for name, trained in segments.items()
-        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in trained)
+        if all(part.is_finite for part in trained)
     }
     ordered = sorted(
         (point for point in points if point.name in finite),

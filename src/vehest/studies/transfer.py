@@ -38,7 +38,7 @@ from vehest.report.style import (
 )
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of, budget_sentence, data_sentence
-from vehest.studies.kit.runs import by_name
+from vehest.studies.kit.runs import titles_of
 from vehest.studies.kit.standing import (
     interval_in_words,
     ranking_of,
@@ -114,9 +114,7 @@ def overview(
     )
     rows = []
     for (part, test_set), ranking in rankings.items():
-        titles = {
-            name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()
-        }
+        titles = titles_of(parts[part].models)
         order = [name for baseline in REFERENCES for name in titles if name[0] == baseline]
         order += [name for name in ranking.order if name not in order] + [
             name for name in titles if name not in ranking.order
@@ -306,10 +304,7 @@ def _first(rows_of_test: pd.DataFrame, estimator: str) -> float:
 def _part(
     name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]
 ) -> list[Block]:
-    titles: dict[Name, str] = {
-        name_of_model: as_text(models[0].title)
-        for name_of_model, models in by_name(part.models).items()
-    }
+    titles = titles_of(part.models)
     blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
     for test_set in part.split.tests:
         kinds = part.kinds_of(part.split.tests[test_set])

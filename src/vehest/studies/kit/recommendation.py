@@ -8,12 +8,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from vehest.data.splits import VALIDATION
 from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking
-from vehest.report.document import as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.runs import by_name, chosen_seed, runs_of, values_of
+from vehest.studies.kit.runs import by_name, chosen_seed, runs_of, titles_of, value_of_run
 from vehest.studies.kit.standing import BASELINE_TITLES, best_sentence, figure_of, ranking_of
 from vehest.studies.kit.warnings import cannot_rank
 
@@ -104,7 +104,7 @@ def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
         Metrics are missing or ambiguous.
     """
     ranking = ranking_of(part, test_set)
-    titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
+    titles = titles_of(part.models)
     obstacles = _obstacles(part, test_set, ranking) if ranking.order else []
     names = [] if obstacles else ranking.recommendable
     if ranking.winner is not None:
@@ -132,7 +132,7 @@ def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> Evaluat
     errors = list[tuple[float, EvaluatedModel]]()
     for name in names:
         seed = chosen_seed(sorted(model.seed for model in groups[name]), name, runs)
-        error = values_of(runs, name, [seed], "validation", "rmse_vy")[0]
+        error = value_of_run(runs, name, seed, VALIDATION, "rmse_vy")
         model = next(model for model in groups[name] if model.seed == seed)
         errors.append((error if math.isfinite(error) else math.inf, model))
     return min(errors, key=lambda pair: pair[0])[1]

@@ -10,6 +10,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
+from vehest.report.document import as_text
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, nominal_rows
 
 Name = tuple[str, str]  # estimator and variant
@@ -51,7 +52,12 @@ def values_of(
     runs: Runs, name: Name, seeds: Sequence[int], test_set: str, metric: str
 ) -> FloatArray:
     """Values of a metric, one a seed; NaN where there is none."""
-    return np.array([runs.get((*name, seed, test_set), {}).get(metric, math.nan) for seed in seeds])
+    return np.array([value_of_run(runs, name, seed, test_set, metric) for seed in seeds])
+
+
+def value_of_run(runs: Runs, name: Name, seed: int, test_set: str, metric: str) -> float:
+    """Value of a metric of one seed; NaN where there is none."""
+    return runs.get((*name, seed, test_set), {}).get(metric, math.nan)
 
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
@@ -75,6 +81,11 @@ def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
         )
     validation = values_of(runs, name, seeds, VALIDATION, "rmse_vy")
     return seeds[int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))]
+
+
+def titles_of(models: Iterable[EvaluatedModel]) -> dict[Name, str]:
+    """Estimator and variant -> title, as Markdown."""
+    return {name: as_text(seeds[0].title) for name, seeds in by_name(models).items()}
 
 
 def by_name(models: Iterable[EvaluatedModel]) -> dict[Name, list[EvaluatedModel]]:

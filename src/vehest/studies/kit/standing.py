@@ -30,9 +30,7 @@ def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
         for name, models in by_name(artefacts.models).items()
     }
     finite = {
-        name: models
-        for name, models in segments.items()
-        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in models)
+        name: models for name, models in segments.items() if all(part.is_finite for part in models)
     }
     return rank(finite, artefacts.protocol.rate_hz)
 
