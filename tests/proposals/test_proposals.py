@@ -351,7 +351,7 @@ ROLES = {
     "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx", "AccelLateral": "ay",
     "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other", "Querabweichung": "other", "Vx_world": "other",
     "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax", "Drehzahl": "other",
-    "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other",
+    "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
 }  # fmt: skip
 
 
@@ -937,6 +937,9 @@ def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
         ("adma_vy_ms", "m/s", "vy_ref"),
         ("lat_mps", "m/s", "vy_ref"),
         ("Lateral", "m/s²", "ay"),
+        ("yaw", "deg/s", "yaw_rate"),
+        ("r_radps", "rad/s", "yaw_rate"),
+        ("Roll", "rad/s", "roll_rate"),
     ],
 )
 def test_the_unit_says_of_what_a_name_is(name, unit, role):
@@ -1117,6 +1120,8 @@ WRAPPED = {
     "16 bit of ms": lambda ms: (60_000 + ms) % 65_536,
     "signed 16 bit of ms": lambda ms: (90_000 + ms + 32_768) % 65_536 - 32_768,
     "32 bit of us": lambda ms: (2**32 - 30_000_000 + 1000 * ms) % 2**32,
+    "12 bit of ms": lambda ms: (1000 + ms) % 4096,
+    "seconds of the minute": lambda ms: (30.0 + 1e-3 * ms) % 60.0,
     "seconds of the week": lambda ms: (604_750.0 + 1e-3 * ms) % 604_800.0,
 }
 
@@ -1142,12 +1147,23 @@ def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path)
     made = drafted(tmp_path, table.iloc[rows])
     assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
     np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    for order in (rows[::-1], np.random.default_rng(0).permutation(6000), np.roll(rows, 2000)):
+        made = drafted(tmp_path, table.iloc[order])
+        assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
     table.loc[2000:, "Time [s]"] -= 40.0
     made = drafted(tmp_path, table)
     assert [round(seconds) for seconds in made.durations.values()] == [40, 80]
     (note,) = [note for note in made.notes if "go back" in note]
     assert "split into 2 recordings" in note
     assert "a command on a single recording uses the longest, 80 of 120 s" in note
+
+
+def test_a_clock_that_is_set_back_for_a_while_ends_a_recording_and_mixes_no_rows(tmp_path):
+    table = usual(drive())
+    table.loc[2500:2599, "Time [s]"] -= 0.7
+    made = drafted(tmp_path, table)
+    assert [round(seconds) for seconds in made.durations.values()] == [50, 71]
+    assert "sort" not in made.dataset["time"]
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.08])
@@ -1249,6 +1265,9 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
         "ax": "AccelerationZ",
         "vy_ref": "VelocityX",
     }
+    table.columns = [name.replace("AngularVelocityX", "Gyro X (rad/s)") for name in table.columns]
+    table.columns = [name.replace("AngularVelocity", "Gyro ") for name in table.columns]
+    assert "roll_rate" not in proposed(tmp_path, table)  # about X, which is no forward axis here
 
 
 def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
@@ -1269,6 +1288,12 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "gyro_z [rad/s]", "ay": "LatAcc [m/s2]"}
     assert "an axis of the world" in open_questions["twist.linear.x"].text
+    heading = 3.0 * np.cumsum(d["r"]) / 50.0
+    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    table = pd.DataFrame({"t": d["t"], "vx": east, "vy": north, "wz": d["r"], "acc_lat": d["ay"]})
+    table = table.assign(pos_x=np.cumsum(east) / 50.0, pos_y=np.cumsum(north) / 50.0)
+    with pytest.raises(VehestError, match='--answer "vy=vy_ref m/s"'):
+        left_out(tmp_path, table)
 
 
 def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):

@@ -86,6 +86,7 @@ _EXPLAINED = {
     "vy_ref": ("vx", "ay", "pitch_rate", "position_y"),
     "sideslip_ref": ("vx",),
     "ay": ("latitude", "vx", "vy_ref", "pitch_rate", "position_y"),
+    "latitude": ("ay",),
     "ax": ("longitude", "vx", "roll_rate", "position_x"),
     "roll_rate": ("roll", "vx"),
     "pitch_rate": ("pitch", "vx"),
@@ -96,6 +97,7 @@ _EXPLAINED = {
 _QUANTITIES = {
     **dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"),
     **dict.fromkeys(("m/s²", "g"), "acc"),
+    **dict.fromkeys(("rad/s", "deg/s"), "rate"),
 }
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2|radps|rads|degps|degs|dps)$")
 _PLAIN = str.maketrans(
@@ -176,7 +178,7 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
         part
         for role in strong
         for part in _EXPLAINED.get(role, ())
-        if role != "vx" or part not in strong
+        if role not in ("vx", "latitude") or part not in strong
     }
     parts |= {
         "other",

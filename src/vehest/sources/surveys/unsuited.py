@@ -25,6 +25,7 @@ _NAMES_BYTES = re.compile(
 )
 _BYTES = re.compile(r"(0x)?[0-9A-Fa-f]{2}([ _:-]?[0-9A-Fa-f]{2})*")
 MIN_ROWS_OF_SIGNAL = 5  # of each quantity in long format, on average
+MAX_COLUMNS = 5  # of a table in long format that begins with a single quantity
 
 
 def require_columns_of_signals(
@@ -56,7 +57,7 @@ def require_columns_of_signals(
         table = [row for row in rows.values() if len(row) > 1]
         if table:
             _require_no_frames(file, table)
-            _require_wide_format(file, table)
+            require_wide_format(file, table)
         quoted = [row for row in rows.values() if len(row) == 1 and row[0].count(delimiter) > 1]
         if delimiter in ";\t," and len(quoted) > 0.9 * len(rows) and filled[-1].startswith('"'):
             raise DataError(
@@ -81,16 +82,21 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
             )
 
 
-def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
+def require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
+    """Refuse, by a `DataError` with the way out, rows of a table that hold one value each."""
     for at, header in enumerate(table[:20]):
         rows = [row for row in table[at + 1 :] if len(row) == len(header)]
-        of_signal = [k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip())]
+        of_signal = [
+            k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip(" _"))
+        ]
         of_value = [k for k, name in enumerate(header) if _NAMES_VALUE.fullmatch(name.strip())]
         for k in of_signal:
             names = [row[k] for row in rows]
             n_names = len(set(names))
             is_text = not any(name.strip().lstrip("+-")[:1].isdigit() for name in names)
-            if of_value and is_text and 1 < n_names <= len(rows) / MIN_ROWS_OF_SIGNAL:
+            has_few_names = n_names <= len(rows) / MIN_ROWS_OF_SIGNAL
+            is_long = n_names > 1 or len(header) <= MAX_COLUMNS
+            if of_value and is_text and has_few_names and is_long:
                 signal, value = printable(header[k].strip()), printable(header[of_value[0]].strip())
                 raise DataError(
                     f"'{file}' is in long format, one value a row: '{signal}' names the quantity, "
