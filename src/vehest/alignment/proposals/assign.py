@@ -402,9 +402,14 @@ def _ask_for_second_evidence(
         evidence += [bool(column.unit), role in column.hints]
         if sum(evidence) < 2:
             checked[name] = replace(proposal.questioned(SINGLE_EVIDENCE), is_weak=True)
+    channels_of_turn = [name for name in channels if channels[name].column in columns]
     if any(checked[name].is_weak for name in ("vx", "yaw_rate") if name in checked):
         checked = {
-            name: replace(proposal, is_weak=bool(proposal.question))
+            name: replace(
+                proposal,
+                is_weak=proposal.is_weak
+                or (bool(proposal.question) and name not in channels_of_turn),
+            )
             for name, proposal in checked.items()
         }
     return checked

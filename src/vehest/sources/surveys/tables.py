@@ -39,7 +39,7 @@ from vehest.sources.clock_times import past_midnight, seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
-from vehest.sources.surveys.unsuited import require_columns_of_signals, require_wide_format
+from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_columns_of_signals
 from vehest.sources.tables import (
     TextLayout,
     is_parquet,
@@ -126,15 +126,10 @@ def survey_table(file: Path) -> Log:
                 for field in table.schema_arrow
                 if field.name in units or is_numeric(field.type)
             ]
-            skipped = [
-                f"column '{printable(field.name)}' holds {field.type}"
-                for field in table.schema_arrow
-                if field.name not in names
-            ]
+            others = [field for field in table.schema_arrow if field.name not in names]
+            require_columns_of_numbers(file, names, [field.name for field in others])
+            skipped = [f"column '{printable(field.name)}' holds {field.type}" for field in others]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-            first_rows = next(table.iter_batches(MOST_LINES), pa.RecordBatch.from_pylist([]))
-            texts = [[str(cell) for cell in row.values()] for row in first_rows.to_pylist()]
-            require_wide_format(file, [table.schema_arrow.names, *texts])
             values = read_numbers(file, table, names)
     else:
         shape = shape_of(file)
