@@ -131,6 +131,11 @@ def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
     assert values(config, first, other) == (None, None)
     given = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
     assert with_car_values(given, [car_of(first)]) is given
+    filter_of = {"name": "self_calibrating", "wheelbase": 2.7, "cg_to_rear_axle": None}
+    assert values({"estimator": filter_of}, first) == (2.4, 1.1)  # 2.7 m is its default
+    assert values({"estimator": filter_of}, first, other) == (2.7, None)
+    assert values({"estimator": filter_of}, TABLE | {"name": "one"}) == (2.7, None)
+    assert values({"estimator": filter_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     without = {"estimator": {"name": "zero"}}
     assert with_car_values(without, [car_of(first)]) is without
 

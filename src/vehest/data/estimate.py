@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording, clock_tolerance
+from vehest.data.recording import clock_tolerance
 from vehest.data.time_series import TimeSeries
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Mode = Literal["causal", "offline"]
 
@@ -121,17 +118,6 @@ class Estimate(TimeSeries):
         if name not in self.channels:
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
-
-    def plot(
-        self,
-        recording: Recording | None = None,
-        start: float | None = None,
-        stop: float | None = None,
-    ) -> Figure:
-        """Draw the estimate, with its recording where that is passed; see `Recording.plot`."""
-        from vehest.report.drive_figure import drive_figure
-
-        return drive_figure(recording, [self], start, stop)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
         """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,11 +15,6 @@ from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.time_series import TimeSeries
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from vehest.data.estimate import Estimate
 
 Kind = Literal["real", "simulated"]
 
@@ -171,27 +166,6 @@ class Recording(TimeSeries):
         return replace(
             self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels
         )
-
-    def plot(
-        self, *estimates: Estimate, start: float | None = None, stop: float | None = None
-    ) -> Figure:
-        """Draw the drive with estimates of it; see `vehest.report.drive_figure.drive_figure`.
-
-        Parameters
-        ----------
-        *estimates : Estimate
-            Of this recording; band, health and course are those of the first.
-        start, stop : float, optional
-            Range that is drawn [s]; by default all of it.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            A notebook shows it; ``savefig`` writes PNG, PDF or SVG.
-        """
-        from vehest.report.drive_figure import drive_figure
-
-        return drive_figure(self, estimates, start, stop)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the

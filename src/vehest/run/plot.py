@@ -15,6 +15,7 @@ from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
 from vehest.inference.reading import read_checked, without_references
 from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
+from vehest.report.drive_figure import drive_figure
 from vehest.report.style import MatplotlibFigure
 from vehest.run.estimate_tables import read_estimate_table
 
@@ -91,7 +92,8 @@ def plot_files(
     recording = _with_references_if_any(recording_file, options)
     with use_limits(options.limits):
         estimates = [read_estimate_table(file, recording) for file in estimate_files]
-    content = WRITERS[out.suffix.lower()](recording.plot(*estimates, start=start, stop=stop))
+    figure = drive_figure(recording, estimates, start, stop)
+    content = WRITERS[out.suffix.lower()](figure)
     with written_aside(out) as aside:
         aside.write_bytes(content)
     return {

@@ -19,7 +19,7 @@ from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import VEHICLE, Examined
 from vehest.run.printing import echo
 from vehest.sources.surveys import Log
-from vehest.sources.surveys.clocks import UNITS
+from vehest.sources.surveys.clocks import STATED_UNITS
 
 LEAVE_OUT = "-"
 KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
@@ -135,7 +135,7 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
         text = f"is '{clock.column}' the time in {clock.unit}?"
-        yield Question("time", text, clock.unit, tuple(UNITS), (clock.evidence,), "a unit")
+        yield Question("time", text, clock.unit, tuple(STATED_UNITS), (clock.evidence,), "a unit")
     for proposal in proposals.channels:
         if proposal.question:
             alternatives = tuple(
@@ -230,8 +230,8 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))
     if key == "time":
-        if answer not in UNITS:
-            raise ConfigurationError(f"'{answer}' is not one of {', '.join(UNITS)}")
+        if answer not in STATED_UNITS:
+            raise ConfigurationError(f"'{answer}' is not one of {', '.join(STATED_UNITS)}")
         return replace(examined, logs=tuple(_with_time_unit(log, answer) for log in examined.logs))
     if key in VEHICLE:
         return replace(examined, vehicle={**examined.vehicle, key: _number(answer, key)})
@@ -253,7 +253,7 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
 def _with_time_unit(log: Log, unit: str) -> Log:
     if log.clock is None or log.seconds is None:
         return log
-    factor = UNITS[unit] / UNITS[log.clock.unit]
+    factor = STATED_UNITS[unit] / STATED_UNITS[log.clock.unit]
     return replace(
         log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor
     )
