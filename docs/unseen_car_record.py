@@ -60,7 +60,7 @@ SHIFTS = np.arange(-0.12, 0.121, 0.03)  # s, of yaw rate
 SETTLED = 2.0
 STEP = 0.01  # s before the first sample, and between commands
 SHAPE = 1.4
-VERSION = "1"
+VERSION = "2"
 """Raised when the numbers of its tables move."""
 EXPONENT = 0.25
 COMPARED = 0.8  # of the tyres' curve, of the filter's; share of the tyres' limit where they have the same slip
@@ -80,7 +80,7 @@ filter's prior. `train_1` is the drive that has a reference elsewhere, and is in
 
 RMSE(β) of a held-out drive that starts from the record of the car's other drives, over that of a cold start ([CSV](carry_over.csv)):
 geometric means over a car's drives, and over cars. `vehest estimate --car` starts from κ and b with deviations times {widening}: better
-than cold on {better} of {drives} drives, six real (Ferrari, S90, TTS) and seven simulated.
+than cold on {better} of {drives} drives, {real} real and {simulated} simulated.
 C differs between calm driving and the limit: with it too, the worst drive has {worst} times the RMSE(β) of a cold start.
 
 {ratios}
@@ -651,6 +651,7 @@ def report(
             cells[number][f"{title} ({len(own)})"] = (
                 f"{fixed(own.mean(), 2)} ± {fixed(own.std(), 2)}, {within}"
             )
+    origins = rows["car"].map({car.title: car.origin for car in CARS})
     apart = pairs[pairs["z"].abs() > 1.645]["number"]
     excess = seen["RMSE(β)"] - seen["RMSE(β), v = 0"]
     beyond = seen[excess > seen["band of β, median"]]["scene"]
@@ -682,6 +683,8 @@ def report(
         worst=fixed(ratios[f"κ, b, a_max, C; {WIDENING:g}"].max(), 2),
         better=int((ratios[f"κ, b; {WIDENING:g}"] < 1.0).sum()),
         drives=len(rows),
+        real=int((origins == "real").sum()),
+        simulated=int((origins == "simulated").sum()),
         widening=WIDENING,
         cars=len(cars),
     )

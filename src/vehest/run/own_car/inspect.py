@@ -58,6 +58,8 @@ VEHICLE = {
     "steering_ratio": "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)",
 }
 """Values of the car that no log holds, as questions."""
+IMU_PLACE = "imu_to_rear_axle"
+"""Another one, asked in any case: the distance of the inertial unit from the rear axle, negative behind it [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class Examined:
     proposals: Proposals  # for all logs
     place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
     rate_hz: float | None  # sampling rate of logs without times; else None
-    vehicle: Mapping[str, float | None]  # values of `VEHICLE`, None where unknown
+    vehicle: Mapping[str, float | None]  # values of `VEHICLE` and `IMU_PLACE`, None where unknown
     kind: Kind = "real"  # whether a real car or a simulation wrote the logs
 
     @property
@@ -213,7 +215,7 @@ def inspect(
         proposals,
         place,
         rate,
-        dict.fromkeys(VEHICLE) | dict(vehicle or {}),
+        dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
 
 
