@@ -71,7 +71,7 @@ OVERVIEWS = {
             "test": "test",
             **{
                 key: key
-                for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")
+                for key in ("LINT", "RATT", "RATTE", "zero", "static map")
             },
         },
     ),
