@@ -13,13 +13,12 @@ import yaml
 from place import run_vehest, undrawn
 from revs_files import smooth_drive, write_csv, write_vehicle_parameters
 from vehest.configuration.composition import compose_config
-from vehest.run.study import read_study
 from vehest_papers.kit.block_errors import read_blocks, read_training
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.verdicts import judge_paper, judge_row
 
 SWEEPS = [
-    ["estimator=zero,static_map,kinematic"],
+    ["estimator=zero,static_map"],
     ["estimator=luenberger"],
     ["estimator=gru,lstm", "estimator.n_states=2", "seed=0"],
     [
@@ -49,10 +48,7 @@ def study(elsewhere, monkeypatch):
             write_csv(folder / f"{name}.csv", drive)
         write_vehicle_parameters(folder / dataset["vehicle_parameters"])
     content = yaml.safe_load((PIPELINES / "ksnn_revs.yaml").read_text(encoding="utf-8"))
-    parts = {
-        name: {**content["parts"][name], "sweeps": SWEEPS} if name in MAIN else None
-        for name in read_study("ksnn").parts
-    }
+    parts = {name: {**content["parts"][name], "sweeps": SWEEPS} for name in MAIN}
     pipeline = {**content, "study": "revs_short", "publish": False, "parts": parts}
     (elsewhere / "pipelines").mkdir(exist_ok=True)
     (elsewhere / "pipelines" / "revs_short.yaml").write_text(yaml.safe_dump(pipeline))

@@ -283,3 +283,36 @@ def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_re
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
+
+
+def test_epoch_of_some_steps_validates_after_each_of_them_and_one_of_many_is_a_pass(monkeypatch):
+    steps = []
+    plain_step = supervised.Adam.step
+    monkeypatch.setattr(
+        supervised.Adam, "step", lambda self: (steps.append(1), plain_step(self))[1]
+    )
+    settings = SupervisedSettings(compiled=False, max_epochs=4, patience=4, epoch_steps=3)
+    _, (record,) = _fit("ksnn", {}, [0], settings)
+    assert len(steps) == 3 * 4
+    assert len(record.history["validation_loss"]) == 4
+    passes = [
+        _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=2, epoch_steps=steps_of_epoch))
+        for steps_of_epoch in (0, 10_000)
+    ]
+    (whole,), (many,) = (members for members, _ in passes)
+    assert np.array_equal(flat_weights(whole), flat_weights(many))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_kinematic_gain_bounds_the_gains_of_the_slip_rate_in_every_step(compiled):
+    settings = SupervisedSettings(max_epochs=3, patience=3, learning_rate=3e-2, compiled=compiled)
+
+    def gains(config):
+        (member,), _ = _fit("ksnn", config, [0], settings)
+        return (member.network.state_dict()[name][:, 0].numpy() for name in ("gamma", "beta"))
+
+    gamma, beta = gains({"kinematic_gain": 0.95})
+    assert np.all((gamma >= np.float32(0.95)) & (gamma <= 1.0))
+    assert np.all((beta >= np.float32(0.95)) & (beta <= np.float32(1.05)))
+    gamma, beta = gains({})
+    assert np.any(gamma < 0.95) or np.any(np.abs(beta - 1.0) > 0.05), "the bound must matter"

@@ -49,6 +49,12 @@ class Ksnn(WindowedEstimator):
         2, "neurons Q of each feedback function; 0: linear", least=0, most=MAX_WIDTH
     )
     bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
+    kinematic_gain: float = setting(
+        0.0,
+        "lower bound of γ₁ and β₁, and 2 less it the upper bound of β₁, so that the estimate integrates a_y - ωu; not in the paper; 0: none",
+        least=0.0,
+        most=1.0,
+    )
 
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str]:
@@ -68,13 +74,15 @@ class Ksnn(WindowedEstimator):
         """Name of the structure as in Table III."""
         return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (
             f"_q{self.n_hidden}" if self.n_hidden else ""
-        )
+        ) + (f"_kinematic_{self.kinematic_gain:g}" if self.kinematic_gain else "")
 
     @property
     def full_title(self) -> str:
         """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
         neurons = f", Q = {self.n_hidden}" if self.n_hidden else ""
-        return f"{self.title} {self.kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
+        bias = "+ bias" if self.bias else "no bias"
+        bound = f", kinematic gain ≥ {self.kinematic_gain:g}" if self.kinematic_gain else ""
+        return f"{self.title} {self.kind} {bias}, P = {self.n_local}{neurons}{bound}"
 
     def network_for(self, train: list[Recording]) -> Any:
         """A network whose local models span the yaw rates of the training recordings."""

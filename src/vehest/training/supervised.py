@@ -355,11 +355,12 @@ class _Run:
         self._activate([member], state or {"parameters": self.members[member].best.unsqueeze(0)})
 
     def train_epoch(self) -> None:
-        """One pass over the training windows, then the validation."""
+        """One epoch of training windows, then the validation."""
         before = self._checkpoints()
+        n_windows = self._epoch_windows()
         order = torch.stack(
             [
-                torch.randperm(len(self.train), generator=self.members[index].generator)
+                torch.randperm(len(self.train), generator=self.members[index].generator)[:n_windows]
                 for index in self.active
             ]
         )
@@ -374,7 +375,12 @@ class _Run:
                 return
             total += train(self.train, windows)
         self.epoch += 1
-        self._judge(total / len(self.train))
+        self._judge(total / n_windows)
+
+    def _epoch_windows(self) -> int:
+        """Training windows of an epoch."""
+        n_windows = self.settings.epoch_steps * self.settings.batch_size
+        return min(n_windows or len(self.train), len(self.train))
 
     def _judge(self, train_loss: Tensor) -> None:
         """Validate the weights or their average; members that are over leave the batch."""

@@ -20,6 +20,11 @@ class SupervisedSettings(Group):
     patience: int = setting(
         25, "epochs without a better validation loss after which a member stops", least=1
     )
+    epoch_steps: int = setting(
+        0,
+        "steps of an epoch, on windows drawn anew without replacement; 0: as many as use every window once",
+        least=0,
+    )
     averaging: float = setting(
         0.0,
         "decay a step of an exponential moving average of the weights, corrected for its start, which is then validated and kept; 0: none",

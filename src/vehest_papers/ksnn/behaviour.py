@@ -1,4 +1,4 @@
-"""Behaviour of trained candidates beside their errors: at little yaw rate, after the start of a window, with biases removed."""
+"""Behaviour of trained candidates beside their errors: at little yaw rate, and with biases removed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
@@ -16,31 +15,15 @@ from vehest.data.store import read_recording
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.luenberger import Luenberger
 from vehest.estimators.model_files import load_model
-from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.evaluation.blocks import Segments, segments_of
-from vehest.evaluation.metrics import Scored, is_fast_enough, pieces_of, score
+from vehest.evaluation.metrics import pieces_of, score
 from vehest.studies.artefacts import EvaluatedModel
-from vehest.training.members import prepare
 from vehest_papers.kit.reading import recordings_of
 from vehest_papers.kit.spectra import mean_bias
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme
 
-WINDOWS = (
-    5,
-    10,
-    15,
-    20,
-    30,
-    45,
-    60,
-    90,
-)  # samples after the start at v = 0 at which errors are read
-STRIDE = 4  # every so many samples of a test drive end windows
-MOST_SEEDS = 3  # seeds of a candidate that are run again here
-ENOUGH = "30"
-LONGER = "60"  # samples of a window: the paper's 1.5 s, and twice that
 AT_LOW_YAW_RATE = (
     paper.ZERO,
     paper.STATIC_MAP,
@@ -49,7 +32,6 @@ AT_LOW_YAW_RATE = (
     paper.LSTM,
     *paper.STRUCTURED,
 )
-STARTED = (paper.NONLINEAR, paper.LINEAR, paper.LSTM)
 BIASED = (paper.LSTM, *paper.STRUCTURED)
 HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
 
@@ -61,7 +43,6 @@ class Behaviour:
     observer: Luenberger | None
     share: float  # of samples at which |ω| lies below the observer's threshold; NaN where there is no observer
     low_yaw_rate: SegmentErrors  # categories, where |ω| lies below it
-    after_start: Mapping[str, SegmentErrors]  # category -> its networks by the length of the window
     corrected: SegmentErrors  # categories, the mean bias of a_y taken off
     biases: Mapping[str, float]  # as `mean_biases` gives them
 
@@ -82,10 +63,6 @@ class Behaviour:
             observer,
             share,
             SegmentErrors(low, labels, _seeds(scheme, low), recordings),
-            {
-                name: SegmentErrors(after_start(scheme, name, test), None, None, recordings)
-                for name in STARTED
-            },
             SegmentErrors(corrected, labels, _seeds(scheme, corrected), recordings),
             biases,
         )
@@ -134,60 +111,6 @@ def at_low_yaw_rate(
 
 def _reference(scheme: Scheme, span: Span) -> Recording:
     return read_recording(scheme.part.references[span.dataset, span.recording])
-
-
-def after_start(scheme: Scheme, category: str, test: str) -> dict[str, list[Segments]]:
-    """Segments of a network by the length of its window: how far it has come so long after it started at v = 0, û = u_m.
-
-    All windows end at the same samples. Keys are the lengths, in samples.
-    """
-    segments: dict[str, list[Segments]] = {}
-    spans = scheme.part.split.tests[test]
-    recordings = recordings_of(scheme.part, spans)
-    speeds = [scheme.part.protocol.min_sideslip_speed_on(span.dataset) for span in spans]
-    for model in scheme.models(category)[:MOST_SEEDS]:
-        estimator = load_model(model.model_folder)
-        if (
-            not isinstance(estimator, WindowedEstimator)
-            or abs(estimator.settings.rate_hz - recordings[0].rate_hz) > 1e-9
-        ):
-            return {}
-        for length in WINDOWS:
-            parts = [
-                own
-                for recording, speed in zip(recordings, speeds, strict=True)
-                if (own := _with_window(estimator, recording, length, speed)) is not None
-            ]
-            if parts:
-                segments.setdefault(str(length), []).append(
-                    segments_of(parts, recordings[0].rate_hz / STRIDE)
-                )
-    return segments
-
-
-def _with_window(
-    estimator: WindowedEstimator, recording: Recording, length: int, min_sideslip_speed: float
-) -> Scored | None:
-    """Estimates from windows of a length, every `STRIDE` samples from where the longest is full."""
-    ends = np.arange(max(WINDOWS), len(recording), STRIDE)
-    if not len(ends):
-        return None
-    network = estimator.network
-    dtype = next(network.parameters()).dtype
-    with torch.no_grad():
-        series = prepare(network, torch.as_tensor(recording.stack(estimator.channels), dtype=dtype))
-        windows = series.unfold(0, length, 1).transpose(1, 2)[ends - length]
-        vy = network(windows).double().numpy().reshape(-1)
-    speed, reference, ay = (recording[name][ends] for name in ("vx", "vy_ref", "ay"))
-    return Scored(
-        recording.time[ends],
-        vy,
-        reference,
-        np.arctan2(vy, speed),
-        np.arctan2(reference, speed),
-        ay,
-        is_fast_enough(speed, reference, min_sideslip_speed),
-    )
 
 
 def mean_biases(scheme: Scheme) -> dict[str, float]:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.splits import VALIDATION
+from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.block_errors import BlockErrors
 from vehest_papers.kit.block_rows import (
     BlockRow,
@@ -22,15 +24,15 @@ from vehest_papers.kit.block_rows import (
 )
 from vehest_papers.kit.claim_files import BASELINES, Paper
 from vehest_papers.ksnn import measures
-from vehest_papers.ksnn.behaviour import ENOUGH, LONGER, Behaviour
-from vehest_papers.ksnn.comparing import METRICS, SegmentErrors
+from vehest_papers.ksnn.behaviour import Behaviour
+from vehest_papers.ksnn.candidates import category_of, runs_of
+from vehest_papers.ksnn.comparing import METRICS
 from vehest_papers.ksnn.schemes import CANDIDATES, Scheme
 
 BAND_POWER = re.compile(r"band_power_(\d+)(?:_(\d+))?_hz")
 CORRECTED = ", acceleration bias removed"
-AFTER = {" after 1.5 s": ENOUGH, " after 3 s": LONGER}  # end of a name -> length of the window
 LOW_YAW_RATE = "rmse_vy_low_yaw_rate"
-AFTER_START = "rmse_vy_after_start"
+DOUBLED = re.compile(r"doubled_(\d+)")
 CLOSED_FORM = "a direct search, a filter or a fixed function; nothing is learnt in epochs"
 Comparison = tuple[str, str, str]  # part, test set, metric
 
@@ -93,10 +95,6 @@ def errors_of(
     elif metric == LOW_YAW_RATE:
         key = CANDIDATES.get(candidate, candidate)
         errors = behaviour.low_yaw_rate
-    elif metric == AFTER_START:
-        ending = next((ending for ending in AFTER if candidate.endswith(ending)), "")
-        key = AFTER.get(ending, "")
-        errors = behaviour.after_start.get(candidate.removesuffix(ending), SegmentErrors({}))
     else:
         key = candidate.removesuffix(CORRECTED)
         errors = behaviour.corrected
@@ -150,15 +148,33 @@ def measured_rows(claimed: Paper, parts: Mapping[str, Scheme]) -> list[BlockRow]
     return rows
 
 
-def training_rows(claimed: Paper, parts: Mapping[str, Scheme]) -> list[TrainingRow]:
-    """How far every candidate was trained; whether twice the epochs are better is not checked."""
+def training_rows(
+    claimed: Paper, parts: Mapping[str, PartArtefacts], schemes: Mapping[str, Scheme]
+) -> list[TrainingRow]:
+    """How far every candidate was trained, and whether twice the epochs are better.
+
+    Parameters
+    ----------
+    parts
+        Of the study, of which ``doubled_NN`` are trained twice as long as ``pair_NN_converged``.
+    schemes
+        Those that are no pairs of drawn cars.
+    """
+    validation, doubled = _validation_errors(parts)
     rows = []
     for candidate, declared in claimed.candidates.items():
-        trained_as = _trained_as(candidate)
+        trained_as = candidate.removesuffix(CORRECTED)
         models = [
             model
-            for scheme in parts.values()
+            for scheme in schemes.values()
             for model in scheme.models_of(scheme.key_of(trained_as))
+        ]
+        category = trained_as.split(",")[0]
+        models += [
+            model
+            for part in parts.values()
+            for model in part.models
+            if category_of(model.estimator, model.variant) == category
         ]
         budgets = sorted({own for model in models if (own := _most_epochs(model.training))})
         if not models:
@@ -166,11 +182,39 @@ def training_rows(claimed: Paper, parts: Mapping[str, Scheme]) -> list[TrainingR
         if candidate in BASELINES or not budgets:
             rows.append(TrainingRow(candidate, "", "", "not applicable", CLOSED_FORM))
             continue
-        stops = np.concatenate([_epochs(scheme, trained_as) for scheme in parts.values()])
-        words = f"{budgets[-1]} at most, {stops.min():.0f} to {stops.max():.0f} by early stopping"
+        words = f"{budgets[-1]} at most"
+        stops = [_epochs(scheme, trained_as) for scheme in schemes.values()]
+        if any(len(own) for own in stops):
+            epochs = np.concatenate(stops)
+            words += f", {epochs.min():.0f} to {epochs.max():.0f} by early stopping"
         of_paper = "" if declared.epochs_paper is None else str(declared.epochs_paper)
-        rows.append(checked_training(candidate, words, of_paper, {}, {}))
+        rows.append(
+            checked_training(
+                candidate,
+                words,
+                of_paper,
+                validation.get(category, {}),
+                doubled.get(category, {}),
+            )
+        )
     return rows
+
+
+def _validation_errors(
+    parts: Mapping[str, PartArtefacts],
+) -> tuple[dict[str, dict[int, float]], dict[str, dict[int, float]]]:
+    """Category -> pair -> RMSE of v on validation, converged and with twice the epochs."""
+    errors: tuple[dict[str, dict[int, float]], ...] = ({}, {})
+    for name, part in parts.items():
+        match = DOUBLED.fullmatch(name)
+        converged = f"pair_{match[1]}_converged" if match else ""
+        if match is None or converged not in parts:
+            continue
+        for by_category, own in zip(errors, (parts[converged], part), strict=True):
+            for run in runs_of(own).to_dict("records"):
+                value = float(run[f"rmse_vy.{VALIDATION}"])
+                by_category.setdefault(str(run["category"]), {})[int(match[1])] = value
+    return errors[0], errors[1]
 
 
 def _most_epochs(training: Mapping[str, Any]) -> int:
@@ -182,10 +226,3 @@ def _epochs(scheme: Scheme, candidate: str) -> FloatArray:
     runs = scheme.runs
     own = runs["estimator"] + "/" + runs["variant"] == scheme.key_of(candidate)
     return np.asarray(runs[own]["epochs"], dtype=np.float64)
-
-
-def _trained_as(candidate: str) -> str:
-    """The candidate whose networks it uses."""
-    for ending in (CORRECTED, *AFTER):
-        candidate = candidate.removesuffix(ending)
-    return candidate

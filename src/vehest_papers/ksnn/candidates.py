@@ -71,6 +71,8 @@ def category_of(estimator: str, variant: str) -> str:
         return f"{paper.FIXED_LAG} {lag[1].removesuffix('s')} s"
     if estimator != "ksnn":
         return _NAMES.get(estimator, estimator)
+    if "_kinematic_" in variant:
+        return paper.KINEMATIC_GAIN
     kind = variant.split("_")[0]
     bias = "no_bias" if "_no_bias" in variant else "bias"
     return _KINDS[kind, bias]

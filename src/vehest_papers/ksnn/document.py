@@ -1,107 +1,137 @@
-"""The report: what came of the paper's claims on the first page, then everything else in appendices."""
+"""The report: claims judged by the engine, errors on pairs of cars, sub-models, window lengths and real cars."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Document, Table, as_code, as_text
-from vehest.report.style import fixed, listed
+from vehest.report.document import PATENT_NOTE, REPORT, Column, Document, Table, as_text
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import StudyArtefacts
-from vehest_papers.kit import methods
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import claims_of
-from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.verdict_table import claims_table
-from vehest_papers.ksnn import (
-    analyses,
-    behaviour_tables,
-    block_errors,
-    cost,
-    paper,
-    scatter,
-    tables,
+from vehest_papers.kit.methods import absent_parts
+from vehest_papers.kit.reading import recordings_of, words_of_kinds
+from vehest_papers.kit.report_template import fill_template
+from vehest_papers.kit.verdict_table import (
+    CLAIMS,
+    claims_table,
+    figure_in_words,
+    one_line,
 )
+from vehest_papers.kit.verdicts import VERDICTS
+from vehest_papers.ksnn import block_errors, measures, paper
 from vehest_papers.ksnn.behaviour import Behaviour
-from vehest_papers.ksnn.causes import CAUSES, causes_table
-from vehest_papers.ksnn.curve import Curve, curve_figure, curve_of, curve_table
-from vehest_papers.ksnn.schemes import SET_TITLES, Scheme, with_common_blocks
+from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
+from vehest_papers.ksnn.pairs import (
+    ORDER,
+    TRAININGS,
+    detectable_ratio,
+    errors_table,
+    geometric_mean,
+    log_fvu,
+    n_seeds,
+    pair_errors,
+    pair_parts,
+    pair_rows,
+    ratios_table,
+)
+from vehest_papers.ksnn.schemes import Scheme, with_common_blocks
+from vehest_papers.ksnn.sub_models import shares_of_parts, shares_table
 
+NAME = "ksnn"  # of the paper's package
+TEMPLATE = Path(__file__).with_name("report.md.j2")
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
-"""Part -> the paper's table, test set of the car that is learnt on, test set of the other."""
-OTHER_CARS = ("devbot_ferrari", "ferrari_devbot")
+"""Part -> the paper's table, test set of the training car, test set of the other car."""
+
+WINDOWS = re.compile(r"window_(\d+)_([12])")
+APART = re.compile(r"pair_|window_|doubled_")  # parts that are no `Scheme`
+REAL = ("ferrari_drive", "simulated_to_ferrari", "devbot_ferrari", "ferrari_devbot")
 SMALL = ("f1tenth", "dart", "roboracer")
-WINDOW = 30  # steps of a network for an estimate
+RATIO_SETS = {"Scheme 1": ("C-1", "F-2"), "Scheme 2": ("C-2", "F-1")}
+RATIO_MARGIN = 0.05
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of the study.
+    """The report of the study; what is not trained yet is named, and claims on it are not assessed.
 
-    Raises:
-        DataError: a scheme is missing, it has no test sets ``c2`` and ``f2``, or metrics are missing.
+    Raises
+    ------
+    DataError
+        No part has a trained estimator, a scheme has no test sets ``c2`` and ``f2``, or metrics are
+        missing.
     """
-    for name in SCHEMES:
-        if name not in artefacts.parts:
-            raise DataError(f"study '{artefacts.study}' needs part '{name}'")
+    if not artefacts.parts:
+        raise DataError(f"study '{artefacts.study}' has no trained part yet; train one first")
+    for name in set(SCHEMES) & set(artefacts.parts):
         if not {"c2", "f2"} <= set(artefacts.parts[name].split.tests):
             raise DataError(
                 f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2"
             )
-    parts = with_common_blocks({name: scheme_of(artefacts, name) for name in artefacts.parts})
-    schemes = [parts[name] for name in SCHEMES]
-    ablations = {
-        cause: own
-        for cause in CAUSES
-        if (own := [parts[name] for number in "12" if (name := f"{cause}_{number}") in parts])
+    schemes = with_common_blocks(
+        {name: scheme_of(artefacts, name) for name in artefacts.parts if not APART.match(name)}
+    )
+    content = claims_of(NAME)
+    errors = pair_errors(artefacts.parts)
+    rows = block_errors.error_rows(content, schemes, behaviours(schemes)) + pair_rows(errors)
+    rows += block_errors.measured_rows(content, schemes | windows_of(artefacts))
+    trained = block_errors.training_rows(content, artefacts.parts, schemes)
+    kinds = kinds_of(artefacts)
+    claims = claims_table(content, rows, trained, kinds)
+    shares = pd.concat(
+        [
+            shares_of_parts(pair_parts(artefacts.parts), "own", "pairs, SIMULATED"),
+            *(
+                shares_of_parts({name: artefacts.parts[name]}, "test", "Ferrari, REAL")
+                for name in ("ferrari_drive",)
+                if name in artefacts.parts
+            ),
+        ]
+    )
+    tables = [pair_claims(claims)]
+    if len(errors):
+        tables += [errors_table(errors, measure) for measure in ("raw", "best_gain")]
+        tables += [ratios_table(errors)]
+    if len(shares):
+        tables.append(shares_table(shares))
+    gates = velocity_ratios(artefacts)
+    tables += [table for table in (gates, windows_table(artefacts), real_table(schemes)) if table]
+    verdicts = claims.frame["verdict"].value_counts()
+    values = {
+        "recommendation": one_line(content.recommendation),
+        "kinds": " and ".join(
+            sorted({word for kind in kinds.values() for word in kind.split(" and ")})
+        ).upper(),
+        "pairs": pairs_values(errors),
+        "verdicts": {
+            verdict: int(verdicts[verdict]) for verdict in VERDICTS if verdict in verdicts
+        },
+        "n_claims": len(claims.frame),
+        "absent_parts": absent_parts(artefacts),
+        "incomplete": incomplete(artefacts),
+        "searches": [
+            {
+                "title": as_text(trial.title),
+                "value": f"{trial.validation:.4f}",
+                "chosen": trial.chosen,
+            }
+            for trial in artefacts.trials
+        ],
     }
-    curve = curve_of(
-        parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")}
-    )
-    pairs = _pairs(parts)
-    behaviours = {scheme.name: Behaviour.of(scheme) for scheme in schemes}
-    claimed = claims_of("ksnn")
-    rows = block_errors.error_rows(claimed, parts, behaviours)
-    rows += block_errors.measured_rows(claimed, parts)
-    trained = block_errors.training_rows(claimed, parts)
-    kinds = {re.sub(r"_[a-z]$", "", name): own.kind for name, own in parts.items()}
-    figure_6 = (
-        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
-        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
-        f"dashed line the own car is estimated better."
-    )
-    overview = (
-        "FVU, with 95 % intervals over blocks of the drives and seeds, and RMSE(v), since v varies differently from car to car; of each "
-        f"category the structure that validation chooses; all figures are in the CSV. {schemes[0].kind.upper()}."
-    )
-    blocks: list[Block] = [
-        *_asked(artefacts),
-        claims_table(claimed, rows, trained, kinds),
-        "## On the own car, on the other and on a third",
-        scatter.two_tests(schemes, figure_6),
-        tables.across_cars(schemes, "overview", overview, without=(paper.KINEMATIC,)),
-    ]
-    if ablations:
-        blocks += ["## Which difference between the cars matters", causes_table(schemes, ablations)]
-    if curve is not None:
-        blocks += ["## With fewer minutes", curve_figure(curve)]
-    blocks += _appendices(artefacts, parts, schemes, curve, behaviours)
-    data = {
-        f"candidates_{name}": tables.candidates(
-            parts[name].runs, list(parts[name].part.split.tests)
-        )
-        for name in SCHEMES
-    }
+    data = {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
+    data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
-    if pairs:
-        data["small_cars_all"] = tables.across_cars(pairs, "small_cars_all", "").frame
+    blocks = [*fill_template(TEMPLATE, values, tables), PATENT_NOTE]
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
 def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
-    """A part with its cars: those of the paper's schemes by the name, others by which data set a test shares with what is learnt on."""
+    """A part with its cars: those of the paper by the name, others by the data set of the training."""
     part = artefacts.parts[name]
     title = as_text(artefacts.titles[name])
     if name in SCHEMES:
@@ -111,133 +141,175 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
     if {"c2", "f2"} <= set(tests):
         own = "c2" if name.endswith("_1") else "f2"
         return Scheme(name, title, part, own, "f2" if own == "c2" else "c2")
-    learnt = {span.dataset for span in part.split.train}
+    datasets = {span.dataset for span in part.split.train}
     own = next(
-        (test for test in tests if learnt & {span.dataset for span in part.split.tests[test]}),
+        (test for test in tests if datasets & {span.dataset for span in part.split.tests[test]}),
         tests[0],
     )
     return Scheme(name, title, part, own, next((test for test in tests if test != own), own))
 
 
-def _pairs(parts: Mapping[str, Scheme]) -> list[Scheme]:
-    """Parts of small cars, which are called by both."""
-    return [own for name, own in parts.items() if set(name.split("_")) <= set(SMALL)]
-
-
-def _asked(artefacts: StudyArtefacts) -> list[Block]:
-    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
-    schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
-    words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
-    others = {
-        kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind]
-        for kind in kinds.values()
-        if kind != schemes
-    }
-    if others:
-        counts = listed([f"{len(titles)} are {kind}" for kind, titles in others.items()])
-        words += f" Of the other parts {counts}: see the appendix."
-    return [f"{words}{methods.absent_parts(artefacts)} {artefacts.about}".strip()]
-
-
-def _appendices(
-    artefacts: StudyArtefacts,
-    parts: Mapping[str, Scheme],
-    schemes: Sequence[Scheme],
-    curve: Curve | None,
-    behaviours: Mapping[str, Behaviour],
-) -> list[Block]:
-    runs = {name: own.runs for name, own in parts.items()}
-    blocks: list[Block] = ["## Appendix: how estimators behave", *_behaviour(schemes, behaviours)]
-    if curve is not None:
-        blocks.append(curve_table(curve))
-    blocks += ["## Appendix: the paper's tables"]
-    for scheme, number in zip(schemes, ("IV", "V"), strict=True):
-        which = (
-            f"{scheme.title.lower()} (Table {number} of the paper). Ours: {scheme.kind.upper()}."
-        )
-        caption = f"The one run of each category that validation chooses, {which}"
-        blocks.append(tables.chosen_runs(scheme, f"table_{4 if number == 'IV' else 5}", caption))
-    blocks.append(
-        tables.sideslip(
-            runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), schemes[0].kind
-        )
+def pair_claims(claims: Table) -> Table:
+    """The claims that pairs of cars decide."""
+    chosen = claims.frame[claims.frame["id"].str.endswith("_pairs")]
+    columns = {name: claims.columns[name] for name in ("claim", "published", "ours", "verdict")}
+    return Table(
+        "pair_claims", "Claims over pairs of cars. SIMULATED.", chosen[[*columns]], columns
     )
-    if "one_vehicle" in runs:
-        blocks.append(tables.regularisation(runs["scheme_2"], runs["one_vehicle"]))
-    others = [parts[name] for name in OTHER_CARS if name in parts]
-    if others:
-        caption = "FVU and RMSE(v) with 95 % intervals, of each category the structure that validation chooses."
-        blocks += [
-            "## Appendix: a simulated DevBot and the real Ferrari",
-            tables.across_cars(others, "devbot", caption),
-        ]
-        blocks += map(tables.whether_an_order_means_anything, others)
-    pairs = _pairs(parts)
-    if pairs:
-        blocks += [
-            "## Appendix: pairs of small cars",
-            tables.small_cars(pairs),
-            *map(tables.whether_an_order_means_anything, pairs),
-        ]
-    blocks += ["## Appendix: noise of the accelerations", *analyses.of_sensitivities(schemes)]
-    blocks += ["## Appendix: spectra of the residuals", *analyses.of_residuals(schemes)]
-    blocks += ["## Appendix: what the networks have learnt", *analyses.of_interpretation(schemes)]
-    warned = methods.warnings_in_words({scheme.title: scheme.part for scheme in schemes})
-    blocks += [
-        "## Appendix: the data",
-        *analyses.of_the_data(artefacts),
-        *([warned] if warned else []),
+
+
+def behaviours(schemes: Mapping[str, Scheme]) -> dict[str, Behaviour]:
+    """What the candidates of both schemes do at little yaw rate and without biases."""
+    return {name: Behaviour.of(schemes[name]) for name in SCHEMES if name in schemes}
+
+
+def windows_of(artefacts: StudyArtefacts) -> dict[str, Scheme]:
+    """Parts with networks on windows of another length."""
+    return {name: scheme_of(artefacts, name) for name in artefacts.parts if WINDOWS.fullmatch(name)}
+
+
+def kinds_of(artefacts: StudyArtefacts) -> dict[str, str]:
+    """Part in claims.yaml -> real or simulated."""
+    kinds = {}
+    for name, part in artefacts.parts.items():
+        match = re.fullmatch(r"pair_\d+_(stop|converged)(?:_more)?", name)
+        title = f"pairs_{match[1]}" if match else re.sub(r"_[a-z]$", "", name)
+        kinds[title] = words_of_kinds(part)
+    return kinds
+
+
+def pairs_values(errors: pd.DataFrame) -> list[dict[str, object]]:
+    """Numbers of the answer: one entry, or none without a complete pair."""
+    if not len(errors):
+        return []
+    first = paper.NONLINEAR
+    stop, converged = (log_fvu(errors, training, "other", "raw") for training in TRAININGS)
+    gain = log_fvu(errors, "converged", "other", "best_gain")
+    third = log_fvu(errors, "stop", "third", "raw")
+
+    def ratio(table: pd.DataFrame, name: str, over: str) -> str:
+        if name not in table or over not in table:
+            return MISSING
+        return figure_in_words(geometric_mean((table[name] - table[over]).to_numpy()))
+
+    over = {"GRU": paper.GRU, "LSTM": paper.LSTM, "luenberger": paper.LUENBERGER}
+    over |= {"static_map": "static_map"}
+    detectable = [
+        detectable_ratio((stop[first] - stop[name]).to_numpy())
+        for name in (paper.GRU, paper.LSTM)
+        if {first, name} <= set(stop)
     ]
-    blocks += _how_it_was_made(artefacts)
-    whole = pd.concat([scheme.runs for scheme in schemes], ignore_index=True)
-    blocks += [
-        tables.instances(whole),
-        *analyses.of_activation(schemes),
-        tables.stopping(runs, artefacts.titles),
-        PATENT_NOTE,
-    ]
-    return blocks
-
-
-def _behaviour(schemes: Sequence[Scheme], behaviours: Mapping[str, Behaviour]) -> list[Table]:
-    """Low yaw rates, starts, biases, learnt parameters and cost."""
-    costs = cost.cost_rows(schemes[0], (paper.ZERO, paper.STATIC_MAP, *paper.CATEGORIES), WINDOW)
-    tables_of = (
-        behaviour_tables.low_yaw_rate_table(schemes, behaviours),
-        behaviour_tables.after_start_table(schemes, behaviours),
-        behaviour_tables.biases_table(schemes, behaviours),
-        behaviour_tables.parameters_table(schemes),
-        cost.cost_table(costs, WINDOW) if len(costs) else None,
-    )
-    return [table for table in tables_of if table is not None]
-
-
-def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    fits = sum(len(part.models) for part in artefacts.parts.values())
-    lines = [
-        f"Command: {as_code(artefacts.command)}; {fits} fits",
-        methods.scoring(
-            artefacts.parts["scheme_1"], ", held and never interpolated from later values"
-        ),
-        "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
-        "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "
-        "is of the other car. Test data choose nothing.",
-        _averaging(artefacts),
-        "Intervals are over blocks of the drives and seeds, as `docs/scorecard.md` describes; spectra have segments of 25.6 s as blocks.",
-        *methods.facts_of(artefacts.parts.values()),
-    ]
-    caption = "What was used for what (the first two rows are Table II of the paper)."
     return [
-        methods.how_it_was_made(lines),
-        methods.ranges_table(artefacts, "table_2", caption, SET_TITLES),
+        {
+            "number": errors["pair"].nunique(),
+            "seeds": n_seeds(errors, [name for name in (first, paper.GRU) if name in stop]),
+            "stop": {key: ratio(stop, first, name) for key, name in over.items()},
+            "converged": {key: ratio(converged, first, name) for key, name in over.items()},
+            "third": {key: ratio(third, first, name) for key, name in over.items()},
+            "gain": {key: ratio(gain, first, name) for key, name in over.items()},
+            "kinematic": ratio(stop, paper.KINEMATIC_GAIN, first),
+            "kinematic_third": ratio(third, paper.KINEMATIC_GAIN, first),
+            "no_bias": ratio(stop, first, paper.NONLINEAR_BIAS),
+            "detectable": fixed(max(detectable, default=np.nan), 2),
+        }
     ]
 
 
-def _averaging(artefacts: StudyArtefacts) -> str:
-    """Averaging of weights over training steps, where a training is configured with it."""
-    trainings = [model.training for part in artefacts.parts.values() for model in part.models]
-    decays = sorted({float(own["averaging"] or 0.0) for own in trainings if "averaging" in own})
-    if decays in ([], [0.0]):
-        return "Networks keep the weights of their best epoch."
-    words = listed([fixed(own, 4).rstrip("0") for own in decays])
-    return f"Networks keep an exponential average of their weights, decay {words} a step, at its best epoch: docs/estimators/training.md."
+def incomplete(artefacts: StudyArtefacts) -> list[dict[str, object]]:
+    """What is planned and not trained: one entry, or none."""
+    counts = {name: len(names) for name, names in artefacts.not_trained.items() if names}
+    if not counts:
+        return []
+    titles = dict.fromkeys("pairs" if name.startswith("pair_") else f"`{name}`" for name in counts)
+    return [{"number": sum(counts.values()), "parts": ", ".join(titles)}]
+
+
+def velocity_ratios(artefacts: StudyArtefacts) -> Table | None:
+    """The gates on the pair of cars: v over ay of the Corvette over that of the Ferrari."""
+    found = next((artefacts.parts[name] for name in SCHEMES if name in artefacts.parts), None)
+    both = [artefacts.parts[name] for name in SCHEMES if name in artefacts.parts]
+    if found is None or len(both) < len(SCHEMES):
+        return None
+    first, second = both
+    drives = {
+        "C-1": recordings_of(first, first.split.train),
+        "F-1": recordings_of(second, second.split.train),
+        "C-2": recordings_of(first, first.split.tests["c2"]),
+        "F-2": recordings_of(first, first.split.tests["f2"]),
+    }
+    rows = []
+    for scheme, (corvette, ferrari) in RATIO_SETS.items():
+        published = PUBLISHED[corvette].velocity_over_ay / PUBLISHED[ferrari].velocity_over_ay
+        ours = velocity_ratio(drives[corvette], drives[ferrari])
+        is_met = abs(ours / published - 1.0) <= RATIO_MARGIN
+        rows.append(
+            {
+                "scheme": f"{scheme}: {corvette} over {ferrari}",
+                "published": published,
+                "ours": ours,
+                "gate": f"within {100 * RATIO_MARGIN:.0f} %" if is_met else "not met",
+            }
+        )
+    columns = {
+        "scheme": Column("v over ay"),
+        "published": Column("paper", decimals=3),
+        "ours": Column("ours", decimals=3),
+        "gate": Column("gate"),
+    }
+    caption = (
+        "Ratio of v over ay between the two cars: mean size of the 0.01 and 0.99 quantiles of v over the 0.99 "
+        "quantile of the magnitude of a_y. The gate was met before any network was trained."
+    )
+    return Table("velocity_ratios", caption, pd.DataFrame(rows), columns)
+
+
+def windows_table(artefacts: StudyArtefacts) -> Table | None:
+    """FVU of networks trained on windows of 15, 30 and 60 samples, on the samples that all estimate."""
+    schemes = {name: scheme_of(artefacts, name) for name in artefacts.parts if name in SCHEMES}
+    windows = windows_of(artefacts)
+    rows = []
+    for number, (scheme_name, scheme) in enumerate(schemes.items(), start=1):
+        lengths = {30: scheme} | {
+            int(match[1]): own
+            for name, own in windows.items()
+            if (match := WINDOWS.fullmatch(name)) and match[2] == scheme_name[-1]
+        }
+        if len(lengths) < 2:
+            continue
+        for candidate in (paper.NONLINEAR, paper.GRU):
+            row: dict[str, object] = {"scheme": f"Scheme {number}", "candidate": candidate}
+            for length in sorted(lengths):
+                for test in (scheme.own, scheme.other):
+                    fvu = measures.fvu_after_longest_window(lengths[length], candidate, test)
+                    row[f"{'own' if test == scheme.own else 'other'}_{length}"] = fvu
+            rows.append(row)
+    if not rows:
+        return None
+    table = pd.DataFrame(rows)
+    columns = {"scheme": Column("scheme"), "candidate": Column("candidate")} | {
+        name: Column(f"{name.split('_')[0]} car, N = {name.split('_')[1]}", decimals=3)
+        for name in table.columns[2:]
+    }
+    caption = "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds. SIMULATED."
+    return Table("windows", caption, table, columns)
+
+
+def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
+    """RMSE of v on the tests of real cars, with the baselines."""
+    names = [name for name in schemes if name in REAL or set(name.split("_")) <= set(SMALL)]
+    rows = []
+    for name in names:
+        scheme = schemes[name]
+        for test in dict.fromkeys([scheme.own, scheme.other]):
+            errors = scheme.errors(test)
+            row: dict[str, object] = {"trained": scheme.title, "test": test}
+            for candidate in ORDER:
+                key = scheme.key_of(candidate)
+                row[candidate] = errors.in_words(key, "fvu") if key in errors else MISSING
+            rows.append(row)
+    if not rows:
+        return None
+    columns = {"trained": Column("comparison"), "test": Column("test")}
+    columns |= {name: Column(name) for name in ORDER}
+    caption = "FVU on real cars (DevBot: simulated), 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
+    return Table("real_cars", caption, pd.DataFrame(rows), columns)

@@ -17,6 +17,7 @@ from vehest.constants import FloatArray
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.blocks import block_sums
+from vehest.evaluation.metrics import Scored
 from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.kit.block_errors import BlockErrors
 from vehest_papers.kit.claim_files import Claim
@@ -33,6 +34,7 @@ BANDS_HZ = tuple(
 )  # centres of thirds of an octave, 0.1 to 6.3 Hz
 LEAST_SEGMENTS = 8  # of a spectrum
 LEAST_STRUCTURES = 8  # of a rank correlation
+LONGEST_WINDOW = 60  # samples of the longest windows that networks are trained on
 WEIGHTS = ("weights",)  # the only block of what is measured of trained weights
 
 
@@ -342,12 +344,70 @@ def first_sub_model_shares(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def stopping_epochs(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Epoch at which training stopped, of each seed."""
+    """Passes over the training windows after which training stopped, of each seed."""
     scheme = parts[claim.part]
     name = scheme.key_of(str(claim.candidate))
     runs = scheme.runs
     own = runs[(runs["estimator"] + "/" + runs["variant"] == name) & (runs["epochs"] > 0)]
-    return _of_weights(own["epochs"].to_numpy(dtype=float)) if len(own) else None
+    if not len(own):
+        return None
+    training = _models(scheme, claim.candidate)[0].training
+    windows_of_epoch = int(training.get("epoch_steps") or 0) * int(training.get("batch_size") or 64)
+    passes = 1.0
+    if windows_of_epoch:
+        drives = recordings_of(scheme.part, scheme.part.split.train)
+        passes = windows_of_epoch / sum(len(drive) for drive in drives)
+    return _of_weights(passes * own["epochs"].to_numpy(dtype=float))
+
+
+def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
+    """RMSE of v of networks trained on windows of 60 samples over that of those trained on 30."""
+    scheme = parts[claim.part]
+    longer = parts.get(f"window_60_{claim.part[-1]}")
+    candidate = str(claim.candidate)
+    if longer is None or not (_models(longer, candidate) and _models(scheme, candidate)):
+        return None
+    logs = []
+    for own in (longer, scheme):
+        sums = [_block_squares(own, model, claim.test_set) for model in _models(own, candidate)]
+        logs.append(0.5 * log_values(np.stack([squares for squares, _ in sums]), sums[0][1]))
+    ratios = np.subtract(*paired_seeds(*logs))
+    return ByBlock(_segment_names(ratios.shape[1]), as_ratio(ratios))
+
+
+def after_longest_window(scheme: Scheme, model: EvaluatedModel, test: str) -> list[Scored]:
+    """Estimate and reference where a window of `LONGEST_WINDOW` samples is full."""
+    spans = scheme.part.split.tests[test]
+    recordings = recordings_of(scheme.part, spans)
+    seconds = LONGEST_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
+    return [
+        own.at(own.time > recording.start_time + seconds)
+        for own, recording in zip(scheme.part.scored(model, test), recordings, strict=True)
+    ]
+
+
+def fvu_after_longest_window(scheme: Scheme, candidate: str, test: str) -> float:
+    """FVU on those samples, mean over seeds; NaN where the candidate is not there."""
+    values = []
+    for model in _models(scheme, candidate):
+        scored = after_longest_window(scheme, model, test)
+        errors = np.concatenate([own.vy - own.vy_ref for own in scored])
+        values.append(np.var(errors) / np.var(np.concatenate([own.vy_ref for own in scored])))
+    return float(np.mean(values)) if values else np.nan
+
+
+def _block_squares(
+    scheme: Scheme, model: EvaluatedModel, test: str
+) -> tuple[FloatArray, FloatArray]:
+    """Sums of squared errors and samples of blocks of `SEGMENT_SECONDS`, (B,) each."""
+    length = round(SEGMENT_SECONDS * scheme.part.protocol.rate_hz)
+    squares = []
+    samples = []
+    for own in after_longest_window(scheme, model, test):
+        starts = np.arange(0, len(own.vy), length)
+        squares.append(np.add.reduceat(np.square(own.vy - own.vy_ref), starts))
+        samples.append(np.diff([*starts, len(own.vy)]).astype(np.float64))
+    return np.concatenate(squares), np.concatenate(samples)
 
 
 def _models(scheme: Scheme, candidate: str | None) -> list[EvaluatedModel]:

@@ -12,6 +12,7 @@ LINEAR_BIAS = "KS-NN linear + bias"
 NONLINEAR_BIAS = "KS-NN nonlinear + bias"
 LINEAR = "KS-NN linear no bias"
 NONLINEAR = "KS-NN nonlinear no bias"
+KINEMATIC_GAIN = "KS-NN with kinematic gains"  # ours: nonlinear no bias with `kinematic_gain`
 KALMAN = "Kalman filter (KF)"
 FACTOR_GRAPH = "Factor graph (FG)"
 FIXED_LAG = "Factor graph (FG), fixed lag of"

@@ -79,8 +79,15 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
                     parameter.copy_(0.01 * noise)
 
     def constrain(self, parameters: Mapping[str, Tensor]) -> None:
-        """Keep γ₁ in (0, 1] (Section IV-A2)."""
-        parameters["gamma"][..., 0].clamp_(min=1e-3, max=1.0)
+        """Keep γ₁ in (0, 1] (Section IV-A2), or both gains of the slip rate near one.
+
+        Without ``kinematic_gain`` the bound is the paper's. With it, which is not in the paper, γ₁
+        and β₁ of every local model are so near one that the estimate integrates a_y - ωu_m.
+        """
+        bound = self.settings.kinematic_gain
+        parameters["gamma"][..., 0].clamp_(min=max(bound, 1e-3), max=1.0)
+        if bound:
+            parameters["beta"][..., 0].clamp_(min=bound, max=2.0 - bound)
 
     def activations(self, yaw_rate: Tensor) -> Tensor:
         """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the
