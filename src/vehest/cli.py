@@ -245,7 +245,9 @@ def ingest(
         bool,
         typer.Option(
             "--download",
-            help="First fetch missing files, and compare checksums.",
+            help=(
+                "First fetch missing files, and compare checksums; resumes an interrupted download."
+            ),
         ),
     ] = False,
     dry_run: DryRun = False,
