@@ -15,7 +15,7 @@ from vehest.configuration.composition import compose_config
 from vehest.configuration.files import choices, packaged
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
-from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
+from vehest.run.evaluate_faults import FaultSettings, faults_of, union_of_faults
 from vehest.run.study import jobs_of, read_study
 from vehest.run.versions import code_of
 from vehest.trust.faults import KINDS, is_fault
@@ -74,11 +74,11 @@ def test_a_list_takes_what_it_does_not_say_from_the_kind_stands_before_the_choic
     assert (bias.condition, bias.start, bias.duration) == ("bias:ax:0.4", 3.0, 10.0)
     assert faults_of(compose_config("eval")) == ()
     fault = FaultSettings("bias", "ay", "mild")
-    assert all_of([[fault], [fault]]) == (fault,)
+    assert union_of_faults([[fault], [fault]]) == (fault,)
     assert "two faults are both called bias:ay:mild" in refusal(
-        lambda: all_of([[fault], [replace(fault, start=4.0)]]), ConfigurationError
+        lambda: union_of_faults([[fault], [replace(fault, start=4.0)]]), ConfigurationError
     )
-    assert len(all_of([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
+    assert len(union_of_faults([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
 
 
 def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_in_each():

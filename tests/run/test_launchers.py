@@ -64,9 +64,9 @@ def made_in(output):
 
 def test_progress_has_no_more_bars_than_fit_a_terminal():
     with FINE.bars() as bars:
-        for number in range(console.MOST_BARS + 5):
+        for number in range(console.MAX_BARS + 5):
             bars.step(f"training {number}", 0, 1, "starting")
-        assert len(bars.tasks) == console.MOST_BARS
+        assert len(bars.tasks) == console.MAX_BARS
 
 
 def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):

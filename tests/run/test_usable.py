@@ -186,7 +186,7 @@ def test_estimators_of_another_package_or_without_a_file_in_conf_say_themselves_
     found = usability(
         "luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))]
     )
-    assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
+    assert (found.usable, found.rate_hz, found.configured_rate_hz) == ("yes", 50.0, 100.0)
 
 
 LOGS = {

@@ -167,15 +167,15 @@ class SpeedFromWheels:
             np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         )
         vx = np.empty(len(recording))
-        n_held = 0
+        n_samples_carried = 0
         now = math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
-            n_held = 0 if agreeing >= enough else n_held + 1
+            n_samples_carried = 0 if agreeing >= enough else n_samples_carried + 1
             target = wheels if agreeing >= enough else median
             if math.isnan(now):
                 now = target
-            elif (n_held and n_held <= patience) or math.isnan(target):
+            elif (n_samples_carried and n_samples_carried <= patience) or math.isnan(target):
                 now += gain
             else:
                 now += min(max(target - now, -max_change), max_change)

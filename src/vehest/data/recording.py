@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["real", "simulated"]
 
-LONGEST_PART = 900.0  # s; a longer drive is checked and, from a large table, read in parts
+MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6
@@ -236,10 +236,10 @@ def _immutable(samples: FloatArray) -> FloatArray:
 
 def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
     """Ranges of indices that divide so many samples into parts of about one length, none longer
-    than `LONGEST_PART`.
+    than `MAX_PART_SECONDS`.
     """
     edges = (
-        np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1)
+        np.linspace(0, n_samples, max(math.ceil(n_samples / (MAX_PART_SECONDS * rate_hz)), 1) + 1)
         .astype(int)
         .tolist()
     )

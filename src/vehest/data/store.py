@@ -257,14 +257,14 @@ def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _
     `DataError` if it is damaged or of another kind or format.
     """
     content = "recording" if kind is RecordingDescription else "estimate"
-    content_found = _metadata(schema, path)
-    if content_found.get("content") != content:
+    description = _metadata(schema, path)
+    if description.get("content") != content:
         raise DataError(
             f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} "
             f"{content} that vehest wrote"
         )
-    check_format(content_found.get("format", 0), _FORMAT, f"'{path}'")
-    return validated(kind, content_found, f"'{path}'")
+    check_format(description.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, description, f"'{path}'")
 
 
 def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = (
+MAX_DIRECT_TAPS = (
     8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 )
 OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
@@ -218,7 +218,7 @@ class LowPass:
         """
         half = max(1, round(self.reach * rate_hz))
         taps = scipy.signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
-        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else scipy.signal.oaconvolve
+        convolve = np.convolve if len(taps) <= MAX_DIRECT_TAPS else scipy.signal.oaconvolve
         return convolve(_extended(samples, half), taps, mode="valid")
 
 

@@ -37,7 +37,7 @@ PATENT_NOTE = (
 
 REPORT = "report"  # document of a study that one starts with
 
-LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
+MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
 PNG_COLOURS = 256
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
@@ -512,7 +512,7 @@ def bars_of(
     """Where values and the ends of their intervals lie on one axis from zero, in per cent of its
     length; none where a value is missing.
 
-    The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far
+    The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
     beyond; what is longer is ``cut``.
     """
     finite = [value for value in values if math.isfinite(value)]
@@ -523,7 +523,7 @@ def bars_of(
     ]
     if not finite or max(ends) <= 0:
         return [None] * len(values)
-    axis = min(max(ends), LONGEST_AXIS * sorted(finite)[len(finite) // 2] or max(ends))
+    axis = min(max(ends), MAX_AXIS_RATIO * sorted(finite)[len(finite) // 2] or max(ends))
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)

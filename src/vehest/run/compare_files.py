@@ -54,8 +54,8 @@ from vehest.sources.base import read_single
 from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
-LEAST_SECONDS = 5.0
-LOWEST_RATE = 1.0  # Hz
+MIN_COMMON_SECONDS = 5.0
+MIN_RATE_HZ = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -289,18 +289,19 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
         raise DataError(f"{empty[0]} has no value at all")
     start = max(float(clock[0]) for clock in times.values())
     stop = min(float(clock[-1]) for clock in times.values())
-    if stop - start < LEAST_SECONDS:
+    if stop - start < MIN_COMMON_SECONDS:
         ranges = ", ".join(
             f"{name} goes from {clock[0]:.6g} to {clock[-1]:.6g} s" for name, clock in times.items()
         )
         raise DataError(
-            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift "
+            f"{ranges}: less than {MIN_COMMON_SECONDS:g} s in common; are the clocks the same? "
+            "(--shift "
             "SECONDS or auto moves tables of other tools)"
         )
-    if reference.rate_hz < LOWEST_RATE:
+    if reference.rate_hz < MIN_RATE_HZ:
         raise DataError(
             f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need "
-            f"{LOWEST_RATE:g} Hz or more"
+            f"{MIN_RATE_HZ:g} Hz or more"
         )
     return start, stop
 

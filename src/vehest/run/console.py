@@ -40,7 +40,7 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-MOST_BARS = 16
+MAX_BARS = 16
 
 
 class _Console(Console):
@@ -125,7 +125,7 @@ class Bars(Progress):
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar, which appears when it is first moved."""
-        if name not in self._named and len(self._named) < MOST_BARS:
+        if name not in self._named and len(self._named) < MAX_BARS:
             self._named[name] = self.add_task(printable(name), total=total, note="")
         if name in self._named:
             self.update(self._named[name], completed=done, total=total, note=printable(note))

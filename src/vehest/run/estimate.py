@@ -46,12 +46,12 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
-SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
-SHARPEST_TURN = (
+MIN_LOG_RATE_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
+MAX_WHEELBASE_OVER_RADIUS = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
 # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
-LARGEST_FROUDE = 400.0
+MAX_FROUDE_NUMBER = 400.0
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 
 
@@ -108,7 +108,7 @@ def estimate_file(
             model.preparation = options.preparation
         band = describe_band(trust, first.vehicle, options.same_vehicle, first.car)
         elsewhere = is_other_vehicle(trust, first.vehicle, options.same_vehicle, first.car)
-        if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
+        if MIN_LOG_RATE_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
             remarks.append(
                 f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
                 f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the "
@@ -124,7 +124,7 @@ def estimate_file(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
-            slowest_hz=SLOWEST_LOG_HZ,
+            slowest_hz=MIN_LOG_RATE_HZ,
         )
         estimates = report.counted(estimate_parts(run, resampled_drive))
         if writes_log:
@@ -235,7 +235,7 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
     problem = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
     remedy = "give estimator.wheelbase"
-    if wheelbase * turn > SHARPEST_TURN:
+    if wheelbase * turn > MAX_WHEELBASE_OVER_RADIUS:
         return [
             Finding(
                 "warning",
@@ -245,7 +245,7 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
             )
         ]
     fast = float(np.quantile(speed, 0.99))
-    if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
+    if fast**2 > MAX_FROUDE_NUMBER * GRAVITY * wheelbase:
         return [
             Finding(
                 "warning", "wheelbase", "", f"{problem} does not reach {fast:.0f} m/s; {remedy}"

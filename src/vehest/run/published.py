@@ -27,7 +27,7 @@ from vehest.data.text_files import read_yaml
 from vehest.data.transforms import Preparation
 from vehest.run.console import Messages
 from vehest.run.evaluate import evaluation_options
-from vehest.run.evaluate_faults import all_of, faults_of
+from vehest.run.evaluate_faults import faults_of, union_of_faults
 from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Stages
@@ -94,7 +94,7 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
 def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
-    faults = all_of(map(faults_of, configs))
+    faults = union_of_faults(map(faults_of, configs))
     protocol = stages.protocol(first, dataset_names(first["split"]))
     rates = sorted({*map(estimator_rate, configs), protocol.rate_hz})
     preparation = changed_options(

@@ -401,7 +401,7 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
         member = (
             None
             if job.failure is not None or job.training is None
-            else comparison.found.get(job.training.plan.key)
+            else comparison.finished.get(job.training.plan.key)
         )
         title = (
             new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""

@@ -491,14 +491,14 @@ def evaluate_model(
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (model_found := find(plan, runner.messages.warn)) is None:
+            if (existing_model := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
                     f"{plan.label} has not been trained; run '{command_line('train', training)}' "
                     "first"
                 )
             assert group.evaluation is not None
-            trained = model_found
+            trained = existing_model
             evaluation = group.evaluation
         calibration = _calibration(trained, evaluation, runner)
         artefact = runner.ensure(*evaluation.of(trained, calibration))

@@ -48,7 +48,7 @@ COLUMNS = {
     "against_scratch": Column("than from scratch"),
 }
 """Of a table of `rows_of_curve`."""
-NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
+MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -132,7 +132,9 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
             float(named[1]) if named is not None else math.nan
         )  # by split.minutes, which the split's name then ends in
         minutes = (
-            requested if abs(recorded - requested) <= NEARLY * requested else round(recorded, 2)
+            requested
+            if abs(recorded - requested) <= MAX_MINUTES_DEVIATION * requested
+            else round(recorded, 2)
         )
         for model in part.models:
             models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)

@@ -50,9 +50,9 @@ from vehest.studies.kit.warnings import warnings_of
 VERSION = "3"
 TAKES = "parts"
 SHOWS_FAILED = True
-COLUMNS = 4
+MAX_PANEL_COLUMNS = 4
 TITLE_WIDTH = 24
-ROW = 0.16  # in, height of an estimator
+ROW_HEIGHT = 0.16  # in, height of an estimator
 REFERENCES = (
     "zero",
     "static_map",
@@ -240,11 +240,11 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     )
     names = [name for name in names if name[0] != "zero"]
     lines = lines_of([name[:2] for name in names])
-    columns = min(COLUMNS, len(places))
+    columns = min(MAX_PANEL_COLUMNS, len(places))
     rows = -(-len(places) // columns)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names))) as figure:
+    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW_HEIGHT * len(names))) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)
