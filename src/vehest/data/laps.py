@@ -32,9 +32,11 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     The path is that of ``vx`` and ``yaw_rate``, driven forwards. The first lap begins where the
     recording does, wherever that is on the course.
 
-    Args:
-        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where
-            it lacks them.
+    Parameters
+    ----------
+    recording : Recording
+        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks
+        them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")

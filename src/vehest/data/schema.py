@@ -39,11 +39,15 @@ def validated(
 ) -> Schema:
     """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
-    Args:
-        kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
-            ``ValueError``.
-        subject: first words of a message, ``"'model.yaml'"``; may be empty.
-        group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
+    Parameters
+    ----------
+    kind : type[Schema]
+        Dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
+        ``ValueError``.
+    subject : str
+        First words of a message, ``"'model.yaml'"``; may be empty.
+    group : str
+        That the keys belong to, ``training`` for ``training.patience``; may be empty.
 
     Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value
     makes no sense.

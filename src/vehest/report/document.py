@@ -139,12 +139,15 @@ def write_documents(
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by
     side.
 
-    Args:
-        on_page: text and tables that the page of ``report`` alone ends with, and no other file
-            contains.
+    Parameters
+    ----------
+    on_page : Sequence[str or Table]
+        Text and tables that the page of ``report`` alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: tables or figures of two documents share a name, or a name is no file name.
+    Raises
+    ------
+    ValueError
+        Tables or figures of two documents share a name, or a name is no file name.
     """
     blocks = [block for document in documents.values() for block in document.blocks]
     Document(
@@ -171,12 +174,17 @@ def write_document(
 
     The same document gives the same bytes.
 
-    Args:
-        name: of both files, without ending.
-        on_page: text and tables that the page alone ends with, and no other file contains.
+    Parameters
+    ----------
+    name : str
+        Of both files, without ending.
+    on_page : Sequence[str or Table]
+        Text and tables that the page alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: a table of ``on_page`` has the name of another.
+    Raises
+    ------
+    ValueError
+        A table of ``on_page`` has the name of another.
     """
     numbers = _numbers(document)
     images: dict[str, bytes] = {}

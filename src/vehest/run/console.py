@@ -51,9 +51,11 @@ class _Console(Console):
 class Messages:
     """Lines and bars on standard error; warnings alone if ``quiet``.
 
-    Attributes:
-        printed: (status, stage, label, detail) of every line, a warning's text in the last; also
-            where nothing is shown. Lines of reused artefacts are printed as one, by `print_reused`.
+    Attributes
+    ----------
+    printed : list[tuple[str, str, str, str]]
+        (status, stage, label, detail) of every line, a warning's text in the last; also where
+        nothing is shown. Lines of reused artefacts are printed as one, by `print_reused`.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:

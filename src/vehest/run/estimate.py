@@ -61,14 +61,21 @@ def estimate_file(
     """Run a model on a recording and write the estimate to ``out``; returns its figures and a
     verdict.
 
-    Args:
-        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
-        out: table to write, or the log with further channels (`estimate_log`).
-        strict: whether findings in the channels are an error; else they are printed as warnings.
-        car: record of `vehest identify` to start from.
+    Parameters
+    ----------
+    words : Sequence[str]
+        A model, which may be left out, a recording and overrides of conf/estimate.yaml.
+    out : Path
+        Table to write, or the log with further channels (`estimate_log`).
+    strict : bool
+        Whether findings in the channels are an error; else they are printed as warnings.
+    car : Path or None
+        Record of `vehest identify` to start from.
 
-    Raises:
-        VehestError: model, recording or table cannot be used.
+    Raises
+    ------
+    VehestError
+        Model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
     name = words[0] if n_names == 2 else SELF_CALIBRATING
@@ -257,10 +264,14 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
 class _Report:
     """Findings, figures and verdict of a drive that is checked and estimated in parts.
 
-    Args:
-        model, trust: that estimate it.
-        accepted: checks whose contradictions do not count.
-        strict: name of the file if findings are an error.
+    Parameters
+    ----------
+    model, trust : Estimator, Trust or None
+        That estimate it.
+    accepted : Sequence[str]
+        Checks whose contradictions do not count.
+    strict : str or None
+        Name of the file if findings are an error.
     """
 
     def __init__(

@@ -171,7 +171,9 @@ def errors_under(
     A piece is a range or sequence, its samples with a warm-up before it, and the state to start
     from, if any.
 
-    Returns:
+    Returns
+    -------
+    dict[str, dict[str, float]]
         Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of
         bands and health where there is a trust.
     """

@@ -131,7 +131,9 @@ def interval(values: FloatArray) -> tuple[float, float]:
     """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t
     distribution with n - 1 degrees of freedom.
 
-    Returns:
+    Returns
+    -------
+    tuple[float, float]
         Mean and half interval; NaN where there are no values, half NaN for one value.
     """
     from scipy.stats import t

@@ -37,11 +37,15 @@ def explorer_of(
 ) -> str:
     """What the page draws of a test set, as `explorer_json`.
 
-    Args:
-        candidates_drawn: (estimator, variant) -> model, title and looks, in the order of the board.
-        scored: (estimator, variant) -> estimate and reference of each range, or sequence.
-        axis: first time [s], label of the time axis, samples between two ranges, and a range that
-            deserves a button [s].
+    Parameters
+    ----------
+    candidates_drawn : Mapping[Name, tuple[EvaluatedModel, str, Line]]
+        (estimator, variant) -> model, title and looks, in the order of the board.
+    scored : Mapping[Name, Sequence[Scored]]
+        (estimator, variant) -> estimate and reference of each range, or sequence.
+    axis : tuple[float, str, int, tuple[float, float]]
+        First time [s], label of the time axis, samples between two ranges, and a range that
+        deserves a button [s].
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
