@@ -34,8 +34,11 @@ HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 class Recording(TimeSeries):
     """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
-    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or
-    a senseless rate, start or kind.
+    Raises
+    ------
+    DataError
+        No samples, unknown channel, unequal lengths, values that are not finite, or a senseless
+        rate, start or kind.
     """
 
     id: str  # name, unique within its data set
@@ -110,7 +113,10 @@ class Recording(TimeSeries):
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of one channel, shape (T,).
 
-        Raises `DataError`: the recording does not have it.
+        Raises
+        ------
+        DataError
+            The recording does not have it.
         """
         if name not in self.channels:
             raise DataError(
@@ -122,7 +128,13 @@ class Recording(TimeSeries):
         return name in self.channels
 
     def stack(self, names: Iterable[str]) -> FloatArray:
-        """Channels as columns, shape (T, C). Raises `DataError`: one of them is missing."""
+        """Channels as columns, shape (T, C).
+
+        Raises
+        ------
+        DataError
+            One of them is missing.
+        """
         return np.stack([self[name] for name in names], axis=1)
 
     def select(self, names: Iterable[str]) -> Recording:
@@ -152,7 +164,10 @@ class Recording(TimeSeries):
     def cut(self, start: float, stop: float) -> Recording:
         """The samples taken in [start, stop) seconds.
 
-        Raises `DataError`: the range holds no samples.
+        Raises
+        ------
+        DataError
+            The range holds no samples.
         """
         first, last = self.index_range(start, stop)
         if first >= last:

@@ -49,8 +49,10 @@ def validated(
     group : str
         That the keys belong to, ``training`` for ``training.patience``; may be empty.
 
-    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value
-    makes no sense.
+    Raises
+    ------
+    DataError
+        Or ``error``: a key is missing, unknown or of the wrong type, or a value makes no sense.
     """
     above = [group] if group else []
     try:

@@ -136,9 +136,13 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
     The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps
     or folds name or cut them.
 
-    Raises `ConfigurationError`: a key is missing, misspelt or of the wrong type; a pattern that no
-    recording's id matches; a condition that none meets; or one of them without a catalogue. Raises
-    `DataError`: a recording lacks a channel that a condition looks at.
+    Raises
+    ------
+    ConfigurationError
+        A key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a
+        condition that none meets; or one of them without a catalogue.
+    DataError
+        A recording lacks a channel that a condition looks at.
     """
     ranges = _Ranges(_read(config), catalogue)
     return ranges.limited(ranges.split())

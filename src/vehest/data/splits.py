@@ -86,8 +86,11 @@ class Split:
 
     Without training and validation stretches it is for estimators that learn nothing.
 
-    Raises `ConfigurationError`: training without validation stretches or the other way round, no
-    stretch at all, or a stretch that serves two purposes.
+    Raises
+    ------
+    ConfigurationError
+        Training without validation stretches or the other way round, no stretch at all, or a
+        stretch that serves two purposes.
     """
 
     name: str

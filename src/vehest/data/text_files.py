@@ -46,7 +46,10 @@ def read_yaml(path: Path) -> Any:
 def parse_yaml(text: str, subject: str) -> Any:
     """Plain values of YAML.
 
-    Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values.
+    Raises
+    ------
+    DataError
+        It is not YAML, nests too deep, or repeats itself into too many values.
     """
     check_yaml_size(text, subject)
     try:
@@ -112,7 +115,13 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes, subject: str) -> Any:
-    """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
+    """Plain values of JSON.
+
+    Raises
+    ------
+    DataError
+        It is not JSON, too long, or nests too deep.
+    """
     check_limit("text_bytes", len(text), f"{subject} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)

@@ -103,7 +103,10 @@ Block: TypeAlias = "str | Table | Figure"
 class Document:
     """A report.
 
-    Raises `ValueError` where two tables or two figures share a name, or a name is no file name.
+    Raises
+    ------
+    ValueError
+        Two tables or two figures share a name, or a name is no file name.
     """
 
     title: str  # plain text

@@ -184,12 +184,16 @@ def compare_estimates(
     (`min_sideslip_speed`). The map is fitted on one half of the scored range and scored on the
     other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by
     models that were trained on this recording, have rows, the last ones, and are left out of the
-    verdict.
-    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and
-    ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
+    verdict. Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start``
+    and ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
     ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
-    Raises `DataError` without a reference, or with too little or gaps in common,
-    `ConfigurationError` for none or a baseline's name.
+
+    Raises
+    ------
+    DataError
+        There is no reference, or too little in common, or gaps.
+    ConfigurationError
+        There is no estimate, or one has the name of a baseline.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")

@@ -97,8 +97,14 @@ class Comparison:
         """Fit jobs to the recordings of their split, find those that lack something, and plan
         groups of trainings; makes data on the way.
 
-        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done,
-        `DryRunStop` where a dry run would make data.
+        Raises
+        ------
+        ConfigurationError
+            A wrong setting.
+        DataError
+            No job can be done.
+        DryRunStop
+            A dry run would make data.
         """
         usable = self.usable
         labels = dict[Any, str]()

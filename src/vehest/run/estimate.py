@@ -206,7 +206,10 @@ def findings_of(
 ) -> list[Finding]:
     """Findings in the channels that a model reads, given those of all channels, if they are known.
 
-    Raises `DataError` on contradictions.
+    Raises
+    ------
+    DataError
+        Channels contradict each other.
     """
     read = [name for name in model.channels if name in recording]
     if of_all_channels is not None and (

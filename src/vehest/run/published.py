@@ -152,8 +152,13 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
     Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
     with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
     why the state is not known.
-    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name
-    of no pipeline or published study.
+
+    Raises
+    ------
+    ConfigurationError
+        An override that would change results.
+    MissingError
+        A name of no pipeline or published study.
     """
     if content_overrides(overrides):
         raise ConfigurationError(

@@ -99,8 +99,12 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
     """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where
     machines share the output root.
 
-    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with
-    neither a shared root nor copies.
+    Raises
+    ------
+    MissingError
+        The machine has other versions, or copies cannot be written.
+    NotShared
+        There is neither a shared output root nor copies.
     """
     versions = versions_here()
     unlike = [

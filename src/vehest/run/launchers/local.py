@@ -64,8 +64,10 @@ class LocalLauncher:
         """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin
         of a group is reported.
 
-        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines
-        cannot run them.
+        Raises
+        ------
+        MissingError
+            There is no cluster, it takes no tasks, or one of its machines cannot run them.
         """
         return launch([group.run for group in groups], self.cores, stop, report)
 
