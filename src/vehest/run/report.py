@@ -411,8 +411,6 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
             "title": title,
             **job.values,
             "seed": job.config["seed"],
-        }
-        row |= {
             "status": DONE if member else FAILED,
             "error": job.failure.message if job.failure is not None else "",
         }

@@ -124,39 +124,20 @@ def all_usabilities(
     There is at least one recording. A file or a package that cannot be used is a row with the
     reason.
     """
-    rows = [_choice_usability(name, recordings, dataset) for name in choices("estimator")]
-    listed = {row.estimator for row in rows}
-    for name in estimator_names():
-        if name not in listed:
-            config: Config = {"estimator": {"name": name}, "training": {}}
-            rows.append(_usability_with_car(name, config, recordings, dataset))
+    cars = [car_of(dataset)] if dataset else []
+    with_files = choices("estimator")
+    rows = []
+    for name in dict.fromkeys((*with_files, *estimator_names())):
+        config: Config = {"estimator": {"name": name}, "training": {}}
+        try:
+            if name in with_files:
+                config = compose_config("train", [f"estimator={name}"])
+            rows.append(usability(name, with_car_values(config, cars), recordings))
+        except ConfigurationError as error:
+            if name not in with_files:
+                raise
+            rows.append(Usability(name, None, None, Missing([], [], {}), to_give=str(error)))
     return rows
-
-
-def _choice_usability(
-    name: str, recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None
-) -> Usability:
-    """The row of a file of conf/estimator.
-
-    One that is no configuration is unusable for the reason that its error names.
-    """
-    try:
-        config = compose_config("train", [f"estimator={name}"])
-        return _usability_with_car(name, config, recordings, dataset)
-    except ConfigurationError as error:
-        return Usability(name, None, None, Missing([], [], {}), to_give=str(error))
-
-
-def _usability_with_car(
-    name: str,
-    config: Config,
-    recordings: Sequence[RecordingSummary],
-    dataset: Mapping[str, Any] | None,
-) -> Usability:
-    """A row with the car of a data set, if any."""
-    return usability(
-        name, with_car_values(config, [car_of(dataset)] if dataset else []), recordings
-    )
 
 
 def usability(

@@ -242,13 +242,16 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
     for point in curve.points:
         if point.estimator != BASELINES[0]:
             low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
-            row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
-            row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
-            row |= {
+            row = {
+                "title": point.title,
+                "start": point.start,
+                "minutes": point.minutes,
+                "rmse_sideslip": curve.ranking.rmse[point.name],
                 "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
                 "n_trainings": point.n_trainings,
+                "against_scratch": _against_scratch(curve, point) or "–",
             }
-            rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
+            rows.append(row)
     return rows
 
 

@@ -83,9 +83,10 @@ class SweepArtefacts:
             row: dict[str, object] = {
                 "combination": number,
                 **{name: jobs.iloc[0][name] for name in ("title", *self.keys)},
+                "n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan,
+                "n_seeds": len(done),
+                "n_failed": len(jobs) - len(done),
             }
-            row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
-            row |= {"n_seeds": len(done), "n_failed": len(jobs) - len(done)}
             for name in self.sets:
                 row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(
                     done[f"{METRIC}.{name}"].to_numpy(dtype=float)

@@ -124,11 +124,13 @@ def overview(
                 "part": part,
                 "title": as_text(parts[part].title),
                 "test_set": test_set,
+                "estimator": name[0],
+                "variant": name[1],
+                "estimator_title": titles[name],
+                "rmse_sideslip": ranking.rmse.get(name, math.nan),
+                **(standing_columns(ranking, name) if name in ranking.rmse else nothing),
+                **_with_best_lever(parts[part], name, test_set),
             }
-            row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
-            row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
-            row |= standing_columns(ranking, name) if name in ranking.rmse else nothing
-            row |= _with_best_lever(parts[part], name, test_set)
             rows.append(row)
     return pd.DataFrame(rows)
 
