@@ -323,7 +323,7 @@ def damaged(value, *wheels, start=500, stop=650):
     return rolling(**broken)
 
 
-def test_speed_from_wheels_inverts_what_rolling_wheels_do_also_of_the_rear_wheels_alone():
+def test_speed_from_wheels_inverts_rolling_wheels():
     drive, u = rolling()
     np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
@@ -363,7 +363,7 @@ def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels):
     assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
 
 
-def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all():
+def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter():
     frequency = 0.5
     rate = 100.0
     time = np.arange(3000) / rate

@@ -56,7 +56,7 @@ def model():
     )
 
 
-def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(model):
+def test_identified_values_of_a_car_reduce_the_error(model):
     record = record_of(
         model,
         {
