@@ -44,7 +44,13 @@ from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.report.style import fixed
 from vehest.run.console import Messages
-from vehest.run.identify import LATENESS, posterior_of, prior_of, record_of, without_prior
+from vehest.run.identify import (
+    YAW_RATE_LATENESS_SECONDS,
+    posterior_of,
+    prior_of,
+    record_of,
+    without_prior,
+)
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.table_records import record_tables
@@ -658,7 +664,7 @@ def report(
     worse = seen[excess > 0.0]["scene"]
     missed = 1e3 * (cars["delay_found"] - cars["delay"])
     return PAGE.format(
-        late=round(1e3 * LATENESS),
+        late=round(1e3 * YAW_RATE_LATENESS_SECONDS),
         of_planted=f"{fixed(missed.mean(), 0)} ± {fixed(missed.std(), 0)}",
         worse=int((shifts["once advanced by it"] > shifts["error"]).sum()),
         now=fixed(shifts["band holds"].mean(), 2),

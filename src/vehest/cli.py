@@ -50,7 +50,7 @@ data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-LONGEST_LINE = 4_000
+MAX_ERROR_CHARACTERS = 4_000
 STAGES = "Single stages, all of which `run` includes"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
@@ -1295,7 +1295,9 @@ def _fail(message: str, exit_code: int) -> NoReturn:
         sys.stdout.flush()
     except (OSError, ValueError):
         silence(sys.stdout)
-    complain(f"error: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + '…'}")
+    complain(
+        f"error: {line if len(line) <= MAX_ERROR_CHARACTERS else line[:MAX_ERROR_CHARACTERS] + '…'}"
+    )
     sys.exit(exit_code)
 
 

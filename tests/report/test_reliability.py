@@ -7,7 +7,7 @@ from vehest.report.figures import Reliability, _spread_heights, reliability_figu
 from vehest.report.style import line_of
 
 
-def test_each_estimator_is_drawn_and_named_at_its_line_and_labels_keep_their_order_a_step_apart():
+def test_labels_of_a_reliability_figure_keep_order_and_distance():
     rows = [
         Reliability(
             "Zero",

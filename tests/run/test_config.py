@@ -21,7 +21,7 @@ from vehest.run.setting_lines import config_as_commented_yaml
 from vehest.run.study import jobs_of, read_study
 
 
-def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(
+def test_every_estimator_composes_with_any_split(
     elsewhere,
 ):
     estimators = choices("estimator")

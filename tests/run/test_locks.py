@@ -40,7 +40,7 @@ def held_elsewhere(output, stage, name):
         process.communicate()
 
 
-def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(
+def test_lock_ends_with_its_process_and_waiting_names_the_holder_once(
     tmp_path,
 ):
     lock = Lock(tmp_path, "train", "a model")
@@ -87,7 +87,7 @@ def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
     second.release()
 
 
-def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path):
+def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
     plans = [
         StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", tmp_path)
         for seed in range(3)
@@ -196,7 +196,7 @@ print(at_once(1, "alone"), at_once(3, "together"))
 """
 
 
-def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(
+def test_three_runs_at_once_make_each_artefact_and_mlflow_run_once(
     place,
 ):
     from mlflow import MlflowClient

@@ -198,7 +198,7 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
     assert (turned.study, turned.title, turned.publish) == ("turned", "Both ways", False)
 
 
-def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
+def test_simulated_study_differs_from_the_recorded_one_in_splits_alone():
     simulated = read_study("ksnn")
     official = read_study("ksnn_revs")
     shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]

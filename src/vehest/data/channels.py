@@ -128,7 +128,13 @@ CHANNELS: dict[str, Channel] = _table()
 
 
 def channel(name: str) -> Channel:
-    """Look up a channel. Raises `DataError`: the name is not in the table."""
+    """Look up a channel.
+
+    Raises
+    ------
+    DataError
+        The name is not in the table.
+    """
     if name not in CHANNELS:
         raise DataError(
             f"channel '{name}' is not known to vehest; known channels: "

@@ -95,7 +95,7 @@ def derivation_of(
     )
 
 
-def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
+def channels_made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
     """Channels that transforms make of others, as far as their names tell."""
     return frozenset(
         MAKES[name] for entry in transforms if (name := str(entry.get("name"))) in MAKES

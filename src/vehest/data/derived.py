@@ -49,7 +49,12 @@ class SteeringRatio:
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``.
 
-        It has gaps where the angle has them. Raises `DataError`: the channel is missing.
+        It has gaps where the angle has them.
+
+        Raises
+        ------
+        DataError
+            The channel is missing.
         """
         steer = (recording[self.channel] - self.offset) / self.ratio
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
@@ -81,7 +86,12 @@ class SteeringCurve:
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``.
 
-        It has gaps where the channel has them. Raises `DataError`: the channel is missing.
+        It has gaps where the channel has them.
+
+        Raises
+        ------
+        DataError
+            The channel is missing.
         """
         steer = np.interp(recording[self.channel], self.inputs, self.angles)
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
@@ -117,8 +127,10 @@ class SpeedFromWheels:
         """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right,
         rear left, rear right; NaN without it.
 
-        Raises `DataError` where there is no wheel speed at all, or tracks are given and
-        ``yaw_rate`` is missing.
+        Raises
+        ------
+        DataError
+            There is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
         """
         names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
         if not set(names) & set(recording.channels):
@@ -167,15 +179,15 @@ class SpeedFromWheels:
             np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         )
         vx = np.empty(len(recording))
-        n_held = 0
+        n_samples_carried = 0
         now = math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
-            n_held = 0 if agreeing >= enough else n_held + 1
+            n_samples_carried = 0 if agreeing >= enough else n_samples_carried + 1
             target = wheels if agreeing >= enough else median
             if math.isnan(now):
                 now = target
-            elif (n_held and n_held <= patience) or math.isnan(target):
+            elif (n_samples_carried and n_samples_carried <= patience) or math.isnan(target):
                 now += gain
             else:
                 now += min(max(target - now, -max_change), max_change)
@@ -210,8 +222,10 @@ class AccelerationFromSpeed:
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.
 
-        Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the
-        sampling rate.
+        Raises
+        ------
+        DataError
+            The speed is missing or has gaps, or the cut-off lies beyond half the sampling rate.
         """
         speed = recording[self.channel]
         rate = recording.rate_hz

@@ -15,8 +15,10 @@ from difflib import get_close_matches
 class VehestError(Exception):
     """Base of all errors caused by input or environment rather than by a defect of vehest.
 
-    Attributes:
-        exit_code: status that the command line leaves with (documented in docs/cli.md).
+    Attributes
+    ----------
+    exit_code
+        Status that the command line leaves with (documented in docs/cli.md).
     """
 
     exit_code = 1

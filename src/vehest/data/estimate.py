@@ -64,9 +64,13 @@ def number_cell(value: float) -> str:
 class Estimate(TimeSeries):
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
-    NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`:
-    a quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its
-    rows have no n different names.
+    NaN means that the method has no estimate yet (a window that is not full).
+
+    Raises
+    ------
+    ValueError
+        A quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its
+        rows have no n different names.
     """
 
     recording_id: str  # the recording it was made from
@@ -130,7 +134,10 @@ class Estimate(TimeSeries):
         """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in
         the future, NaN outside the estimate.
 
-        Raises `DataError`: the estimate has no covariance of one of them.
+        Raises
+        ------
+        DataError
+            The estimate has no covariance of one of them.
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"

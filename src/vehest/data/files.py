@@ -37,7 +37,11 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
     is removed.
 
     A file that is there may always be replaced, a folder by ``replace_folder``.
-    Raises `MissingError`: the disk is full or the folder cannot be written to.
+
+    Raises
+    ------
+    MissingError
+        The disk is full or the folder cannot be written to.
     """
     aside = aside_of(path)
     try:
@@ -69,8 +73,12 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
 def regular_file(path: Path) -> Path:
     """A file that can be read to its end: no folder, pipe or device.
 
-    Raises `MissingError`: there is nothing. Raises `DataError`: it is something else, or cannot be
-    looked at.
+    Raises
+    ------
+    MissingError
+        There is nothing.
+    DataError
+        It is something else, or cannot be looked at.
     """
     try:
         mode = os.stat(path).st_mode
@@ -89,7 +97,13 @@ def regular_file(path: Path) -> Path:
 
 
 def without_links(path: Path) -> Path:
-    """The absolute path behind all links; raises `DataError` where links lead to each other."""
+    """The absolute path behind all links.
+
+    Raises
+    ------
+    DataError
+        Links lead to each other.
+    """
     try:
         return path.resolve()
     except (OSError, RuntimeError):  # the latter up to Python 3.12

@@ -63,7 +63,11 @@ def fold_of(
     folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
-    Raises `ConfigurationError` where there is no such fold, or too few blocks to fill them.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such fold, or too few blocks to fill them.
     """
     if not 0 <= fold < folds.number:
         raise ConfigurationError(f"{subject}: fold {fold} is not one of 0 to {folds.number - 1}")

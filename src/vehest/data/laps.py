@@ -11,18 +11,18 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
-POINTS = 8192  # of the path at most
+MAX_POINTS = 8192  # of the path at most
 # between the curvatures of a lap and of the next; drivers take other lines, the course stays
-LEAST_CORRELATION = 0.6
+MIN_LAP_CORRELATION = 0.6
 # of the best correlation, from which the shorter of two periods is taken: two laps repeat too
-LEAST_SHARE_OF_BEST = 0.9
+MIN_SHARE_OF_BEST = 0.9
 # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
-MOST_TURN_OFF = 0.8
+MAX_HEADING_ERROR = 0.8
 # spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
-STEADY = 0.2
-INCOMPLETE = 0.005  # share of a lap that a last one may lack and count as complete
+MAX_CIRCLE_SPREAD = 0.2
+MAX_MISSING_SHARE = 0.005  # share of a lap that a last one may lack and count as complete
 # share of a lap by which the next boundary is looked for before and after where it is expected
-SEARCH = 0.04
+SEARCH_SHARE = 0.04
 
 
 def laps_of(recording: Recording) -> list[tuple[float, float]]:
@@ -32,9 +32,11 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     The path is that of ``vx`` and ``yaw_rate``, driven forwards. The first lap begins where the
     recording does, wherever that is on the course.
 
-    Args:
-        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where
-            it lacks them.
+    Parameters
+    ----------
+    recording : Recording
+        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks
+        them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")
@@ -42,11 +44,11 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     heading = np.cumsum(np.where(speed > 0.0, turning, 0.0)) / recording.rate_hz
     if len(recording) < 16 or not distance[-1] > 0.0:
         return []
-    points = min(POINTS, len(recording))
+    points = min(MAX_POINTS, len(recording))
     grid = np.linspace(0.0, distance[-1], points)
     turned = np.interp(grid, distance, heading)
     curvature = np.diff(turned) / (grid[1] - grid[0])
-    if np.std(curvature) < STEADY * abs(float(np.mean(curvature))):
+    if np.std(curvature) < MAX_CIRCLE_SPREAD * abs(float(np.mean(curvature))):
         bounds = _turns(turned)
     else:
         period = _period(curvature, turned)
@@ -84,12 +86,12 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
     peak = np.zeros(len(correlation), dtype=bool)
     peak[1:-1] = (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
     periods = np.flatnonzero(
-        peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8)
+        peak & (correlation > MIN_LAP_CORRELATION) & (off < MAX_HEADING_ERROR) & (lags >= 8)
     )
     if not len(periods):
         return None
     best = correlation[periods].max()
-    return int(periods[correlation[periods] >= LEAST_SHARE_OF_BEST * best][0])
+    return int(periods[correlation[periods] >= MIN_SHARE_OF_BEST * best][0])
 
 
 def _correlations(samples: FloatArray) -> FloatArray:
@@ -121,7 +123,7 @@ def _boundaries(curvature: FloatArray, period: int) -> list[int]:
     fit best.
     """
     bounds = [0]
-    reach = max(round(SEARCH * period), 1)
+    reach = max(round(SEARCH_SHARE * period), 1)
     while bounds[-1] + period < len(curvature):
         last = bounds[-1]
         length = min(
@@ -138,7 +140,7 @@ def _boundaries(curvature: FloatArray, period: int) -> list[int]:
         ]
         bounds.append(int(starts[int(np.argmin(misfits))]))
     if len(bounds) > 1 and len(curvature) - bounds[-1] >= period - max(
-        round(INCOMPLETE * period), 2
+        round(MAX_MISSING_SHARE * period), 2
     ):
         bounds.append(len(curvature))
     return bounds

@@ -66,8 +66,11 @@ def check_limit(
 ) -> None:
     """Refuse a number above the limit ``name``, a field of `Limits`.
 
-    Raises `DataError`: it is above (or ``error``); its message begins with ``subject``,
-    ``"'lap.csv' would hold 4000000000 samples"``.
+    Raises
+    ------
+    DataError
+        It is above (or ``error``); its message begins with ``subject``, ``"'lap.csv' would hold
+        4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:

@@ -18,7 +18,7 @@ from vehest.data.time_series import TimeSeries
 
 Kind = Literal["real", "simulated"]
 
-LONGEST_PART = 900.0  # s; a longer drive is checked and, from a large table, read in parts
+MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6
@@ -29,8 +29,11 @@ HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 class Recording(TimeSeries):
     """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
-    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or
-    a senseless rate, start or kind.
+    Raises
+    ------
+    DataError
+        No samples, unknown channel, unequal lengths, values that are not finite, or a senseless
+        rate, start or kind.
     """
 
     id: str  # name, unique within its data set
@@ -105,7 +108,10 @@ class Recording(TimeSeries):
     def __getitem__(self, name: str) -> FloatArray:
         """Samples of one channel, shape (T,).
 
-        Raises `DataError`: the recording does not have it.
+        Raises
+        ------
+        DataError
+            The recording does not have it.
         """
         if name not in self.channels:
             raise DataError(
@@ -117,7 +123,13 @@ class Recording(TimeSeries):
         return name in self.channels
 
     def stack(self, names: Iterable[str]) -> FloatArray:
-        """Channels as columns, shape (T, C). Raises `DataError`: one of them is missing."""
+        """Channels as columns, shape (T, C).
+
+        Raises
+        ------
+        DataError
+            One of them is missing.
+        """
         return np.stack([self[name] for name in names], axis=1)
 
     def select(self, names: Iterable[str]) -> Recording:
@@ -147,7 +159,10 @@ class Recording(TimeSeries):
     def cut(self, start: float, stop: float) -> Recording:
         """The samples taken in [start, stop) seconds.
 
-        Raises `DataError`: the range holds no samples.
+        Raises
+        ------
+        DataError
+            The range holds no samples.
         """
         first, last = self.index_range(start, stop)
         if first >= last:
@@ -210,10 +225,10 @@ def _immutable(samples: FloatArray) -> FloatArray:
 
 def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
     """Ranges of indices that divide so many samples into parts of about one length, none longer
-    than `LONGEST_PART`.
+    than `MAX_PART_SECONDS`.
     """
     edges = (
-        np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1)
+        np.linspace(0, n_samples, max(math.ceil(n_samples / (MAX_PART_SECONDS * rate_hz)), 1) + 1)
         .astype(int)
         .tolist()
     )

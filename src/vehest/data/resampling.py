@@ -24,8 +24,11 @@ def resampled(
 ) -> Recording:
     """A recording, after the transforms of a preparation and by its method, at another rate.
 
-    Raises `DataError` for a rate that is higher than the recording's, unless this is sampled at
-    ``slowest_hz`` or faster.
+    Raises
+    ------
+    DataError
+        A rate that is higher than the recording's, unless this is sampled at ``slowest_hz`` or
+        faster.
     """
     if recording.rate_hz < min(rate_hz * (1 - 1e-9), slowest_hz):
         raise DataError(

@@ -25,8 +25,8 @@ Schema = TypeVar("Schema")
 FURTHER_KEYS = ConfigDict(
     extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
 )
-DEEPEST = 60  # levels that plain values may nest
-LARGEST = 10**300  # whole number
+MAX_DEPTH = 60  # levels that plain values may nest
+MAX_INTEGER = 10**300  # whole number
 
 
 def validated(
@@ -39,14 +39,20 @@ def validated(
 ) -> Schema:
     """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
-    Args:
-        kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
-            ``ValueError``.
-        subject: first words of a message, ``"'model.yaml'"``; may be empty.
-        group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
+    Parameters
+    ----------
+    kind : type[Schema]
+        Dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
+        ``ValueError``.
+    subject : str
+        First words of a message, ``"'model.yaml'"``; may be empty.
+    group : str
+        That the keys belong to, ``training`` for ``training.patience``; may be empty.
 
-    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value
-    makes no sense.
+    Raises
+    ------
+    DataError
+        Or ``error``: a key is missing, unknown or of the wrong type, or a value makes no sense.
     """
     above = [group] if group else []
     try:
@@ -113,8 +119,8 @@ def _plain(value: Any, path: list[str]) -> Any:
 
     A ValueError where a value is not plain, such as a date, or it nests too deep.
     """
-    if len(path) > DEEPEST:
-        raise ValueError(f"{path[0]} nests deeper than {DEEPEST} levels")
+    if len(path) > MAX_DEPTH:
+        raise ValueError(f"{path[0]} nests deeper than {MAX_DEPTH} levels")
     if isinstance(value, dict):
         return {str(key): _plain(inner, [*path, str(key)]) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -122,7 +128,7 @@ def _plain(value: Any, path: list[str]) -> Any:
     if (
         value is None
         or isinstance(value, str | bool | float)
-        or (isinstance(value, int) and abs(value) < LARGEST)
+        or (isinstance(value, int) and abs(value) < MAX_INTEGER)
     ):
         return value
     problem = (

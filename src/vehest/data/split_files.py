@@ -32,7 +32,7 @@ PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
 # of a piece of limited minutes; shorter ones hold no window after the start that is not scored
-LEAST_SECONDS = 3.0
+MIN_PIECE_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,13 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
     The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps
     or folds name or cut them.
 
-    Raises `ConfigurationError`: a key is missing, misspelt or of the wrong type; a pattern that no
-    recording's id matches; a condition that none meets; or one of them without a catalogue. Raises
-    `DataError`: a recording lacks a channel that a condition looks at.
+    Raises
+    ------
+    ConfigurationError
+        A key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a
+        condition that none meets; or one of them without a catalogue.
+    DataError
+        A recording lacks a channel that a condition looks at.
     """
     ranges = _Ranges(_read(config), catalogue)
     return ranges.limited(ranges.split())
@@ -172,7 +176,9 @@ def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Spa
     begin = at * total
     upper = _between(spans, begin, min(begin + seconds, total))
     pieces = (*_between(spans, 0.0, begin + seconds - total), *upper)
-    return tuple(piece for piece in pieces if piece.stop - piece.start >= LEAST_SECONDS) or pieces
+    return (
+        tuple(piece for piece in pieces if piece.stop - piece.start >= MIN_PIECE_SECONDS) or pieces
+    )
 
 
 def _seconds_of(spans: Iterable[Span]) -> float:
@@ -197,8 +203,8 @@ class _Ranges:
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file = file
         self._catalogue = catalogue
-        self._where = f"split '{file.name}'"
-        self._known: dict[str, Mapping[str, Reader]] = {}
+        self._subject = f"split '{file.name}'"
+        self._catalogues: dict[str, Mapping[str, Reader]] = {}
 
     def split(self) -> Split:
         """The split of the ranges, or of one fold of a cross-validation."""
@@ -211,7 +217,8 @@ class _Ranges:
             return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
             raise ConfigurationError(
-                f"{self._where}: folds make training, validation and test; leave train, validation "
+                f"{self._subject}: folds make training, validation and test; leave train, "
+                "validation "
                 "and tests out"
             )
         dataset = file.dataset_of()
@@ -220,7 +227,7 @@ class _Ranges:
             for name in self._matching(dataset, folds.recordings)
         )
         train, validation, test = fold_of(
-            blocks_of(folds, recordings), folds, file.fold, self._where
+            blocks_of(folds, recordings), folds, file.fold, self._subject
         )
         return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
 
@@ -276,7 +283,7 @@ class _Ranges:
         share = float(match[1]) if match else math.inf
         if share > 100.0:
             raise ConfigurationError(
-                f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
+                f"{self._subject}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
             )
         if share in (0.0, 100.0):
             return -math.inf if share == 0.0 else math.inf
@@ -287,7 +294,7 @@ class _Ranges:
         match = LAPS.fullmatch(words)
         if match is None:
             raise ConfigurationError(
-                f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not "
+                f"{self._subject}: laps are first, last, first 3, last 2, a number, or 2 to 4, not "
                 f"'{words[:60]}'"
             )
         end, number, first, last = match.groups()
@@ -300,7 +307,7 @@ class _Ranges:
                 f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
             )
             raise ConfigurationError(
-                f"{self._where}: recording '{name}' has no '{words.strip()}': {problem}; name "
+                f"{self._subject}: recording '{name}' has no '{words.strip()}': {problem}; name "
                 "times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
@@ -311,7 +318,7 @@ class _Ranges:
         recordings = self._recordings(dataset)
         if name not in recordings:
             raise ConfigurationError(
-                f"{self._where}: data set '{dataset}' has no recording '{name}'"
+                f"{self._subject}: data set '{dataset}' has no recording '{name}'"
             )
         return recordings[name](channels)
 
@@ -324,20 +331,21 @@ class _Ranges:
                 [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
             )
             raise ConfigurationError(
-                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has "
+                f"{self._subject}: no recording of data set '{dataset}' matches '{pattern}' (it "
+                "has "
                 f"{available})"
             )
         return names
 
     def _recordings(self, dataset: str) -> Mapping[str, Reader]:
-        if dataset not in self._known:
+        if dataset not in self._catalogues:
             if self._catalogue is None:
                 raise ConfigurationError(
-                    f"{self._where}: its patterns and the like need the recordings of data set "
+                    f"{self._subject}: its patterns and the like need the recordings of data set "
                     f"'{dataset}'"
                 )
-            self._known[dataset] = self._catalogue(dataset)
-        return self._known[dataset]
+            self._catalogues[dataset] = self._catalogue(dataset)
+        return self._catalogues[dataset]
 
     def _cut(self, role: str, ranges: Sequence[Span], condition: Condition) -> list[Span]:
         """Stretches of spans in which a condition holds."""
@@ -357,6 +365,6 @@ class _Ranges:
                 spans.append(replace(span, start=start, stop=stop))
         if not spans:
             raise ConfigurationError(
-                f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})"
+                f"{self._subject}: the condition of {role} keeps nothing ({condition.describe()})"
             )
         return spans

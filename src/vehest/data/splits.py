@@ -12,7 +12,7 @@ from vehest.data.errors import ConfigurationError, printable
 
 VALIDATION = "validation"
 TRAINING = "training"
-LONGEST_NAME = 100  # characters, so that file names with a stage and a key stay below 255
+MAX_NAME_CHARACTERS = 100  # characters, so that file names with a stage and a key stay below 255
 YAML_WORDS = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n", "nan", "inf"])
 YAML_NUMBER = re.compile(
     r"0[xob][0-9a-f_]+|[0-9][0-9_]*(\.[0-9_]*)?(e-?[0-9]+)?|[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}",
@@ -26,8 +26,8 @@ def check_name(name: str, subject: str) -> None:
     an override.
 
     It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
-    with none of the last, and has `LONGEST_NAME` characters at most. It is no word or number of
-    YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
+    with none of the last, and has `MAX_NAME_CHARACTERS` characters at most. It is no word or number
+    of YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
@@ -36,9 +36,10 @@ def check_name(name: str, subject: str) -> None:
             "'.', begin with none of the last two and not end with '.'; it becomes part of file "
             "names"
         )
-    if len(name) > LONGEST_NAME:
+    if len(name) > MAX_NAME_CHARACTERS:
         raise ConfigurationError(
-            f"{subject}: '{name[:20]}…' has {len(name)} characters; take {LONGEST_NAME} at most"
+            f"{subject}: '{name[:20]}…' has {len(name)} characters; take {MAX_NAME_CHARACTERS} at "
+            "most"
         )
     if name.lower() in YAML_WORDS or YAML_NUMBER.fullmatch(name):
         raise ConfigurationError(
@@ -85,8 +86,11 @@ class Split:
 
     Without training and validation stretches it is for estimators that learn nothing.
 
-    Raises `ConfigurationError`: training without validation stretches or the other way round, no
-    stretch at all, or a stretch that serves two purposes.
+    Raises
+    ------
+    ConfigurationError
+        Training without validation stretches or the other way round, no stretch at all, or a
+        stretch that serves two purposes.
     """
 
     name: str

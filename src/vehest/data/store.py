@@ -77,7 +77,12 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 def write_recording(recording: Recording, path: Path) -> None:
     """Store one recording.
 
-    The file appears complete or not at all. Raises `MissingError`: the file cannot be written.
+    The file appears complete or not at all.
+
+    Raises
+    ------
+    MissingError
+        The file cannot be written.
     """
     about = _attributes(recording, _OF_RECORDING) | {
         "gappy": sorted(recording.gappy),
@@ -89,8 +94,12 @@ def write_recording(recording: Recording, path: Path) -> None:
 def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recording:
     """Read a recording back, all of it or the named channels.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged, not a
-    recording, or lacks a channel.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        The file is damaged, not a recording, or lacks a channel.
     """
     columns, described = _read(
         path, RecordingDescription, None if channels is None else list(channels)
@@ -106,7 +115,10 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 def is_stored_recording(path: Path) -> bool:
     """Whether ``path`` is a Parquet file that vehest wrote as a recording.
 
-    Raises `DataError`: its description is damaged.
+    Raises
+    ------
+    DataError
+        Its description is damaged.
     """
     return _content_of(path) == "recording"
 
@@ -114,7 +126,10 @@ def is_stored_recording(path: Path) -> bool:
 def is_stored_estimate(path: Path) -> bool:
     """Whether ``path`` is a Parquet file that vehest wrote as an estimate.
 
-    Raises `DataError`: its description is damaged.
+    Raises
+    ------
+    DataError
+        Its description is damaged.
     """
     return _content_of(path) == "estimate"
 
@@ -143,7 +158,10 @@ def _content_of(path: Path) -> str:
 def write_estimate(estimate: Estimate, path: Path) -> None:
     """Store one estimate, with its time column, so that other tools can read it.
 
-    Raises `MissingError`: the file cannot be written.
+    Raises
+    ------
+    MissingError
+        The file cannot be written.
     """
     _write(path, estimate_columns([estimate]), "estimate", _about_estimate(estimate))
 
@@ -216,8 +234,12 @@ def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray
 def read_estimate(path: Path) -> Estimate:
     """Read an estimate back.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged or not an
-    estimate.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        The file is damaged or not an estimate.
     """
     columns, described = _read(path, EstimateDescription)
     covariance = None
@@ -257,14 +279,14 @@ def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _
     `DataError` if it is damaged or of another kind or format.
     """
     content = "recording" if kind is RecordingDescription else "estimate"
-    content_found = _metadata(schema, path)
-    if content_found.get("content") != content:
+    description = _metadata(schema, path)
+    if description.get("content") != content:
         raise DataError(
             f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} "
             f"{content} that vehest wrote"
         )
-    check_format(content_found.get("format", 0), _FORMAT, f"'{path}'")
-    return validated(kind, content_found, f"'{path}'")
+    check_format(description.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, description, f"'{path}'")
 
 
 def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:

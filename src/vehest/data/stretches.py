@@ -17,7 +17,10 @@ from vehest.data.runs import true_runs
 class Bounds:
     """Smallest and largest magnitude of a channel, both included, in its unit.
 
-    Raises `ValueError`: no magnitude lies between them.
+    Raises
+    ------
+    ValueError
+        No magnitude lies between them.
     """
 
     at_least: float = 0.0
@@ -32,7 +35,10 @@ class Bounds:
 class Condition:
     """What must hold at every sample of a stretch, and how long for.
 
-    Raises `ValueError`: there is no channel, or an unknown one.
+    Raises
+    ------
+    ValueError
+        There is no channel, or an unknown one.
     """
 
     magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
@@ -58,7 +64,12 @@ def stretches_where(
 ) -> list[tuple[int, int]]:
     """Longest runs [first, end) of sample indices that meet a condition.
 
-    Unmeasured ones do not; raises `DataError` without a channel.
+    Unmeasured ones do not.
+
+    Raises
+    ------
+    DataError
+        A channel of the condition is missing.
     """
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():

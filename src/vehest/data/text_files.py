@@ -18,9 +18,9 @@ import yaml
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
-from vehest.data.schema import DEEPEST
+from vehest.data.schema import MAX_DEPTH
 
-MOST_VALUES = 500_000  # of a YAML text, each counted as often as aliases repeat it
+MAX_YAML_VALUES = 500_000  # of a YAML text, each counted as often as aliases repeat it
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -46,7 +46,10 @@ def read_yaml(path: Path) -> Any:
 def parse_yaml(text: str, subject: str) -> Any:
     """Plain values of YAML.
 
-    Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values.
+    Raises
+    ------
+    DataError
+        It is not YAML, nests too deep, or repeats itself into too many values.
     """
     check_yaml_size(text, subject)
     try:
@@ -63,7 +66,7 @@ def parse_yaml(text: str, subject: str) -> Any:
         ) from None
 
 
-def check_yaml_size(text: str, subject: str, max_values: int = MOST_VALUES) -> None:
+def check_yaml_size(text: str, subject: str, max_values: int = MAX_YAML_VALUES) -> None:
     """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built.
 
     Raises `DataError`.
@@ -79,13 +82,14 @@ def check_yaml_size(text: str, subject: str, max_values: int = MOST_VALUES) -> N
         raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     if is_larger:
         raise DataError(
-            f"{subject} nests deeper than {DEEPEST} levels or holds more than {max_values} values, "
+            f"{subject} nests deeper than {MAX_DEPTH} levels or holds more than {max_values} "
+            "values, "
             "repeated ones included"
         )
 
 
 def _is_larger(text: str, max_values: int, loader: Any) -> bool:
-    """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as
+    """Whether YAML nests deeper than `MAX_DEPTH` or holds more values, each counted as often as
     aliases repeat it.
     """
     sizes: dict[str | None, int] = {}  # of anchored collections
@@ -100,7 +104,7 @@ def _is_larger(text: str, max_values: int, loader: Any) -> bool:
             if isinstance(event, yaml.CollectionStartEvent):
                 begun.append((event.anchor, count))
                 sizes[event.anchor] = max_values  # until its end: it cannot hold itself
-        if count > max_values or len(begun) > DEEPEST:
+        if count > max_values or len(begun) > MAX_DEPTH:
             return True
     return False
 
@@ -111,7 +115,13 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes, subject: str) -> Any:
-    """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
+    """Plain values of JSON.
+
+    Raises
+    ------
+    DataError
+        It is not JSON, too long, or nests too deep.
+    """
     check_limit("text_bytes", len(text), f"{subject} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)

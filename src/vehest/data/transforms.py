@@ -34,7 +34,7 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = (
+MAX_DIRECT_TAPS = (
     8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 )
 OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
@@ -218,7 +218,7 @@ class LowPass:
         """
         half = max(1, round(self.reach * rate_hz))
         taps = scipy.signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
-        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else scipy.signal.oaconvolve
+        convolve = np.convolve if len(taps) <= MAX_DIRECT_TAPS else scipy.signal.oaconvolve
         return convolve(_extended(samples, half), taps, mode="valid")
 
 
@@ -323,7 +323,13 @@ class MountingCorrection:
     yaw: float = 0.0  # rotation of the sensor's axes against the vehicle's, counter-clockwise [rad]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct ax and ay. Raises `DataError`: ax, ay or yaw_rate is missing or has gaps."""
+        """Correct ax and ay.
+
+        Raises
+        ------
+        DataError
+            One of ax, ay and yaw_rate is missing or has gaps.
+        """
         ax, ay, yaw_rate = (
             recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate"))
         )
@@ -433,7 +439,13 @@ class OffsetCorrection:
     )  # by channel, in its unit
 
     def __call__(self, recording: Recording) -> Recording:
-        """Subtract the offsets. Raises `DataError`: a channel is missing."""
+        """Subtract the offsets.
+
+        Raises
+        ------
+        DataError
+            A channel is missing.
+        """
         return recording.with_channels(
             {name: recording[name] - value for name, value in self.offsets.items()}
         )
@@ -487,7 +499,10 @@ class Preparation:
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
     """Build a transform from plain values: its ``name`` and its arguments.
 
-    Raises `ConfigurationError`: an unknown name or argument.
+    Raises
+    ------
+    ConfigurationError
+        An unknown name or argument.
     """
     if not isinstance(config, Mapping):
         raise ConfigurationError(

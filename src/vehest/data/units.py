@@ -53,7 +53,10 @@ _UNITS = {
 def factor_to_si(unit: str, si_unit: str) -> float:
     """Factor that brings a value in ``unit`` to ``si_unit``.
 
-    Raises `DataError`: the unit is not known, or measures something else.
+    Raises
+    ------
+    DataError
+        The unit is not known, or measures something else.
     """
     if unit not in _UNITS:
         raise DataError(f"unit '{unit}' is not known; known units: {', '.join(sorted(_UNITS))}")

@@ -37,7 +37,7 @@ PATENT_NOTE = (
 
 REPORT = "report"  # document of a study that one starts with
 
-LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
+MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
 PNG_COLOURS = 256
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
@@ -103,7 +103,10 @@ Block: TypeAlias = "str | Table | Figure"
 class Document:
     """A report.
 
-    Raises `ValueError` where two tables or two figures share a name, or a name is no file name.
+    Raises
+    ------
+    ValueError
+        Two tables or two figures share a name, or a name is no file name.
     """
 
     title: str  # plain text
@@ -139,12 +142,15 @@ def write_documents(
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by
     side.
 
-    Args:
-        on_page: text and tables that the page of ``report`` alone ends with, and no other file
-            contains.
+    Parameters
+    ----------
+    on_page : Sequence[str or Table]
+        Text and tables that the page of ``report`` alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: tables or figures of two documents share a name, or a name is no file name.
+    Raises
+    ------
+    ValueError
+        Tables or figures of two documents share a name, or a name is no file name.
     """
     blocks = [block for document in documents.values() for block in document.blocks]
     Document(
@@ -171,12 +177,17 @@ def write_document(
 
     The same document gives the same bytes.
 
-    Args:
-        name: of both files, without ending.
-        on_page: text and tables that the page alone ends with, and no other file contains.
+    Parameters
+    ----------
+    name : str
+        Of both files, without ending.
+    on_page : Sequence[str or Table]
+        Text and tables that the page alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: a table of ``on_page`` has the name of another.
+    Raises
+    ------
+    ValueError
+        A table of ``on_page`` has the name of another.
     """
     numbers = _numbers(document)
     images: dict[str, bytes] = {}
@@ -512,7 +523,7 @@ def bars_of(
     """Where values and the ends of their intervals lie on one axis from zero, in per cent of its
     length; none where a value is missing.
 
-    The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far
+    The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
     beyond; what is longer is ``cut``.
     """
     finite = [value for value in values if math.isfinite(value)]
@@ -523,7 +534,7 @@ def bars_of(
     ]
     if not finite or max(ends) <= 0:
         return [None] * len(values)
-    axis = min(max(ends), LONGEST_AXIS * sorted(finite)[len(finite) // 2] or max(ends))
+    axis = min(max(ends), MAX_AXIS_RATIO * sorted(finite)[len(finite) // 2] or max(ends))
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)

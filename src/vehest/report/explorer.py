@@ -42,7 +42,9 @@ def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray |
 def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:
     """Columns in 16 bits.
 
-    Returns:
+    Returns
+    -------
+    tuple[dict[str, list[float]], str]
         Name -> lowest value and the step between two codes, in the order of the data; and the data,
         base64 of zlib: of each column the low bytes, then the high bytes, of differences between
         neighbouring codes.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 STATIC_POINTS = 500
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 MAX_POINTS = 2000  # of a line over a whole drive on one page
-LEAST_SAMPLES = 20
+MIN_SAMPLES_IN_BIN = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other
 # the reference under the estimates: wide enough to show on both sides of a line
@@ -217,7 +217,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
             squares = np.bincount(index, weights=np.square(error), minlength=n_bins)
             rmse = np.sqrt(
                 np.divide(
-                    squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES
+                    squares, counts, out=np.full(n_bins, np.nan), where=counts >= MIN_SAMPLES_IN_BIN
                 )
             )
             axes.plot(

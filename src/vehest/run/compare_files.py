@@ -54,8 +54,8 @@ from vehest.sources.base import read_single
 from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
-LEAST_SECONDS = 5.0
-LOWEST_RATE = 1.0  # Hz
+MIN_COMMON_SECONDS = 5.0
+MIN_RATE_HZ = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -184,12 +184,16 @@ def compare_estimates(
     (`min_sideslip_speed`). The map is fitted on one half of the scored range and scored on the
     other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by
     models that were trained on this recording, have rows, the last ones, and are left out of the
-    verdict.
-    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and
-    ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
+    verdict. Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start``
+    and ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
     ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
-    Raises `DataError` without a reference, or with too little or gaps in common,
-    `ConfigurationError` for none or a baseline's name.
+
+    Raises
+    ------
+    DataError
+        There is no reference, or too little in common, or gaps.
+    ConfigurationError
+        There is no estimate, or one has the name of a baseline.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
@@ -289,18 +293,19 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
         raise DataError(f"{empty[0]} has no value at all")
     start = max(float(clock[0]) for clock in times.values())
     stop = min(float(clock[-1]) for clock in times.values())
-    if stop - start < LEAST_SECONDS:
+    if stop - start < MIN_COMMON_SECONDS:
         ranges = ", ".join(
             f"{name} goes from {clock[0]:.6g} to {clock[-1]:.6g} s" for name, clock in times.items()
         )
         raise DataError(
-            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift "
+            f"{ranges}: less than {MIN_COMMON_SECONDS:g} s in common; are the clocks the same? "
+            "(--shift "
             "SECONDS or auto moves tables of other tools)"
         )
-    if reference.rate_hz < LOWEST_RATE:
+    if reference.rate_hz < MIN_RATE_HZ:
         raise DataError(
             f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need "
-            f"{LOWEST_RATE:g} Hz or more"
+            f"{MIN_RATE_HZ:g} Hz or more"
         )
     return start, stop
 

@@ -21,7 +21,7 @@ from vehest.estimators.registry import new_estimator
 from vehest.inference.car_values import with_car_values
 from vehest.inference.models import find_model
 from vehest.run.evaluate import Evaluation, protocol_from_config
-from vehest.run.evaluate_faults import all_of, check_channels, faults_of
+from vehest.run.evaluate_faults import check_channels, faults_of, union_of_faults
 from vehest.run.failures import Failure, failure_of
 from vehest.run.group import Group, Member
 from vehest.run.next_commands import command_line, location_of_config
@@ -35,7 +35,7 @@ from vehest.studies.reference_minutes import start_in_words
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
 NOT_TRAINED = "not trained yet"
-TOLERANCE = 1e-9  # relative, between two rates that are the same
+RATE_TOLERANCE = 1e-9  # relative, between two rates that are the same
 
 Note = tuple[str, str]
 """Estimator, or ``evaluation``, whose rate was lowered, and how its sentence continues."""
@@ -55,7 +55,7 @@ class Comparison:
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
-    found: Mapping[str, Member] = field(
+    finished: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
     differences: Mapping[str, Differences] = field(
@@ -72,13 +72,13 @@ class Comparison:
     def members(self) -> list[Member]:
         """Trained and evaluated members in the order of the jobs."""
         keys = dict.fromkeys(job.training.plan.key for job in self.jobs if job.training is not None)
-        return [self.found[key] for key in keys if key in self.found]
+        return [self.finished[key] for key in keys if key in self.finished]
 
     @property
     def unfinished(self) -> list[str]:
         """Trainings for which no time was left, by name."""
         trainings = [job.training for job in self.usable if job.training is not None]
-        remaining = [training for training in trainings if training.plan.key not in self.found]
+        remaining = [training for training in trainings if training.plan.key not in self.finished]
         return list(
             dict.fromkeys(
                 label_of(training) + difference_text(self.differences.get(training.plan.key, {}))
@@ -97,8 +97,14 @@ class Comparison:
         """Fit jobs to the recordings of their split, find those that lack something, and plan
         groups of trainings; makes data on the way.
 
-        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done,
-        `DryRunStop` where a dry run would make data.
+        Raises
+        ------
+        ConfigurationError
+            A wrong setting.
+        DataError
+            No job can be done.
+        DryRunStop
+            A dry run would make data.
         """
         usable = self.usable
         labels = dict[Any, str]()
@@ -173,7 +179,7 @@ class Comparison:
                 of_training.setdefault(job.training.plan.key, (job.training, []))[1].append(job)
         groups: dict[Any, list[TrainJob]] = {}
         for training, jobs in of_training.values():
-            faults = all_of(
+            faults = union_of_faults(
                 faults_of(job.config) for job in (jobs if jobs[0].label else self.usable)
             )
             groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
@@ -193,7 +199,7 @@ class Comparison:
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
         """Take what became of the trainings: key of each -> its member, or why it failed."""
-        self.found = {
+        self.finished = {
             key: member for key, member in members.items() if member.evaluation is not None
         }
         for job in self.usable:
@@ -240,7 +246,7 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
     rate = estimator_rate(config) if is_estimator else protocol_from_config(config[group]).rate_hz
     key = f"{group}.rate_hz"
     lowest = limit.rate_hz
-    if not rate > lowest * (1.0 + TOLERANCE):
+    if not rate > lowest * (1.0 + RATE_TOLERANCE):
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):

@@ -38,10 +38,6 @@ class Item:
 
 def examine() -> Iterator[Item]:
     """Check everything that vehest relies on."""
-    import torch
-
-    from vehest.run.launchers.local import default_jobs
-
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
     yield Item(
@@ -79,13 +75,6 @@ def examine() -> Iterator[Item]:
     yield Item("ok" if writable else "error", "output", str(folder) if writable else refused)
     free = shutil.disk_usage(".").free / 1e9
     yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
-    yield Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")
-    yield Item(
-        "ok",
-        "GPU",
-        f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run "
-        "on the processor",
-    )
 
 
 def _kernels() -> Item:

@@ -46,12 +46,12 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
-SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
-SHARPEST_TURN = (
+MIN_LOG_RATE_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
+MAX_WHEELBASE_OVER_RADIUS = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
 # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
-LARGEST_FROUDE = 400.0
+MAX_FROUDE_NUMBER = 400.0
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 
 
@@ -61,14 +61,21 @@ def estimate_file(
     """Run a model on a recording and write the estimate to ``out``; returns its figures and a
     verdict.
 
-    Args:
-        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
-        out: table to write, or the log with further channels (`estimate_log`).
-        strict: whether findings in the channels are an error; else they are printed as warnings.
-        car: record of `vehest identify` to start from.
+    Parameters
+    ----------
+    words : Sequence[str]
+        A model, which may be left out, a recording and overrides of conf/estimate.yaml.
+    out : Path
+        Table to write, or the log with further channels (`estimate_log`).
+    strict : bool
+        Whether findings in the channels are an error; else they are printed as warnings.
+    car : Path or None
+        Record of `vehest identify` to start from.
 
-    Raises:
-        VehestError: model, recording or table cannot be used.
+    Raises
+    ------
+    VehestError
+        Model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
     name = words[0] if n_names == 2 else SELF_CALIBRATING
@@ -108,7 +115,7 @@ def estimate_file(
             model.preparation = options.preparation
         band = describe_band(trust, first.vehicle, options.same_vehicle, first.car)
         elsewhere = is_other_vehicle(trust, first.vehicle, options.same_vehicle, first.car)
-        if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
+        if MIN_LOG_RATE_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
             remarks.append(
                 f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
                 f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the "
@@ -124,7 +131,7 @@ def estimate_file(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
-            slowest_hz=SLOWEST_LOG_HZ,
+            slowest_hz=MIN_LOG_RATE_HZ,
         )
         estimates = report.counted(estimate_parts(run, resampled_drive))
         if writes_log:
@@ -199,7 +206,10 @@ def findings_of(
 ) -> list[Finding]:
     """Findings in the channels that a model reads, given those of all channels, if they are known.
 
-    Raises `DataError` on contradictions.
+    Raises
+    ------
+    DataError
+        Channels contradict each other.
     """
     read = [name for name in model.channels if name in recording]
     if of_all_channels is not None and (
@@ -235,7 +245,7 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
     problem = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
     remedy = "give estimator.wheelbase"
-    if wheelbase * turn > SHARPEST_TURN:
+    if wheelbase * turn > MAX_WHEELBASE_OVER_RADIUS:
         return [
             Finding(
                 "warning",
@@ -245,7 +255,7 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
             )
         ]
     fast = float(np.quantile(speed, 0.99))
-    if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
+    if fast**2 > MAX_FROUDE_NUMBER * GRAVITY * wheelbase:
         return [
             Finding(
                 "warning", "wheelbase", "", f"{problem} does not reach {fast:.0f} m/s; {remedy}"
@@ -257,10 +267,14 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
 class _Report:
     """Findings, figures and verdict of a drive that is checked and estimated in parts.
 
-    Args:
-        model, trust: that estimate it.
-        accepted: checks whose contradictions do not count.
-        strict: name of the file if findings are an error.
+    Parameters
+    ----------
+    model, trust : Estimator, Trust or None
+        That estimate it.
+    accepted : Sequence[str]
+        Checks whose contradictions do not count.
+    strict : str or None
+        Name of the file if findings are an error.
     """
 
     def __init__(

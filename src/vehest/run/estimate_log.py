@@ -39,15 +39,23 @@ def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) ->
     As MDF 4, the log as it is with one group more, on the estimate's clock. As MAT 5, the channels
     of the recording in SI units and the estimate, held, on the clock ``time`` of the recording.
 
-    Args:
-        estimate: of the recording.
-        recording: as it was read from the log.
-        log: its file.
-        out: `LOG_SUFFIXES`; see `check_log_name`.
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the recording.
+    recording : Recording
+        As it was read from the log.
+    log : Path
+        Its file.
+    out : Path
+        `LOG_SUFFIXES`; see `check_log_name`.
 
-    Raises:
-        DataError: the log is of an older version of MDF.
-        MissingError: there is no room, or a folder cannot be written to.
+    Raises
+    ------
+    DataError
+        The log is of an older version of MDF.
+    MissingError
+        There is no room, or a folder cannot be written to.
     """
     if out.suffix.lower() == ".mat":
         from scipy.io import savemat

@@ -81,7 +81,13 @@ def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
 
 
 def parse_shift(text: str) -> float | None:
-    """Seconds of ``--shift``, None for ``auto``; raises `ConfigurationError` for anything else."""
+    """Seconds of ``--shift``, None for ``auto``.
+
+    Raises
+    ------
+    ConfigurationError
+        Anything else.
+    """
     if text == AUTO:
         return None
     with suppress(ValueError):
@@ -162,7 +168,13 @@ def read_estimate_table(
 
 
 def names_of_table(file: Path) -> list[str]:
-    """Names of a table's columns; raises `DataError` where it cannot be read."""
+    """Names of a table's columns.
+
+    Raises
+    ------
+    DataError
+        It cannot be read.
+    """
     return column_names(file, _layout(file))
 
 

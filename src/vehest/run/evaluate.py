@@ -75,7 +75,13 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
-    """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
+    """How estimates are scored.
+
+    Raises
+    ------
+    ConfigurationError
+        A value that makes no sense.
+    """
     protocol = settings_from_config(Protocol, config, "evaluation")
     speeds = protocol.min_sideslip_speed
     if (

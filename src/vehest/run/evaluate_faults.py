@@ -79,7 +79,7 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
     """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of
     ``fault``.
 
-    Raises as `all_of` does.
+    Raises as `union_of_faults` does.
     """
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
@@ -103,7 +103,7 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
         for kind, changes in zip(named, changes_of_entries, strict=True)
     ]
     chosen = chosen_fault(config)
-    return all_of([settings, [] if chosen is None else [chosen]])
+    return union_of_faults([settings, [] if chosen is None else [chosen]])
 
 
 def chosen_fault(config: Config) -> FaultSettings | None:
@@ -116,7 +116,7 @@ def _settings(content: Mapping[str, Any]) -> FaultSettings:
     return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")
 
 
-def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
+def union_of_faults(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
     """Faults of several configurations together, each once.
 
     Raises
@@ -171,7 +171,9 @@ def errors_under(
     A piece is a range or sequence, its samples with a warm-up before it, and the state to start
     from, if any.
 
-    Returns:
+    Returns
+    -------
+    dict[str, dict[str, float]]
         Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of
         bands and health where there is a trust.
     """

@@ -51,19 +51,19 @@ MEANINGS = {
     "compliance": "slip angle of the rear axle over its lateral acceleration",
     "grip": "lateral acceleration at the rear axle's limit",
 }
-AGREEMENT = 0.95
+AGREEMENT_QUANTILE = 0.95
 """Quantile of χ² within which the values of several drives count as those of one car.
 
 Beyond it the number is not identified.
 """
 # s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b
 # and C
-LATENESS = 0.03
+YAW_RATE_LATENESS_SECONDS = 0.03
 
 
 class Normal(NamedTuple):
-    """A number's mean and standard deviation, and what a yaw rate that is late by `LATENESS` adds
-    to the mean.
+    """A number's mean and standard deviation, and what a yaw rate that is late by
+    `YAW_RATE_LATENESS_SECONDS` adds to the mean.
     """
 
     mean: Any
@@ -167,7 +167,7 @@ def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Norm
             f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a "
             "part without them"
         )
-    turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
+    turning = YAW_RATE_LATENESS_SECONDS * model.rate_hz * np.gradient(samples[:, 0])
     on_time, early, late = (
         _final_state(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
         for shift in (0.0, turning, -turning)
@@ -246,8 +246,8 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     """The prior and what each drive adds to it, weighted by information; deviations hold the yaw
     rate's lateness, which drives share.
 
-    The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT`
-    none of them identifies the number.
+    The deviation grows where drives contradict each other, and where they do so beyond
+    `AGREEMENT_QUANTILE` none of them identifies the number.
     """
     mean, deviation, of_lateness = (
         np.array([normal for normal in drives.values() if normal.deviation < prior.deviation])
@@ -263,7 +263,7 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     squares = float(np.sum(np.square((alone - value) / of_alone)))
     n_degrees = max(len(alone) - 1, 1)
     scatter = squares / n_degrees if len(alone) > 1 else 1.0
-    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT, n_degrees))
+    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT_QUANTILE, n_degrees))
     max_deviation = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
     identified = tuple(
         drive

@@ -34,7 +34,7 @@ from vehest.trust.health import SLOW_KERNEL, compile_health
 
 STAGE = "ingest"
 PARTS_PREFIX = ".parts-"
-LONGEST_ID = 200  # bytes
+MAX_ID_BYTES = 200  # bytes
 MAX_NAMES = 6  # of recordings in an error
 Report = Callable[
     [int, int, str], None
@@ -181,12 +181,13 @@ def recording_file(recording_id: str) -> str:
     """
     if (
         not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id)
-        or len(os.fsencode(recording_id)) > LONGEST_ID
+        or len(os.fsencode(recording_id)) > MAX_ID_BYTES
     ):
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's "
             "name in the store, "
-            f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden "
+            f"of up to {MAX_ID_BYTES} bytes, without '/', '\\' and control characters, and no "
+            "hidden "
             "one"
         )
     return f"{recording_id}.parquet"

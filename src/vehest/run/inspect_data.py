@@ -37,9 +37,9 @@ from vehest.sources.signals import MISSING
 from vehest.sources.tabular import unused_columns
 
 # Time stamps between these count from 1970.
-EARLIEST_UNIX = 6e8  # s, in 1989
-LATEST_UNIX = 4e9  # s, in 2096
-MOST_COLUMNS = 40  # of a table that are listed
+MIN_UNIX_SECONDS = 6e8  # s, in 1989
+MAX_UNIX_SECONDS = 4e9  # s, in 2096
+MAX_LISTED_COLUMNS = 40  # of a table that are listed
 SPREAD = ("min", "mean", "max", "std")
 
 Lines = list[str | TerminalTable]
@@ -163,7 +163,9 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
     if missing:
         lines.append(f"missing channels that every score requires: {' and '.join(missing)}")
     if columns:
-        names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
+        names = ", ".join(columns[:MAX_LISTED_COLUMNS]) + (
+            ", …" if len(columns) > MAX_LISTED_COLUMNS else ""
+        )
         lines.append(
             f"columns without a channel: {names}; if one of them is a missing channel, declare it "
             "in conf/dataset"
@@ -260,7 +262,7 @@ def _spread(samples: FloatArray) -> dict[str, float]:
 
 def _stretch(start: float, end: float) -> str:
     """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
-    if not EARLIEST_UNIX < start < LATEST_UNIX:
+    if not MIN_UNIX_SECONDS < start < MAX_UNIX_SECONDS:
         return f"{start:.6g} s to {end:.6g} s"
     return (
         f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} "

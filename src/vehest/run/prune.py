@@ -39,7 +39,9 @@ LEFT_OVER = "left by a process that was killed"
 def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     """List everything in an output root that no current configuration can reuse, stage by stage.
 
-    Returns:
+    Returns
+    -------
+    list[dict[str, Any]]
         ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written
         to.
     """

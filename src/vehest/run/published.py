@@ -27,7 +27,7 @@ from vehest.data.text_files import read_yaml
 from vehest.data.transforms import Preparation
 from vehest.run.console import Messages
 from vehest.run.evaluate import evaluation_options
-from vehest.run.evaluate_faults import all_of, faults_of
+from vehest.run.evaluate_faults import faults_of, union_of_faults
 from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Stages
@@ -94,7 +94,7 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
 def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
-    faults = all_of(map(faults_of, configs))
+    faults = union_of_faults(map(faults_of, configs))
     protocol = stages.protocol(first, dataset_names(first["split"]))
     rates = sorted({*map(estimator_rate, configs), protocol.rate_hz})
     preparation = changed_options(
@@ -152,8 +152,13 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
     Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
     with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
     why the state is not known.
-    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name
-    of no pipeline or published study.
+
+    Raises
+    ------
+    ConfigurationError
+        An override that would change results.
+    MissingError
+        A name of no pipeline or published study.
     """
     if content_overrides(overrides):
         raise ConfigurationError(

@@ -69,7 +69,12 @@ class Published:
 def published_in(folder: Path) -> Published | None:
     """Read the record of a published study; none where nothing is published.
 
-    Raises `DataError` or `ConfigurationError` where the record is damaged.
+    Raises
+    ------
+    DataError
+        The record is damaged.
+    ConfigurationError
+        The record is damaged.
     """
     path = folder / PROVENANCE
     if not path.is_file():
@@ -88,8 +93,13 @@ def publish_study(
     A published report stays that shows data which this run could not read, or more trainings with
     the same keys. Where keys and all other files are the same, the provenance stays that of the
     first run with these results.
-    Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds
-    something else or is reached by a link.
+
+    Raises
+    ------
+    MissingError
+        It cannot be written.
+    ConfigurationError
+        The folder holds something else or is reached by a link.
     """
     if publication is None:
         return None

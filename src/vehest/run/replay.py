@@ -29,7 +29,7 @@ from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import describe_band, is_other_vehicle
 
-SAME_RATE = 1e-6
+MAX_RATE_DIFFERENCE = 1e-6
 
 
 def replay_log(
@@ -81,7 +81,7 @@ def replay_log(
         timing = survey(frames, bus_signals, bus_rate)
         faster = (
             timing.rate_hz
-            if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE
+            if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > MAX_RATE_DIFFERENCE
             else None
         )
         if write_dbc is not None:

@@ -401,7 +401,7 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
         member = (
             None
             if job.failure is not None or job.training is None
-            else comparison.found.get(job.training.plan.key)
+            else comparison.finished.get(job.training.plan.key)
         )
         title = (
             new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""
@@ -411,8 +411,6 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
             "title": title,
             **job.values,
             "seed": job.config["seed"],
-        }
-        row |= {
             "status": DONE if member else FAILED,
             "error": job.failure.message if job.failure is not None else "",
         }

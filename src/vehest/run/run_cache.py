@@ -79,14 +79,18 @@ class Record:
 class RunCache:
     """The record of one command.
 
-    Args:
-        name: of the pipeline, or its path; of the sweep, if it was given.
+    Parameters
+    ----------
+    name : str
+        Of the pipeline, or its path; of the sweep, if it was given.
 
-    Attributes:
-        file: of the record; none where the output root depends on more than overrides and
-            environment.
-        inputs: hash of the command, files and variables that determine keys, but raw files; empty
-            if these are not all that does.
+    Attributes
+    ----------
+    file
+        Of the record; none where the output root depends on more than overrides and environment.
+    inputs
+        Hash of the command, files and variables that determine keys, but raw files; empty if these
+        are not all that does.
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:

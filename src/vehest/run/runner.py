@@ -289,7 +289,9 @@ class Runner(Stages):
         Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
         at a signal; finished artefacts stay.
 
-        Returns:
+        Returns
+        -------
+        tuple[dict[str, Member], dict[str, Failure]]
             Key of a training -> its member, and key of a training -> why it failed. Where the time
             is up, members lack what was not made, and trainings that were not begun are in neither.
         """

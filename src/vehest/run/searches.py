@@ -64,13 +64,13 @@ def published_values(
     finished: dict[str, float] = {}
     for trials in study.searches.values():
         planned = [_planned_trial(study, name, comparisons) for name in trials]
-        values_found = {
+        published_trials = {
             trial.name: values[trial.key, trial.evaluation, trial.metric]
             for trial in planned
             if trial is not None and (trial.key, trial.evaluation, trial.metric) in values
         }
-        if len(values_found) == len(trials):
-            finished |= values_found
+        if len(published_trials) == len(trials):
+            finished |= published_trials
     return finished
 
 

@@ -27,7 +27,10 @@ class DryRunStop(Exception):
 class StopSignals:
     """Records the first SIGINT or SIGTERM.
 
-    Raises `Stopped` at once, or later where a fit is to end cleanly.
+    Raises
+    ------
+    Stopped
+        At once, or later where a fit is to end cleanly.
     """
 
     def __init__(self) -> None:

@@ -44,13 +44,13 @@ from vehest.run.failures import Failure, failure_of
 from vehest.run.next_commands import command_line, location_overrides
 from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
-from vehest.studies.sweep import Value, short_names, shown_value
+from vehest.studies.sweep import Value, override_text, short_names
 
 FORMS = (
     "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; "
     "datasets, each once"
 )
-SAME_IN_A_PART = ("split", "evaluation", "downsample")
+SHARED_KEYS = ("split", "evaluation", "downsample")
 SINGLE_VALUED = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
 Sweeps = Annotated[
@@ -444,7 +444,7 @@ def _part_jobs(
                 config["seed"] = value_of(seeds[-1])
             configs.setdefault(json.dumps({**config, GIVEN: None}, sort_keys=True), config)
     jobs = [Job(config) for config in configs.values()]
-    for key in SAME_IN_A_PART:
+    for key in SHARED_KEYS:
         if any(job.config[key] != jobs[0].config[key] for job in jobs):
             raise ConfigurationError(
                 f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of "
@@ -540,7 +540,7 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
                 value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
             )
     names = short_names(list(values))
-    label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
+    label = ", ".join(f"{names[key]}={override_text(value)}" for key, value in values.items())
     try:
         config = compose_config("eval", overrides)
         estimator = new_estimator(config["estimator"])

@@ -129,21 +129,31 @@ def run_study(
     """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that
     overrides changed is not published.
 
-    Args:
-        name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the
-            estimators and the split.
-        overrides: for all jobs that have their key; of a sweep, with several values.
-        cache: keeps the finished study.
-        sweep: whether the overrides make a sweep.
-        only_report: train and evaluate nothing.
+    Parameters
+    ----------
+    name : str or None
+        Of the pipeline, or its path; of a sweep the start of its folder's name, none for the
+        estimators and the split.
+    overrides : Sequence[str]
+        For all jobs that have their key; of a sweep, with several values.
+    cache : RunCache
+        Keeps the finished study.
+    sweep : bool
+        Whether the overrides make a sweep.
+    only_report : bool
+        Train and evaluate nothing.
 
-    Raises:
-        JobsFailedError: some jobs of a study in parts, or all of another, failed; finished
-            artefacts are kept.
-        DataError: recordings lack what some job of a study in parts, or all of another, needs;
-            nothing was trained.
-        MissingError: raw files are missing, or ``only_report`` and a training is.
-        DryRunStop: in a dry run.
+    Raises
+    ------
+    JobsFailedError
+        Some jobs of a study in parts, or all of another, failed; finished artefacts are kept.
+    DataError
+        Recordings lack what some job of a study in parts, or all of another, needs; nothing was
+        trained.
+    MissingError
+        Raw files are missing, or ``only_report`` and a training is.
+    DryRunStop
+        In a dry run.
     """
     begun = time.monotonic()
     if sweep:
@@ -491,14 +501,14 @@ def evaluate_model(
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (model_found := find(plan, runner.messages.warn)) is None:
+            if (existing_model := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
                     f"{plan.label} has not been trained; run '{command_line('train', training)}' "
                     "first"
                 )
             assert group.evaluation is not None
-            trained = model_found
+            trained = existing_model
             evaluation = group.evaluation
         calibration = _calibration(trained, evaluation, runner)
         artefact = runner.ensure(*evaluation.of(trained, calibration))

@@ -58,20 +58,27 @@ def record_tables(
 
     Tables outside results/, of a trial, are not recorded.
 
-    Args:
-        tables: files just written, all in one folder; files that are not there are left out.
-        command: what makes them again.
-        determined_by: what else all numbers follow from, as in the names of keys. While rows of an
-            earlier run stay, a recorded key of it stays too: the table is stale until all rows are
-            made with today's.
-        without_keys: what of them was made before keys were recorded.
-        rows: further keys, each of some rows; groups without a recorded key are named as
-            ``without_keys``.
+    Parameters
+    ----------
+    tables : Sequence[Path]
+        Files just written, all in one folder; files that are not there are left out.
+    command : str
+        What makes them again.
+    determined_by : Sequence[str]
+        What else all numbers follow from, as in the names of keys. While rows of an earlier run
+        stay, a recorded key of it stays too: the table is stale until all rows are made with
+        today's.
+    without_keys : str
+        What of them was made before keys were recorded.
+    rows : RowKeys or None
+        Further keys, each of some rows; groups without a recorded key are named as
+        ``without_keys``.
 
-    Raises:
-        MissingError: raw files that the numbers follow from are not here, as where a record is
-            written after the tables; without their digest the tables would be stale wherever the
-            files are.
+    Raises
+    ------
+    MissingError
+        Raw files that the numbers follow from are not here, as where a record is written after the
+        tables; without their digest the tables would be stale wherever the files are.
     """
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
@@ -116,8 +123,10 @@ def record_tables(
 def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
     """What a key of a table in ``folder`` is today; without ``data`` where raw files are not here.
 
-    Raises:
-        ConfigurationError: the name is unknown.
+    Raises
+    ------
+    ConfigurationError
+        The name is unknown.
     """
     table, _, origin = key.partition(": ")
     kind, _, name = origin.partition(" ")

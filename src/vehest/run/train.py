@@ -83,8 +83,12 @@ def estimator_rate(config: Mapping[str, Any]) -> float:
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
     """A training and its artefact.
 
-    Raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a
-    recording.
+    Raises
+    ------
+    ConfigurationError
+        A wrong setting or nothing to learn.
+    DataError
+        Without a recording.
     """
     estimator = new_estimator(config["estimator"])
     seed = config["seed"]

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vehest.configuration.composition import Config, compose_config
 from vehest.configuration.files import choices
-from vehest.data.derivable_channels import Derivation, derivation_of, made_by
+from vehest.data.derivable_channels import Derivation, channels_made_by, derivation_of
 from vehest.data.errors import ConfigurationError, VehestError
 from vehest.data.recording_summary import RecordingSummary, common_channels
 from vehest.data.schema import settings_from_config
@@ -64,7 +64,7 @@ class Usability:
 
     estimator: str  # name in conf/estimator
     rate_hz: float | None  # that it would run at [Hz]; None where its settings are incomplete
-    own_rate_hz: float | None  # of its configuration [Hz]
+    configured_rate_hz: float | None  # of its configuration [Hz]
     missing: Missing  # channels that the recordings lack
     gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
     settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
@@ -100,7 +100,7 @@ class Usability:
             "estimator": self.estimator,
             "usable": self.usable,
             "rate_hz": self.rate_hz,
-            "own_rate_hz": self.own_rate_hz,
+            "own_rate_hz": self.configured_rate_hz,
             "missing_to_estimate": self.missing.to_estimate,
             "missing_to_train": self.missing.to_train,
             "supplies": {
@@ -124,39 +124,20 @@ def all_usabilities(
     There is at least one recording. A file or a package that cannot be used is a row with the
     reason.
     """
-    rows = [_choice_usability(name, recordings, dataset) for name in choices("estimator")]
-    listed = {row.estimator for row in rows}
-    for name in estimator_names():
-        if name not in listed:
-            config: Config = {"estimator": {"name": name}, "training": {}}
-            rows.append(_usability_with_car(name, config, recordings, dataset))
+    cars = [car_of(dataset)] if dataset else []
+    with_files = choices("estimator")
+    rows = []
+    for name in dict.fromkeys((*with_files, *estimator_names())):
+        config: Config = {"estimator": {"name": name}, "training": {}}
+        try:
+            if name in with_files:
+                config = compose_config("train", [f"estimator={name}"])
+            rows.append(usability(name, with_car_values(config, cars), recordings))
+        except ConfigurationError as error:
+            if name not in with_files:
+                raise
+            rows.append(Usability(name, None, None, Missing([], [], {}), to_give=str(error)))
     return rows
-
-
-def _choice_usability(
-    name: str, recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None
-) -> Usability:
-    """The row of a file of conf/estimator.
-
-    One that is no configuration is unusable for the reason that its error names.
-    """
-    try:
-        config = compose_config("train", [f"estimator={name}"])
-        return _usability_with_car(name, config, recordings, dataset)
-    except ConfigurationError as error:
-        return Usability(name, None, None, Missing([], [], {}), to_give=str(error))
-
-
-def _usability_with_car(
-    name: str,
-    config: Config,
-    recordings: Sequence[RecordingSummary],
-    dataset: Mapping[str, Any] | None,
-) -> Usability:
-    """A row with the car of a data set, if any."""
-    return usability(
-        name, with_car_values(config, [car_of(dataset)] if dataset else []), recordings
-    )
 
 
 def usability(
@@ -305,8 +286,8 @@ def _cells(row: Usability) -> list[str]:
         "exclude the gaps in conf/split" if row.gaps else "",
     ]
     rate = "" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
-    if row.rate_hz is not None and row.rate_hz != row.own_rate_hz:
-        rate += f", not {row.own_rate_hz:g}"
+    if row.rate_hz is not None and row.rate_hz != row.configured_rate_hz:
+        rate += f", not {row.configured_rate_hz:g}"
     return [
         row.estimator,
         row.usable,
@@ -323,7 +304,7 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
     estimator, training = _built(config)
     tested = split.test_spans if "evaluation" in config else ()
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
-    derived = made_by(config["downsample"]["transforms"])  # of references they are no part
+    derived = channels_made_by(config["downsample"]["transforms"])  # of references they are no part
     to_train, to_estimate = (
         [replace(summary, channels=summary.channels | derived) for summary in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)

@@ -23,7 +23,10 @@ def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
     """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or
     study by name, and of ``faults``.
 
-    Raises `ConfigurationError` where the name is unknown.
+    Raises
+    ------
+    ConfigurationError
+        The name is unknown.
     """
     code = f"{stage}={VERSIONS[stage]}"
     if stage == "ingest":

@@ -201,7 +201,13 @@ class StoredDataset:
     citation: str = ""  # what to cite
 
     def recordings(self) -> Iterator[Recording]:
-        """All recordings, one at a time; raises `DataError` where a file is damaged."""
+        """All recordings, one at a time.
+
+        Raises
+        ------
+        DataError
+            A file is damaged.
+        """
         return map(read_recording, self.files.values())
 
 

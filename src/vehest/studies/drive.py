@@ -220,8 +220,12 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     is none. ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``,
     at which sideslip is not scored. ``epochs`` is NaN for a method without. ``start`` is
     ``reference`` if the protocol passes the true initial state, else ``own``. Sideslip in deg,
-    velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation
-    metrics.
+    velocities in m/s.
+
+    Raises
+    ------
+    DataError
+        A run has two values of a metric, or no validation metrics.
     """
     runs = runs_of(artefacts)
     start = "reference" if artefacts.protocol.initial_state else "own"

@@ -128,8 +128,9 @@ def overview(
             "variant": name[1],
             "title": titles[name],
             "n_seeds": len(seeds),
+            "rmse_sideslip": ranking.rmse[name],
+            **standing_columns(ranking, name),
         }
-        row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
         for fold, part in enumerate(parts):
             square, samples = (
                 sum(float(getattr(folds_of_seed[fold], name).sum()) for folds_of_seed in seeds)

@@ -30,8 +30,8 @@ from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
 SHOWS_FAILED = True
-HARD = 4.0  # m/s², above which the tyres leave their linear range
-PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
+HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
+PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
 VERSION = "9"
 leaderboard = drive.leaderboard
@@ -108,7 +108,11 @@ def _comparison_with_plain(recommendation: Recommendation) -> str:
     }
     by_verdict: dict[str, list[str]] = {verdict: [] for verdict in sentences}
     for plain_name in ranking.order:
-        if plain_name != name and plain_name[0] in PLAIN and plain_name[0] not in BASELINES:
+        if (
+            plain_name != name
+            and plain_name[0] in PLAIN_ESTIMATORS
+            and plain_name[0] not in BASELINES
+        ):
             pair = ranking.pairs.get((name, plain_name))
             if pair is not None:
                 by_verdict[pair.verdict].append(recommendation.titles[plain_name])
@@ -212,15 +216,17 @@ def _hard_driving(part: PartArtefacts) -> str:
     ay = _samples(part, spans, "ay")
     if not len(ay):
         return ""
-    minutes = float((np.abs(ay) > HARD).sum()) / part.protocol.rate_hz / 60.0
+    minutes = float((np.abs(ay) > HARD_DRIVING_AY).sum()) / part.protocol.rate_hz / 60.0
     if minutes < 0.5:
         return (
-            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above {HARD:g} m/s²: "
+            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above "
+            f"{HARD_DRIVING_AY:g} m/s²: "
             "record at least ten minutes "
             "of harder driving."
         )
     return (
-        f"Your recordings contain {fixed(minutes, 1)} min with |ay| above {HARD:g} m/s²: "
+        f"Your recordings contain {fixed(minutes, 1)} min with |ay| above {HARD_DRIVING_AY:g} "
+        "m/s²: "
         f"{fixed(3.0 * minutes, 0)} min more would halve the interval."
     )
 

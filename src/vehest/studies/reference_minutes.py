@@ -48,7 +48,7 @@ COLUMNS = {
     "against_scratch": Column("than from scratch"),
 }
 """Of a table of `rows_of_curve`."""
-NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
+MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -132,7 +132,9 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
             float(named[1]) if named is not None else math.nan
         )  # by split.minutes, which the split's name then ends in
         minutes = (
-            requested if abs(recorded - requested) <= NEARLY * requested else round(recorded, 2)
+            requested
+            if abs(recorded - requested) <= MAX_MINUTES_DEVIATION * requested
+            else round(recorded, 2)
         )
         for model in part.models:
             models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
@@ -240,13 +242,16 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
     for point in curve.points:
         if point.estimator != BASELINES[0]:
             low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
-            row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
-            row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
-            row |= {
+            row = {
+                "title": point.title,
+                "start": point.start,
+                "minutes": point.minutes,
+                "rmse_sideslip": curve.ranking.rmse[point.name],
                 "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
                 "n_trainings": point.n_trainings,
+                "against_scratch": _against_scratch(curve, point) or "–",
             }
-            rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
+            rows.append(row)
     return rows
 
 

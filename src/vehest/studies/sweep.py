@@ -34,10 +34,10 @@ CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
 DONE = "done"
 FAILED = "failed"
-LOGARITHMIC_FROM = 20.0
-MOST_COLUMNS_SIDE_BY_SIDE = 6
+MIN_RATIO_FOR_LOG = 20.0
+MAX_COLUMNS_SIDE_BY_SIDE = 6
 CELL_HEIGHT = 0.42  # in
-NO_VALUE = "#ececec"
+NO_VALUE_COLOUR = "#ececec"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
@@ -83,9 +83,10 @@ class SweepArtefacts:
             row: dict[str, object] = {
                 "combination": number,
                 **{name: jobs.iloc[0][name] for name in ("title", *self.keys)},
+                "n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan,
+                "n_seeds": len(done),
+                "n_failed": len(jobs) - len(done),
             }
-            row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
-            row |= {"n_seeds": len(done), "n_failed": len(jobs) - len(done)}
             for name in self.sets:
                 row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(
                     done[f"{METRIC}.{name}"].to_numpy(dtype=float)
@@ -131,7 +132,9 @@ def interval(values: FloatArray) -> tuple[float, float]:
     """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t
     distribution with n - 1 degrees of freedom.
 
-    Returns:
+    Returns
+    -------
+    tuple[float, float]
         Mean and half interval; NaN where there are no values, half NaN for one value.
     """
     from scipy.stats import t
@@ -161,7 +164,7 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
             if row["n_failed"]
             else str(row["n_seeds"])
         )
-        settings = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
+        settings = [override_text(row[key]) for key in artefacts.keys] or [str(row["title"])]
         scores = [
             mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name])
             for name in artefacts.sets
@@ -197,7 +200,7 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
         panels = []
         for key, rows in table.groupby(switches, sort=False) if switches else [((), table)]:
             title = ", ".join(
-                f"{names[switch]} = {shown_value(value)}"
+                f"{names[switch]} = {override_text(value)}"
                 for switch, value in zip(switches, key, strict=True)
             )
             panels.append(_panel(rows, title, name, numeric, cells))
@@ -222,7 +225,7 @@ def short_names(keys: Sequence[str]) -> dict[str, str]:
     }
 
 
-def shown_value(value: object) -> str:
+def override_text(value: object) -> str:
     """A value as it is typed in an override."""
     return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)
 
@@ -269,15 +272,13 @@ def heat_map(
     high = float(finite.max())
     scale = (
         LogNorm(low, high)
-        if low > 0 and high / low > LOGARITHMIC_FROM
+        if low > 0 and high / low > MIN_RATIO_FOR_LOG
         else Normalize(low, high if high > low else low + 1.0)
     )
-    across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
+    across = 1 if len(columns) > MAX_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
     width = (
-        SINGLE_COLUMN
-        if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE
-        else DOUBLE_COLUMN
+        SINGLE_COLUMN if across == 1 and len(columns) <= MAX_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
     )
     with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
@@ -310,7 +311,7 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     axes.pcolormesh(
         *edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8
     )
-    axes.set_facecolor(NO_VALUE)
+    axes.set_facecolor(NO_VALUE_COLOUR)
     for row, column in np.ndindex(means.shape):
         mean = float(means[row, column])
         half = float(halves[row, column])
@@ -363,7 +364,7 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
         )
     row = table[table["chosen"]].iloc[0]
     names = short_names(artefacts.keys)
-    settings = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
+    settings = ", ".join(f"{names[key]} = {override_text(row[key])}" for key in artefacts.keys)
     words = f"Chosen on the validation range: **{row['title']}**" + (
         f" ({settings})" if settings else ""
     )
@@ -447,7 +448,7 @@ def _table(artefacts: SweepArtefacts) -> Table:
     frame = table.assign(chosen=["chosen" if chosen else "" for chosen in table["chosen"]])
     for key in artefacts.keys:
         if not all(_is_number(value) for value in frame[key]):
-            frame[key] = [shown_value(value) for value in frame[key]]
+            frame[key] = [override_text(value) for value in frame[key]]
         else:
             columns[key] = Column(names[key], each=True)
     caption = (

@@ -50,9 +50,9 @@ from vehest.studies.kit.warnings import warnings_of
 VERSION = "3"
 TAKES = "parts"
 SHOWS_FAILED = True
-COLUMNS = 4
+MAX_PANEL_COLUMNS = 4
 TITLE_WIDTH = 24
-ROW = 0.16  # in, height of an estimator
+ROW_HEIGHT = 0.16  # in, height of an estimator
 REFERENCES = (
     "zero",
     "static_map",
@@ -124,11 +124,13 @@ def overview(
                 "part": part,
                 "title": as_text(parts[part].title),
                 "test_set": test_set,
+                "estimator": name[0],
+                "variant": name[1],
+                "estimator_title": titles[name],
+                "rmse_sideslip": ranking.rmse.get(name, math.nan),
+                **(standing_columns(ranking, name) if name in ranking.rmse else nothing),
+                **_with_best_lever(parts[part], name, test_set),
             }
-            row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
-            row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
-            row |= standing_columns(ranking, name) if name in ranking.rmse else nothing
-            row |= _with_best_lever(parts[part], name, test_set)
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -240,11 +242,11 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     )
     names = [name for name in names if name[0] != "zero"]
     lines = lines_of([name[:2] for name in names])
-    columns = min(COLUMNS, len(places))
+    columns = min(MAX_PANEL_COLUMNS, len(places))
     rows = -(-len(places) // columns)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names))) as figure:
+    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW_HEIGHT * len(names))) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)

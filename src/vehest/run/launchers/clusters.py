@@ -38,11 +38,11 @@ from vehest.run.launchers.local import POLL_SECONDS, Done, Files, Reporter, defa
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
-TIMES = 3  # that a group is tried, if its tasks end without a report
+MAX_ATTEMPTS = 3  # that a group is tried, if its tasks end without a report
 ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 ENVIRONMENT |= {
     "RAY_worker_niceness": "0",
-    "RAY_task_oom_retries": str(TIMES - 1),
+    "RAY_task_oom_retries": str(MAX_ATTEMPTS - 1),
 }  # by default 15, and without end
 """Of Ray, unless it is set otherwise."""
 QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
@@ -99,8 +99,12 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
     """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where
     machines share the output root.
 
-    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with
-    neither a shared root nor copies.
+    Raises
+    ------
+    MissingError
+        The machine has other versions, or copies cannot be written.
+    NotShared
+        There is neither a shared output root nor copies.
     """
     versions = versions_here()
     unlike = [
@@ -272,7 +276,7 @@ class RayLauncher:
             "again", "ray", data["lines"][0].partition("\n")[0]
         )
         self._ray, self._mark = ray, new_mark(self._output)
-        self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
+        self._task = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
         machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
@@ -310,7 +314,9 @@ class RayLauncher:
         except errors.RayError as error:
             return Done(
                 position,
-                Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"),
+                Failure(
+                    f"{_line(error)} ({MAX_ATTEMPTS} times; --launcher local shows what ends it)"
+                ),
             )
         unpack(done.made)
         return done
@@ -484,8 +490,8 @@ class SlurmLauncher:
             self._lost[name] += 1
             if not job.paths.result_pickle.exists():
                 why = f"its job ended without an outcome ({str(job.state).lower()}); {log}"
-                if self._lost[name] == TIMES:
-                    return Done(position, Failure(f"{why} ({TIMES} times)"))
+                if self._lost[name] == MAX_ATTEMPTS:
+                    return Done(position, Failure(f"{why} ({MAX_ATTEMPTS} times)"))
                 self._messages.line("again", "train", name, why)
                 return None
             lines = str(error).splitlines()

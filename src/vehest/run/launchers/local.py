@@ -64,8 +64,10 @@ class LocalLauncher:
         """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin
         of a group is reported.
 
-        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines
-        cannot run them.
+        Raises
+        ------
+        MissingError
+            There is no cluster, it takes no tasks, or one of its machines cannot run them.
         """
         return launch([group.run for group in groups], self.cores, stop, report)
 
@@ -78,12 +80,16 @@ def launch(
 ) -> Iterator[Done]:
     """Run tasks in their order, as many at a time as ``jobs`` says, and yield them as they end.
 
-    Args:
-        jobs: processes; 1 runs everything in this one.
-        stop: when a signal came or the time is up, running tasks are asked to end and no other is
-            started.
-        report: called with the task's position and its progress (None when it starts), or what it
-            waits for.
+    Parameters
+    ----------
+    jobs : int
+        Processes; 1 runs everything in this one.
+    stop : StopSignals or TimeLimit
+        When a signal came or the time is up, running tasks are asked to end and no other is
+        started.
+    report : Reporter
+        Called with the task's position and its progress (None when it starts), or what it waits
+        for.
     """
     if min(jobs, len(tasks)) > 1 and not stop.requested():
         yield from _launch_in_processes(tasks, min(jobs, len(tasks)), stop, report)

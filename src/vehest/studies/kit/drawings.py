@@ -235,7 +235,7 @@ def error_over_ay_block(signals: DriveSignals, file: str) -> Figure:
         f"errors_over_ay_{file}",
         "RMSE of sideslip over the magnitude of the measured lateral acceleration, in bins of 1 "
         "m/s²; bins of fewer than "
-        f"{figures.LEAST_SAMPLES} samples show no error.",
+        f"{figures.MIN_SAMPLES_IN_BIN} samples show no error.",
         figures.error_over_ay(drive.ay[drive.is_sideslip_scored], _errors(signals)),
     )
 

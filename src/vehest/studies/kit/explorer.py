@@ -20,7 +20,7 @@ from vehest.studies.kit.runs import Name
 from vehest.trust.health import health_rows
 from vehest.trust.record import TRUST, read_trust
 
-MOST_INPUTS = 16
+MAX_INPUTS = 16
 DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
 RECKONED = (
     "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and "
@@ -31,17 +31,21 @@ RECKONED = (
 def explorer_of(
     artefacts: PartArtefacts,
     test_set: str,
-    shown: Mapping[Name, tuple[EvaluatedModel, str, Line]],
+    candidates_drawn: Mapping[Name, tuple[EvaluatedModel, str, Line]],
     scored: Mapping[Name, Sequence[Scored]],
     axis: tuple[float, str, int, tuple[float, float]],
 ) -> str:
     """What the page draws of a test set, as `explorer_json`.
 
-    Args:
-        shown: (estimator, variant) -> model, title and looks, in the order of the board.
-        scored: (estimator, variant) -> estimate and reference of each range, or sequence.
-        axis: first time [s], label of the time axis, samples between two ranges, and a range that
-            deserves a button [s].
+    Parameters
+    ----------
+    candidates_drawn : Mapping[Name, tuple[EvaluatedModel, str, Line]]
+        (estimator, variant) -> model, title and looks, in the order of the board.
+    scored : Mapping[Name, Sequence[Scored]]
+        (estimator, variant) -> estimate and reference of each range, or sequence.
+    axis : tuple[float, str, int, tuple[float, float]]
+        First time [s], label of the time axis, samples between two ranges, and a range that
+        deserves a button [s].
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
@@ -72,10 +76,10 @@ def explorer_of(
     }
     inputs = []
     candidates = []
-    for i, name in enumerate(names[:MOST_INPUTS]):
+    for i, name in enumerate(names[:MAX_INPUTS]):
         columns[f"input{i}"], unit = in_display_unit(name, measured(name))
         inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
-    for i, (candidate, (model, title, line)) in enumerate(shown.items()):
+    for i, (candidate, (model, title, line)) in enumerate(candidates_drawn.items()):
         columns[f"vy{i}"] = chained([part.vy for part in scored[candidate]], gap)
         bands = [part.bands for part in scored[candidate]]
         band_vy, band_sideslip = (

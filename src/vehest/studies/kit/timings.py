@@ -66,9 +66,13 @@ def _rows(
             str(metric): float(value)
             for metric, value in times.groupby("metric")["value"].median().items()
         }
-        row: dict[str, object] = {"part": part, "title": title, "fits": times["seed"].nunique()}
-        row |= {"train_seconds": medians.pop("train_seconds", float("nan"))}
-        row |= {"all_seconds": float(times.loc[times["metric"] == "train_seconds", "value"].sum())}
-        row |= {"step_seconds": 1e3 * medians.pop("step_seconds", float("nan"))}
+        row: dict[str, object] = {
+            "part": part,
+            "title": title,
+            "fits": times["seed"].nunique(),
+            "train_seconds": medians.pop("train_seconds", float("nan")),
+            "all_seconds": float(times.loc[times["metric"] == "train_seconds", "value"].sum()),
+            "step_seconds": 1e3 * medians.pop("step_seconds", float("nan")),
+        }
         rows.append(row | medians)
     return rows

@@ -18,9 +18,13 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
 # deg, root mean square of the reference, below which a test hardly distinguishes estimators
-LITTLE_SIDESLIP = 0.5
-CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
-SILENT = 0.7  # bound over the reference itself, above which a drive adds no information on v
+MIN_SIDESLIP_DEG = 0.5
+MIN_ERROR_OVER_NOISE = (
+    2.0  # lowest error over the noise of the reference, below which the reference may decide
+)
+MAX_BOUND_OVER_SIGNAL = (
+    0.7  # bound over the reference itself, above which a drive adds no information on v
+)
 MIN_RATIO_OF_PERCENTILES = (
     1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 )
@@ -68,13 +72,13 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     """
     level = _level(artefacts, artefacts.split.tests[test_set])
     clauses = []
-    if level < LITTLE_SIDESLIP:
+    if level < MIN_SIDESLIP_DEG:
         clauses.append(f"they hardly excite sideslip ({level:.2g}° rms)")
     bound, error = (
         _lowest(runs_of(artefacts), test_set, name)
         for name in ("floor_cramer_rao", "rmse_sideslip")
     )
-    if min(bound, error) > SILENT * level:
+    if min(bound, error) > MAX_BOUND_OVER_SIGNAL * level:
         clauses.append(
             f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the "
             f"zero-sideslip baseline {level:.2g}°"
@@ -103,7 +107,7 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
     for test_set, spans in artefacts.split.tests.items():
         sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
         level = float(np.sqrt(np.mean(np.square(sideslip))))
-        if level < LITTLE_SIDESLIP:
+        if level < MIN_SIDESLIP_DEG:
             sentences.append(
                 f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the "
                 "time below "
@@ -124,7 +128,7 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
             _lowest(runs, test_set, name)
             for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
         )
-        if error < CLOSE * noise:
+        if error < MIN_ERROR_OVER_NOISE * noise:
             sentences.append(
                 f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of "
                 f"the reference, at least {noise:.2g}°; "
@@ -133,7 +137,7 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
         if math.isnan(bound):
             continue
         level = _level(artefacts, spans)
-        if min(bound, error) > SILENT * level:
+        if min(bound, error) > MAX_BOUND_OVER_SIGNAL * level:
             sentences.append(
                 f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their "
                 f"inputs is {bound:.2g}°, and the error of "
