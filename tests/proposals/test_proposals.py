@@ -352,7 +352,7 @@ ROLES = {
     "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other", "Querabweichung": "other", "Vx_world": "other",
     "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax", "Drehzahl": "other",
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
-    "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AngRateLateral": "pitch_rate", "AccelRight": "ay",
+    "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
     "VelDown": "other",
 }  # fmt: skip
 
