@@ -25,15 +25,18 @@ COUNTER = re.compile(
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 STATED_UNITS = {**UNITS, "cs": 0.01, "min": 60.0, "h": 3600.0}  # the last where a header says so
+SPELLINGS_OF = {
+    "s": "s sec secs second seconds sekunden",
+    "ms": "ms msec millis milliseconds",
+    "us": "us µs μs usec micros microseconds",
+    "ns": "ns nsec nanos nanoseconds",
+    "d": "d day days",
+    "cs": "cs 1/100s centiseconds hundredths",
+    "min": "min mins minute minutes",
+    "h": "h hr hrs hour hours stunden",
+}
 SPELLINGS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
-    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
-    **dict.fromkeys(("d", "day", "days"), "d"),
-    **dict.fromkeys(("cs", "1/100 s", "centiseconds", "hundredths"), "cs"),
-    **dict.fromkeys(("min", "mins", "minute", "minutes"), "min"),
-    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours", "stunden"), "h"),
+    spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
@@ -69,7 +72,7 @@ def find_clock(
     step = 0.0
     repaired = {}
     for name, raw in columns.items():
-        written = units.get(name, "").strip().lower()
+        written = units.get(name, "").replace(" ", "").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
