@@ -126,7 +126,7 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     sorted_steps = np.diff(ordered)
     relative_steps = sorted_steps / max(float(np.median(sorted_steps)), 1e-300)
     is_even = np.mean(np.abs(relative_steps - 1.0) < 0.5) >= GROWING
-    is_apart = relative_steps.min() > 0.5
+    is_apart = relative_steps.min() > 0.5 and not span_fault(ordered)  # no stray stamp
     is_near = np.abs(rows - np.arange(len(rows))).max() <= FARTHEST_ROW
     repeats_no_more = (sorted_steps == 0).sum() <= (steps == 0).sum()
     is_out_of_order = is_even and (is_apart or (is_near and repeats_no_more))
