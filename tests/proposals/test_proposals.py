@@ -208,6 +208,14 @@ def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_th
     )
 
 
+@pytest.mark.parametrize("log", ["dlc1", "ramp_steer"])
+def test_no_wheelbase_is_stated_where_the_halves_of_the_drive_contradict_each_other(data_root, log):
+    """A Golf of 2.578 m in a lane change and a ramp steer, which regressions made 0.6 m."""
+    file = data_root / "liu_golf" / f"{log}.csv"
+    steer = inspect("my_car", [file]).proposals.by_channel["steer"]
+    assert not any("wheelbase" in text for text in steer.evidence)
+
+
 def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path):
     d = drive(300.0)
     made = drafted(
@@ -352,7 +360,7 @@ ROLES = {
     "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other", "Querabweichung": "other", "Vx_world": "other",
     "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax", "Drehzahl": "other",
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
-    "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AngRateLateral": "pitch_rate", "AccelRight": "ay",
+    "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
     "VelDown": "other",
 }  # fmt: skip
 

@@ -124,7 +124,7 @@ def test_what_is_not_there_is_left_out(drive):
     plain = replace(estimate, channels={name: estimate[name] for name in ("vy", "sideslip")})
     assert labels(drive_figure(None, [plain])) == ["sideslip β [deg]", "v [m/s]"]
     alone = drive.select(["vy_ref"])
-    assert "there is nothing to draw" in refusal(alone.plot, DataError)
+    assert "there is nothing to draw" in refusal(lambda: drive_figure(alone), DataError)
 
 
 def test_a_range_is_drawn_alone_and_one_without_samples_is_refused(drive):

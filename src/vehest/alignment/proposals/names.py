@@ -33,7 +33,7 @@ _STRONG = {  # over the name without blanks
     "vx": r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
     r"velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
-    "pitch_rate": r"pitchrate|nickrate|ang(ular)?ratelateral|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
+    "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",

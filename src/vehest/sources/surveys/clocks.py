@@ -25,15 +25,18 @@ COUNTER = re.compile(
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 STATED_UNITS = {**UNITS, "cs": 0.01, "min": 60.0, "h": 3600.0}  # the last where a header says so
+SPELLINGS_OF = {
+    "s": "s sec secs second seconds sekunden",
+    "ms": "ms msec millis milliseconds",
+    "us": "us µs μs usec micros microseconds",
+    "ns": "ns nsec nanos nanoseconds",
+    "d": "d day days",
+    "cs": "cs 1/100s centiseconds hundredths",
+    "min": "min mins minute minutes",
+    "h": "h hr hrs hour hours stunden",
+}
 SPELLINGS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
-    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
-    **dict.fromkeys(("d", "day", "days"), "d"),
-    **dict.fromkeys(("cs", "1/100 s", "centiseconds", "hundredths"), "cs"),
-    **dict.fromkeys(("min", "mins", "minute", "minutes"), "min"),
-    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours", "stunden"), "h"),
+    spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
@@ -69,7 +72,7 @@ def find_clock(
     step = 0.0
     repaired = {}
     for name, raw in columns.items():
-        written = units.get(name, "").strip().lower()
+        written = units.get(name, "").replace(" ", "").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
@@ -123,7 +126,7 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     sorted_steps = np.diff(ordered)
     relative_steps = sorted_steps / max(float(np.median(sorted_steps)), 1e-300)
     is_even = np.mean(np.abs(relative_steps - 1.0) < 0.5) >= GROWING
-    is_apart = relative_steps.min() > 0.5
+    is_apart = relative_steps.min() > 0.5 and not span_fault(ordered)  # no stray stamp
     is_near = np.abs(rows - np.arange(len(rows))).max() <= FARTHEST_ROW
     repeats_no_more = (sorted_steps == 0).sum() <= (steps == 0).sum()
     is_out_of_order = is_even and (is_apart or (is_near and repeats_no_more))
