@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from make_unseen_car import PLAIN, RATE, TARGET, TURN_YAW_RATE, WARM_UP, table
+from make_unseen_car import MARGIN, PLAIN, RATE, TARGET, TURN_YAW_RATE, WARM_UP, table
 from numpy.typing import NDArray
 from scipy.stats import beta
 from unseen_car_record import PRODUCTION, Profile, a_car, angle_of, driven, root
@@ -38,7 +38,6 @@ CITY_DRIVES = 200
 LIMIT_DRIVES = 100
 MIN_SPEED = 3.0  # m/s, below which nothing is scored
 MIN_TURNING = 10  # samples of a drive whose coverage while turning counts
-MARGIN = 0.1  # deg, by which a drive may be worse than v = 0
 MAX_SIDESLIP = math.radians(
     25.0
 )  # of a drive at the limit; drawn anew beyond it, where the car spins
