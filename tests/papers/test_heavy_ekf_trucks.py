@@ -112,7 +112,7 @@ def test_noise_levels_are_tuned_on_trucks_that_are_not_tested(trucks):
 
 def test_rear_slip_and_gain_of_a_lap():
     recording = lap("x", 0, 120.0)
-    assert drawn.rear_slip(recording) == pytest.approx(5.0, rel=0.1)
+    assert drawn.rear_slip([recording]) == pytest.approx(5.0, rel=0.1)
     assert drawn.bend_gain(recording, 0.7 * recording["sideslip_ref"]) == pytest.approx(0.7)
 
 

@@ -51,7 +51,7 @@ TUNING_CAPTION = (
 )
 OVERVIEW_CAPTION = (
     "RMSE(β) [deg]; trucks and laps SIMULATED, Ferrari REAL. Trucks: noise levels tuned on all "
-    "conditions; rear slip: 99th percentile of a lap, of trucks their median."
+    "conditions; rear slip: 99th percentile over all laps."
 )
 
 

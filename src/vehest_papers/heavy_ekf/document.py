@@ -98,8 +98,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *(block_errors.wheel_rows(WHEELED, parts[WHEELED]) if WHEELED in parts else []),
     ]
     trained = block_errors.training_rows()
-    slips = {test: rear_slip(drive) for test, drive in drives.items()}
-    slips |= {name: _all_laps(of_trucks) for name, of_trucks in trucks.slips.items()}
+    slips = {test: rear_slip([drive]) for test, drive in drives.items()} | trucks.pooled_slips
     orders, tuning, by_condition = conditions.orders_tables(content, rows, trained)
     kinds = dict(content.parts) | {name: words_of_kinds(part) for name, part in parts.items()}
     claims = claims_table(content, rows, trained, kinds)
@@ -224,29 +223,21 @@ def _values(
         low, high = fixed(row["low"], 2), fixed(row["high"], 2)
         return f"{fixed(row['ratio'], 2)} [{low}, {high}]"
 
-    slips = np.concatenate(list(trucks.slips.values()))
     not_different = by_condition[by_condition["outcome"] == "n.s."]
     return {
         "recommendation": recommendation,
         "ratio": ratio,
-        "min_slip": fixed(float(slips.min()), 1),
-        "median_slip": fixed(float(np.median(slips)), 1),
-        "max_slip": fixed(float(slips.max()), 1),
+        "min_slip": fixed(min(trucks.pooled_slips.values()), 1),
+        "max_slip": fixed(max(trucks.pooled_slips.values()), 1),
         "n_not_different": len(not_different),
         "n_with_power": int((not_different["power"] >= 0.8).sum()),
         "n_orders": len(by_condition),
-        "tunings": TUNINGS,
         "all": TUNINGS[TUNED_ON_ALL],
         "matched": TUNINGS[MATCHED],
         "unmatched": TUNINGS[UNMATCHED],
         "absent_parts": methods.absent_parts(artefacts),
         "command": as_code(artefacts.command),
     }
-
-
-def _all_laps(slips: np.ndarray) -> float:
-    """Median of the trucks' 99th percentiles [deg]."""
-    return float(np.median(slips))
 
 
 def _noise_levels(trucks: DrawnTrucks, twin: Factorial) -> pd.DataFrame:

@@ -70,12 +70,15 @@ class DrawnTrucks:
         Errors by truck.
     slips : mapping
         Condition -> 99th percentile of the rear slip of each truck [deg].
+    pooled_slips : mapping
+        The same of the laps of all trucks.
     """
 
     fit: TyreFit
     tuned: Mapping[str, Mapping[str, Mapping[str, Tuned]]]
     rows: list[BlockRow] = field(default_factory=list)
     slips: dict[str, FloatArray] = field(default_factory=dict)
+    pooled_slips: dict[str, float] = field(default_factory=dict)
 
 
 def drawn_trucks(part: PartArtefacts) -> DrawnTrucks:
@@ -107,7 +110,8 @@ def drawn_trucks(part: PartArtefacts) -> DrawnTrucks:
     of_baselines = baselines(part.reference_ranges(tuning_spans))
     for condition in CONDITIONS:
         laps = _laps_of(part, condition, curves)
-        outcome.slips[condition] = np.array([rear_slip(drive) for drive in laps.recordings])
+        outcome.slips[condition] = np.array([rear_slip([drive]) for drive in laps.recordings])
+        outcome.pooled_slips[condition] = rear_slip(laps.recordings)
         fixed = {
             name: [estimate(each) for each in laps.measured]
             for name, estimate in of_baselines.items()
@@ -131,7 +135,7 @@ def _condition_of(span: Span) -> str:
 
 def _laps_of(part: PartArtefacts, condition: str, curves: FloatArray) -> Laps:
     spans = part.split.tests[condition]
-    recordings = [part.reference(span) for span in spans]
+    recordings = part.reference_ranges(spans)
     trucks = [f"truck {int(span.recording.rsplit('_', 1)[1])}" for span in spans]
     return Laps(trucks, recordings, [measured_drive(each, curves) for each in recordings])
 
@@ -194,10 +198,13 @@ def _rows_of_road(rows: Sequence[BlockRow], road: str) -> list[BlockRow]:
     ]
 
 
-def rear_slip(drive: Recording) -> float:
-    """99th percentile of the size of the rear axle's slip angle [deg]."""
-    lateral = drive["vy_ref"] - float(TRUCK.cg_to_rear_axle) * drive["yaw_rate"]
-    return float(np.quantile(np.abs(np.degrees(np.arctan2(lateral, drive["vx"]))), 0.99))
+def rear_slip(drives: Sequence[Recording]) -> float:
+    """99th percentile of the size of the rear axle's slip angle over all drives [deg]."""
+    rear_arm = float(TRUCK.cg_to_rear_axle)
+    slips = [
+        np.arctan2(drive["vy_ref"] - rear_arm * drive["yaw_rate"], drive["vx"]) for drive in drives
+    ]
+    return float(np.quantile(np.abs(np.degrees(np.concatenate(slips))), 0.99))
 
 
 def bend_gain(drive: Recording, sideslip: FloatArray) -> float:

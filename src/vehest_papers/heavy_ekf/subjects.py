@@ -72,13 +72,11 @@ def filters_of(part: PartArtefacts) -> dict[str, Filter]:
 
 def titles_of(part: PartArtefacts) -> dict[Name, str]:
     """Estimator and variant -> what it is called in this report, for all models of a part."""
-    names = {(model.estimator, model.variant) for model in part.models}
-    return {
-        name: paper.VARIANTS[name[1]]
-        if name[0] == FAMILY
-        else BASELINE_TITLES.get(name[0], ": ".join(name))
-        for name in names
-    }
+    titles = {}
+    for model in part.models:
+        other = BASELINE_TITLES.get(model.estimator, ": ".join(model.name))
+        titles[model.name] = paper.VARIANTS.get(model.variant, other)
+    return titles
 
 
 def whole_drive(part: PartArtefacts, test: str) -> Recording:
