@@ -239,7 +239,9 @@ def _overview(main: ManoeuvreErrors, kind: str) -> Table:
 
 def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
     """What the hybrids' networks do, the factorial, the floor ε, bands, wrong tyres, and the limited set."""
-    main, prepared, kind = subjects.main, subjects.full, subjects.kind
+    main = subjects.main
+    prepared = subjects.full
+    kind = subjects.kind
     hybrids = {
         name: seeds
         for name, seeds in subjects.runs.items()
@@ -288,7 +290,8 @@ def _filters(subjects: Subjects) -> list[str]:
 
 def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
     """Table III and Figures 11 to 13."""
-    part, prepared = subjects.artefacts.parts[LIMITED], subjects.prepared[LIMITED]
+    part = subjects.artefacts.parts[LIMITED]
+    prepared = subjects.prepared[LIMITED]
     runs = {
         name: seeds
         for name, seeds in learnt.comparison.runs.items()
@@ -319,7 +322,9 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
 
 def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
     """Figures 4 to 10 of the paper."""
-    artefacts, prepared, kind = subjects.artefacts, subjects.full, subjects.kind
+    artefacts = subjects.artefacts
+    prepared = subjects.full
+    kind = subjects.kind
     part = artefacts.parts[FULL]
     warm_up = part.protocol.warm_up_seconds
     title = artefacts.titles[FULL].lower()
@@ -351,7 +356,9 @@ def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
 
 def _files(outcome: Outcome, subjects: Subjects) -> None:
     """Loss curves, and tables on filters and budgets."""
-    artefacts, parts, kind = subjects.artefacts, subjects.parts, subjects.kind
+    artefacts = subjects.artefacts
+    parts = subjects.parts
+    kind = subjects.kind
     titled = {name: (artefacts.titles[name], runs) for name, runs in parts.items()}
     models: dict[str, Sequence[EvaluatedModel]] = {
         name: [run.model for run in seeds]
@@ -378,7 +385,8 @@ def _values(
     subjects: Subjects, content: Paper, trained: Sequence[TrainingRow], files: Sequence[str]
 ) -> dict[str, object]:
     """Numbers and names that the template has places for."""
-    main, artefacts = subjects.main, subjects.artefacts
+    main = subjects.main
+    artefacts = subjects.artefacts
     estimators = tuple(
         model.estimator for part in artefacts.parts.values() for model in part.models
     )
