@@ -243,7 +243,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict
         "ablation",
         "floor",
         "calibration",
-        "decided_claims",
+        "verdicts",
         "table_3",
         "overview",
     }
@@ -289,7 +289,7 @@ def test_factorial_has_a_ratio_for_each_effect_with_cells_and_names_what_is_not_
     assert floors.loc[(paper.DEEP, "1e-8"), "correlation"] == pytest.approx(
         floors.loc[(paper.DEEP, "1e-6"), "correlation"]
     )
-    assert floors.loc[(paper.CNN, "1e-7"), "mse"] == "not trained yet"
+    assert floors.loc[(paper.CNN, "1e-7"), "mse_nonlinear"] == "not trained yet"
 
 
 def test_effects_are_geometric_means_over_manoeuvres_and_cells():

@@ -146,7 +146,7 @@ def measured_rows(
                 own, outputs[paper.DEEP]
             )
         by_claim |= {(claim, paper.CNN): values for claim, values in of_network.items()}
-    conditions = [ManoeuvreErrors(runs) for runs in perturbed.stiffness]
+    conditions = [ManoeuvreErrors(runs) for runs in perturbed.stiffness if runs]
     trained = perturbed.stiffness[NOMINAL]
     for claim, candidate, other in (
         ("de_ukf_less_sensitive_to_stiffness_than_model", paper.DEEP, paper.MODEL),

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import MISSING, fixed
@@ -48,13 +49,8 @@ from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import (
-    CLAIMS,
-    claims_table,
-    decided_claims,
-    figure_in_words,
-    one_line,
-)
+from vehest_papers.kit.verdict_table import CLAIMS, claims_table, figure_in_words, one_line
+from vehest_papers.kit.verdicts import VERDICTS
 
 NAME = "cnn_ukf"  # of the paper's package
 TEMPLATE = Path(__file__).with_name("report.md.j2")
@@ -96,6 +92,7 @@ class Subjects:
     parts: Mapping[str, Runs]  # by part
     runs: Runs  # of all parts on the full set, by unique names
     main: ManoeuvreErrors  # of `runs`
+    within: Runs  # candidates of part ``full``, each drive until |β| first exceeds 12°
     kind: str  # of the data
 
     @property
@@ -150,21 +147,24 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def _verdicts(claims: Table) -> Table:
-    """Claims that the study decides, with their verdicts alone."""
-    decided = decided_claims(claims)
-    columns = {name: decided.columns[name] for name in ("claim", "verdict")}
-    caption = f"The {len(decided.frame)} claims that this study decides, of {len(claims.frame)}."
-    return Table(decided.name, caption, decided.frame[list(columns)], columns)
+    """How many of the paper's claims, and of those added here, have which verdict."""
+    counts = claims.frame["verdict"].value_counts()
+    rows = [{"verdict": name, "claims": counts[name]} for name in VERDICTS if name in counts]
+    columns = {"verdict": Column("verdict"), "claims": Column("claims", decimals=0)}
+    return Table("verdicts", "Claims by verdict.", pd.DataFrame(rows), columns)
 
 
 def _subjects(artefacts: StudyArtefacts) -> Subjects:
-    prepared = {name: Prepared(part) for name, part in artefacts.parts.items()}
+    read: dict[Path, Recording] = {}
+    prepared = {name: Prepared(part, read=read) for name, part in artefacts.parts.items()}
     parts = {name: runs_of(part, prepared[name]) for name, part in artefacts.parts.items()}
     runs = _together(parts)
     runs |= oracles(runs, prepared[FULL])
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
-    return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), kind)
+    full = artefacts.parts[FULL]
+    within = runs_of(full, Prepared(full, until_sideslip=LARGEST_SIDESLIP, read=read))
+    return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), within, kind)
 
 
 def _place(candidate: str) -> int:
@@ -194,47 +194,46 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
     }
     caption = f"Table II: ours with 95 % intervals (paper's in brackets). Data: {subjects.kind}."
     outcome.blocks += [
-        tables.accuracy(ManoeuvreErrors(in_table), paper.TABLE_II, training, "table_2", caption),
+        tables.accuracy(
+            ManoeuvreErrors(in_table),
+            paper.TABLE_II,
+            training,
+            "table_2",
+            caption,
+            tuple(tables.KPIS),
+        ),
         tables.by_car(main, list(subjects.among((*SHOWN, paper.RECURRENT))), subjects.kind),
-        _overview(main, subjects.kind),
+        _overview(subjects),
     ]
-    outcome.add_files(
-        tables.accuracy(
-            ManoeuvreErrors(subjects.among(ALONE)), {}, training, "networks_alone", "Networks alone"
-        ),
-        tables.accuracy(
-            ManoeuvreErrors(subjects.among((*tables.ORACLES, paper.CNN))), {}, {}, "oracles", ""
-        ),
-    )
-    outcome.data["within_12_deg"] = kpi_table(_within_range(subjects))
+    for name, candidates in (("networks_alone", ALONE), ("oracles", tables.ORACLES)):
+        if among := subjects.among(candidates):
+            outcome.add_files(tables.accuracy(ManoeuvreErrors(among), {}, training, name, ""))
+    outcome.data["within_12_deg"] = kpi_table(subjects.within)
 
 
-def _within_range(subjects: Subjects) -> Runs:
-    """Candidates of the full set, each drive until |β| first exceeds 12°."""
-    part = subjects.artefacts.parts[FULL]
-    return runs_of(part, Prepared(part, until_sideslip=LARGEST_SIDESLIP))
-
-
-def _overview(main: ManoeuvreErrors, kind: str) -> Table:
-    """What the terminal shows: both errors beside the paper's."""
-    rows: list[dict[str, object]] = []
-    for candidate in (*SHOWN, paper.RECURRENT, paper.STATIC_MAP, paper.ZERO):
-        if candidate not in main:
-            continue
-        published = paper.TABLE_II.get(candidate)
-        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(main.runs[candidate])}
-        for kpi in (MSE, MSE_NL):
-            row[f"paper_{kpi}"] = getattr(published, kpi) if published else np.nan
-            row[f"ours_{kpi}"] = main.figure(candidate, kpi).value
-        rows.append(row)
-    columns = {"candidate": Column("method")}
-    for kpi, header in ((MSE, "MSE"), (MSE_NL, "MSE_nl")):
-        columns |= {
-            f"paper_{kpi}": Column(f"{header}, paper [deg²]", decimals=3),
-            f"ours_{kpi}": Column(f"{header}, ours", decimals=3),
+def _overview(subjects: Subjects) -> Table:
+    """Errors of what is trained, which the first screen and the terminal show."""
+    within = ManoeuvreErrors(subjects.within)
+    rows = [
+        {
+            "candidate": name,
+            "mse": subjects.main.text(name, MSE),
+            "mse_nl": subjects.main.text(name, MSE_NL),
+            "within": within.text(name, MSE) if name in within else MISSING,
+            "n_seeds": len(subjects.runs[name]),
         }
-    columns["n_seeds"] = Column("seeds", decimals=0)
-    return Table("overview", f"Summary. Data: {kind}.", pd.DataFrame(rows), columns)
+        for name in SHOWN_FIRST
+        if name in subjects.runs
+    ]
+    columns = {
+        "candidate": Column("method"),
+        "mse": Column("MSE"),
+        "mse_nl": Column("MSE_nl"),
+        "within": Column("MSE up to 12°"),
+        "n_seeds": Column("seeds", decimals=0),
+    }
+    caption = f"Errors [deg²] with 95 % intervals. Data: {subjects.kind}."
+    return Table("overview", caption, pd.DataFrame(rows, columns=list(columns)), columns)
 
 
 def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
@@ -390,24 +389,11 @@ def _values(
     estimators = tuple(
         model.estimator for part in artefacts.parts.values() for model in part.models
     )
-    within = ManoeuvreErrors(_within_range(subjects))
-    rows = [
-        {
-            "name": name,
-            "mse": main.text(name, MSE),
-            "mse_nl": main.text(name, MSE_NL),
-            "within": within.text(name, MSE) if name in within else MISSING,
-            "seeds": len(main.runs[name]),
-        }
-        for name in SHOWN_FIRST
-        if name in main
-    ]
     return {
         "recommendation": one_line(content.recommendation),
         "kind": subjects.kind,
         "manoeuvres": len(main.manoeuvres),
         "beyond": _number_beyond(main, LARGEST_SIDESLIP),
-        "main_rows": rows,
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),

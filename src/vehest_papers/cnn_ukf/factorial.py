@@ -13,7 +13,7 @@ from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.significance import mean_contrast
 from vehest.report.document import Column, Table
 from vehest_papers.cnn_ukf import measures, paper
-from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
+from vehest_papers.cnn_ukf.indicators import MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.subjects import name_in
 from vehest_papers.kit.verdict_table import figure_in_words
@@ -69,10 +69,7 @@ def effects_table(comparison: ManoeuvreErrors, data: str) -> Table:
         "ratio": Column("ratio of MSE_nl"),
         "cells": Column("pairs of cells", decimals=0),
     }
-    caption = (
-        "Effects of the factorial: geometric means over manoeuvres and over the levels of the other factors, 95 % intervals over "
-        f"manoeuvres; below 1 the first is better. Data: {data}."
-    )
+    caption = f"Effects: geometric means over manoeuvres and the other factors, 95 % intervals. Data: {data}."
     return Table("effects", caption, pd.DataFrame(rows), columns)
 
 
@@ -132,24 +129,20 @@ def floor_table(
             candidate = _candidate_at(hybrid, floor)
             row = {"candidate": hybrid, "floor": floor}
             if candidate not in outputs:
-                rows.append({**row, "mse": NOT_TRAINED})
+                rows.append({**row, MSE_NL: NOT_TRAINED})
                 continue
             distrust = active.set_index("candidate").loc[candidate, "distrust"]
             correlation = float(measures.distrust_correlations(outputs[candidate]).mean())
-            errors = {name: comparison.text(candidate, name) for name in (MSE, MSE_NL)}
-            rows.append({**row, **errors, "distrust": distrust, "correlation": correlation})
+            error = comparison.text(candidate, MSE_NL)
+            rows.append({**row, MSE_NL: error, "distrust": distrust, "correlation": correlation})
     columns = {
         "candidate": Column("method"),
         "floor": Column("ε [rad²]"),
-        MSE: Column("MSE [deg²]"),
         MSE_NL: Column("MSE_nl [deg²]"),
         "distrust": Column("σ_DD, 5 / 50 / 95 % [deg]"),
         "correlation": Column("rank correlation with the error", decimals=2),
     }
-    caption = (
-        "Floor ε of the variance of the network's angle: 1e-6 rad² is 0.057°, 1e-7 is 0.018°, 1e-8 is 0.006°. CNN-UKF with 60 epochs "
-        f"through the filter. Data: {data}."
-    )
+    caption = f"Floor ε of the variance; CNN-UKF with 60 epochs through the filter. Data: {data}."
     frame = pd.DataFrame(rows, columns=list(columns))
     return Table("floor", caption, frame, columns)
 

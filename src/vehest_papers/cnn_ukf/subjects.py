@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -213,12 +214,20 @@ class Prepared:
     ----------
     until_sideslip
         Each drive is scored until |β| first exceeds this angle [rad]; by default whole.
+    read
+        Prepared recordings by file, shared by parts that have the same.
     """
 
-    def __init__(self, part: PartArtefacts, *, until_sideslip: float = np.inf) -> None:
+    def __init__(
+        self,
+        part: PartArtefacts,
+        *,
+        until_sideslip: float = np.inf,
+        read: dict[Path, Recording] | None = None,
+    ) -> None:
         self._part = part
         self._until_sideslip = until_sideslip
-        self._read: dict[tuple[str, str], Recording] = {}
+        self._read = {} if read is None else read
 
     def spans(self, test: str) -> Sequence[Span]:
         """Ranges of a test set, or of the validation."""
@@ -226,13 +235,13 @@ class Prepared:
 
     def recording(self, dataset: str, recording: str) -> Recording:
         """All of a recording."""
-        key = dataset, recording
-        if key not in self._read:
-            prepared = read_recording(self._part.references[key])
+        path = self._part.references[dataset, recording]
+        if path not in self._read:
+            prepared = read_recording(path)
             for transform in OFFLINE:
                 prepared = transform(prepared)
-            self._read[key] = prepared
-        return self._read[key]
+            self._read[path] = prepared
+        return self._read[path]
 
     def seen(self, test: str) -> list[Recording]:
         """What an estimator saw of each range of a test set, if it was prepared offline: with its warm-up, without references."""

@@ -17,7 +17,7 @@ from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.block_errors import network_squares
-from vehest_papers.cnn_ukf.indicators import MSE_NL, ManoeuvreErrors
+from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.manoeuvres import CARS, car_of
 from vehest_papers.cnn_ukf.measures import LATERAL_VELOCITY, YAW_RATE
 from vehest_papers.cnn_ukf.networks import Outputs
@@ -58,8 +58,12 @@ def accuracy(
     training: Mapping[str, float],
     name: str,
     caption: str,
+    shown: Sequence[str] = (MSE, MSE_NL),
 ) -> Table:
-    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training [deg]."""
+    """Table II or III: our figures with their intervals, the paper's in brackets.
+
+    The CSV file has all indicators, and errors of validation and of training [deg].
+    """
     rows = []
     for candidate, own in comparison.runs.items():
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}
@@ -78,13 +82,7 @@ def accuracy(
         )
         row["training"] = fixed(training[candidate], 3) if candidate in training else MISSING
         rows.append(row)
-    columns = {"candidate": Column("method")} | {
-        kpi: Column(header) for kpi, header in KPIS.items()
-    }
-    columns |= {
-        "validation": Column("RMSE, validation [deg]"),
-        "training": Column("training [deg]"),
-    }
+    columns = {"candidate": Column("method")} | {kpi: Column(KPIS[kpi]) for kpi in shown}
     columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
@@ -146,15 +144,10 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, data: str) -> Ta
         "mse_nonlinear": Column("MSE_nl [deg²]"),
         "ratio_mse_nonlinear": Column("MSE_nl, CNN-UKF over it"),
         "shift_range": Column("β for 1° of β_DD [deg]"),
-        "distrust": Column("σ_DD [deg]"),
-        "process_vy": Column("σ_Vy [m/s]"),
-        "process_yaw_rate": Column("σ_ψ̇ [rad/s]"),
+        "distrust": Column("σ_DD, 5 / 50 / 95 % [deg]"),
         "n_seeds": Column("seeds", decimals=0),
     }
-    caption = (
-        "Hybrids, and CNN-UKF with one element removed: errors, range of the shift of β for 1° of β_DD, and deviations at 5, 50 and 95 % "
-        f"of the test samples. Data: {data}."
-    )
+    caption = f"Hybrids, and CNN-UKF with one element removed. Data: {data}."
     return Table("ablation", caption, pd.DataFrame(rows), columns)
 
 
