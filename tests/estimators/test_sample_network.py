@@ -218,7 +218,7 @@ def test_inputs_are_scaled_by_their_range_or_to_z_scores():
 
 
 def test_a_network_reports_its_limited_squares():
-    limit = 1.0  # deg
+    limit = 0.5  # deg
     estimator, record = fitted(replace(QUICK, loss_limit=limit))
     drive = DATA.validation[0]
     estimate = estimator.estimate([drive.without_references()])[0]

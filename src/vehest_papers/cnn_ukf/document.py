@@ -31,6 +31,7 @@ from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
+    KPIS,
     LARGEST_SIDESLIP,
     TEST,
     Prepared,
@@ -200,7 +201,7 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
             training,
             "table_2",
             caption,
-            tuple(tables.KPIS),
+            tuple(KPIS),
         ),
         tables.by_car(main, list(subjects.among((*SHOWN, paper.RECURRENT))), subjects.kind),
         _overview(subjects),

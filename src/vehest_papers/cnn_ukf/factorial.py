@@ -127,11 +127,11 @@ def floor_table(
     for hybrid in paper.HYBRIDS:
         for floor in FLOORS:
             candidate = _candidate_at(hybrid, floor)
-            row = {"candidate": hybrid, "floor": floor}
+            row: dict[str, object] = {"candidate": hybrid, "floor": floor}
             if candidate not in outputs:
                 rows.append({**row, MSE_NL: NOT_TRAINED})
                 continue
-            distrust = active.set_index("candidate").loc[candidate, "distrust"]
+            distrust = str(active.set_index("candidate").loc[candidate, "distrust"])
             correlation = float(measures.distrust_correlations(outputs[candidate]).mean())
             error = comparison.text(candidate, MSE_NL)
             rows.append({**row, MSE_NL: error, "distrust": distrust, "correlation": correlation})
