@@ -145,7 +145,7 @@ learned_ukf_quick: $(INSTALLED) ## NNTF_UH, PC and GRU trained anew, one seed ea
 heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
-cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: at most 5 h on two cores, goes on where it was stopped
+cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: about 15 h on one core if nothing is published, goes on where it was stopped
 	$(BIN)/vehest run pipelines/cnn_ukf.yaml
 
 scorecard: $(INSTALLED) ## four papers, published and ours, from committed claims and errors by block: results/scorecard.md (seconds)
