@@ -93,17 +93,6 @@ def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(t
     )
 
 
-def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimate(tmp_path):
-    own = scheme(tmp_path)
-    errors = SegmentErrors(behaviour.after_start(own, paper.LINEAR, "c2"))
-    drive = planar_drive(SECONDS, seed=1)
-    estimate = ksnn_with_weights(n_local=2).estimate([drive.without_references()])[0]["vy"]
-    ends = np.arange(max(behaviour.WINDOWS), len(drive), behaviour.STRIDE)
-    error = (estimate - drive["vy_ref"])[ends]
-    assert errors.value("30", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=1e-9)
-    assert errors.value("5", "rmse_vy") != errors.value("30", "rmse_vy")
-
-
 def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp_path):
     own = scheme(tmp_path)
     segments, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import PATENT_NOTE, REPORT, Column, Document, Table, as_text
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_text
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
@@ -30,8 +31,10 @@ from vehest_papers.ksnn.behaviour import Behaviour
 from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
 from vehest_papers.ksnn.pairs import (
     ORDER,
+    PART,
     TRAININGS,
     detectable_ratio,
+    errors_figure,
     errors_table,
     geometric_mean,
     log_fvu,
@@ -41,7 +44,7 @@ from vehest_papers.ksnn.pairs import (
     pair_rows,
     ratios_table,
 )
-from vehest_papers.ksnn.schemes import Scheme, with_common_blocks
+from vehest_papers.ksnn.schemes import THIRD, Scheme, with_common_blocks
 from vehest_papers.ksnn.sub_models import shares_of_parts, shares_table
 
 NAME = "ksnn"  # of the paper's package
@@ -83,20 +86,20 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     trained = block_errors.training_rows(content, artefacts.parts, schemes)
     kinds = kinds_of(artefacts)
     claims = claims_table(content, rows, trained, kinds)
-    shares = pd.concat(
-        [
-            shares_of_parts(pair_parts(artefacts.parts), "own", "pairs, SIMULATED"),
-            *(
-                shares_of_parts({name: artefacts.parts[name]}, "test", "Ferrari, REAL")
-                for name in ("ferrari_drive",)
-                if name in artefacts.parts
-            ),
-        ]
-    )
-    tables = [pair_claims(claims)]
+    shares = shares_of(artefacts)
+    overviews = [errors_table(errors, "raw")] if len(errors) else []
+    overviews += [schemes_table(schemes)]
+    tables: list[Block] = [
+        replace(overviews[0], name="overview"),
+        *overviews[1:],
+    ]
     if len(errors):
-        tables += [errors_table(errors, measure) for measure in ("raw", "best_gain")]
-        tables += [ratios_table(errors)]
+        tables += [
+            pair_claims(claims),
+            errors_table(errors, "best_gain"),
+            ratios_table(errors),
+            errors_figure(errors),
+        ]
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)
@@ -152,10 +155,9 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
 def pair_claims(claims: Table) -> Table:
     """The claims that pairs of cars decide."""
     chosen = claims.frame[claims.frame["id"].str.endswith("_pairs")]
-    columns = {name: claims.columns[name] for name in ("claim", "published", "ours", "verdict")}
-    return Table(
-        "pair_claims", "Claims over pairs of cars. SIMULATED.", chosen[[*columns]], columns
-    )
+    columns = {name: claims.columns[name] for name in ("claim", "published", "verdict")}
+    caption = "Claims over pairs of cars; the CSV has our values and what decided. SIMULATED."
+    return Table("pair_claims", caption, chosen, columns)
 
 
 def behaviours(schemes: Mapping[str, Scheme]) -> dict[str, Behaviour]:
@@ -172,8 +174,8 @@ def kinds_of(artefacts: StudyArtefacts) -> dict[str, str]:
     """Part in claims.yaml -> real or simulated."""
     kinds = {}
     for name, part in artefacts.parts.items():
-        match = re.fullmatch(r"pair_\d+_(stop|converged)(?:_more)?", name)
-        title = f"pairs_{match[1]}" if match else re.sub(r"_[a-z]$", "", name)
+        match = PART.fullmatch(name)
+        title = f"pairs_{match[2]}" if match else re.sub(r"_[a-z]$", "", name)
         kinds[title] = words_of_kinds(part)
     return kinds
 
@@ -184,8 +186,7 @@ def pairs_values(errors: pd.DataFrame) -> list[dict[str, object]]:
         return []
     first = paper.NONLINEAR
     stop, converged = (log_fvu(errors, training, "other", "raw") for training in TRAININGS)
-    gain = log_fvu(errors, "converged", "other", "best_gain")
-    third = log_fvu(errors, "stop", "third", "raw")
+    third, third_converged = (log_fvu(errors, training, "third", "raw") for training in TRAININGS)
 
     def ratio(table: pd.DataFrame, name: str, over: str) -> str:
         if name not in table or over not in table:
@@ -204,15 +205,27 @@ def pairs_values(errors: pd.DataFrame) -> list[dict[str, object]]:
             "number": errors["pair"].nunique(),
             "seeds": n_seeds(errors, [name for name in (first, paper.GRU) if name in stop]),
             "stop": {key: ratio(stop, first, name) for key, name in over.items()},
-            "converged": {key: ratio(converged, first, name) for key, name in over.items()},
             "third": {key: ratio(third, first, name) for key, name in over.items()},
-            "gain": {key: ratio(gain, first, name) for key, name in over.items()},
+            "converged": ratio(converged, first, "static_map"),
+            "third_converged": ratio(third_converged, first, "static_map"),
             "kinematic": ratio(stop, paper.KINEMATIC_GAIN, first),
             "kinematic_third": ratio(third, paper.KINEMATIC_GAIN, first),
-            "no_bias": ratio(stop, first, paper.NONLINEAR_BIAS),
             "detectable": fixed(max(detectable, default=np.nan), 2),
         }
     ]
+
+
+def shares_of(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """Shares of the sub-models in the KS-NNs of the pairs and of the real Ferrari."""
+    groups = {"pairs": pair_parts(artefacts.parts)}
+    groups |= {name: {name: artefacts.parts[name]} for name in REAL[:1] if name in artefacts.parts}
+    tables = []
+    for name, parts in groups.items():
+        for part_name, part in parts.items():
+            test = "own" if name == "pairs" else next(iter(part.split.tests))
+            data = f"{name}, {words_of_kinds(part).upper()}"
+            tables.append(shares_of_parts({part_name: part}, test, data))
+    return pd.concat(tables) if tables else pd.DataFrame()
 
 
 def incomplete(artefacts: StudyArtefacts) -> list[dict[str, object]]:
@@ -263,6 +276,31 @@ def velocity_ratios(artefacts: StudyArtefacts) -> Table | None:
     return Table("velocity_ratios", caption, pd.DataFrame(rows), columns)
 
 
+def schemes_table(schemes: Mapping[str, Scheme]) -> Table:
+    """FVU on the other car of the structure that validation chooses of each kind: table ``schemes``.
+
+    Its CSV file has the training car and a third car too.
+    """
+    rows: dict[str, dict[str, str]] = {}
+    columns = {"candidate": Column("candidate")}
+    for name in (*SCHEMES, "one_vehicle_1", "one_vehicle"):
+        scheme = schemes.get(name)
+        if scheme is None:
+            continue
+        columns[f"{name}_other"] = Column(scheme.title)
+        tests = {"other": scheme.other, "own": scheme.own, "third": THIRD}
+        for candidate in ORDER:
+            key = scheme.key_of(candidate)
+            for title, test in tests.items():
+                if test in scheme.part.split.tests and key in scheme.errors(test):
+                    row = rows.setdefault(candidate, {"candidate": candidate})
+                    row[f"{name}_{title}"] = scheme.errors(test).in_words(key, "fvu")
+    order = sorted(rows, key=ORDER.index)
+    table = pd.DataFrame([rows[name] for name in order]).fillna(MISSING)
+    caption = "FVU on the other car with 95 % intervals over blocks and seeds."
+    return Table("schemes", caption, table, columns if len(table) else {})
+
+
 def windows_table(artefacts: StudyArtefacts) -> Table | None:
     """FVU of networks trained on windows of 15, 30 and 60 samples, on the samples that all estimate."""
     schemes = {name: scheme_of(artefacts, name) for name in artefacts.parts if name in SCHEMES}
@@ -290,7 +328,9 @@ def windows_table(artefacts: StudyArtefacts) -> Table | None:
         name: Column(f"{name.split('_')[0]} car, N = {name.split('_')[1]}", decimals=3)
         for name in table.columns[2:]
     }
-    caption = "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds. SIMULATED."
+    caption = (
+        "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds."
+    )
     return Table("windows", caption, table, columns)
 
 
@@ -311,5 +351,5 @@ def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
         return None
     columns = {"trained": Column("comparison"), "test": Column("test")}
     columns |= {name: Column(name) for name in ORDER}
-    caption = "FVU on real cars (DevBot: simulated), 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
+    caption = "FVU, 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
     return Table("real_cars", caption, pd.DataFrame(rows), columns)

@@ -258,7 +258,9 @@ def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     """Operations of a step over the smaller number of GRU and LSTM, of the structures that validation chooses in scheme 1."""
-    scheme = parts["scheme_1"]
+    scheme = parts.get("scheme_1")
+    if scheme is None:
+        return None
     counted = {
         category: cost.operations(str(run["estimator"]), str(run["variant"]))
         for category, run in scheme.chosen.items()
@@ -273,7 +275,9 @@ def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 def regularisation_loss_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     """FVU without over FVU with validation on the other car, of the candidate over that of the other candidate."""
-    without, regularised = parts[claim.part], parts["scheme_2"]
+    without, regularised = parts[claim.part], parts.get("scheme_2")
+    if regularised is None:
+        return None
     names = [without.key_of(name) for name in claim.names]
     sides = [scheme.errors(claim.test_set) for scheme in (without, regularised)]
     if not all(name in side for name in names for side in sides):

@@ -10,16 +10,17 @@ import pandas as pd
 from scipy import stats
 
 from vehest.constants import FloatArray
-from vehest.report.document import Column, Table
-from vehest.report.style import MISSING
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, MISSING, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit.block_rows import BlockRow
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.verdict_table import figure_in_words
-from vehest_papers.kit.verdicts import Figure
+from vehest_papers.kit.verdicts import Figure as Value
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
-PART = re.compile(r"pair_(\d+)_(converged|stop)(?:_more)?")
+PART = re.compile(r"pair_(\d+)_(converged|stop)(?:_more|_last)?")
 TRAININGS = ("stop", "converged")
 TESTS = ("own", "other", "third")
 MEASURES = {"raw": "fvu", "best_gain": "fvu_best_gain"}
@@ -27,6 +28,7 @@ MEASURES = {"raw": "fvu", "best_gain": "fvu_best_gain"}
 
 NOT_STOPPED = ("zero", "static_map", paper.LUENBERGER)  # trained once, for both kinds of training
 ORDER = ("zero", "static_map", *paper.CATEGORIES, paper.KINEMATIC_GAIN)
+SHOWN = ORDER[1:]  # the FVU of ``zero`` is 1
 N_RESAMPLES = 4000
 POWER = 0.8
 ALPHA = 0.05
@@ -138,14 +140,14 @@ def log_fvu(errors: pd.DataFrame, training: str, test: str, measure: str) -> pd.
     return logs.pivot_table("log", "pair", "candidate", aggfunc="mean")
 
 
-def geometric_mean(logs: FloatArray) -> Figure:
+def geometric_mean(logs: FloatArray) -> Value:
     """Geometric mean over pairs with its 95 % bootstrap interval; no interval below three pairs."""
     value = float(np.exp(logs.mean()))
     if len(logs) < 3:
-        return Figure(value, np.nan, np.nan)
+        return Value(value, np.nan, np.nan)
     drawn = np.random.default_rng(0).integers(len(logs), size=(N_RESAMPLES, len(logs)))
     low, high = np.exp(np.quantile(logs[drawn].mean(axis=1), [ALPHA / 2, 1 - ALPHA / 2]))
-    return Figure(value, float(low), float(high))
+    return Value(value, float(low), float(high))
 
 
 def detectable_ratio(logs: FloatArray) -> float:
@@ -165,12 +167,13 @@ def detectable_ratio(logs: FloatArray) -> float:
 
 def errors_table(errors: pd.DataFrame, measure: str) -> Table:
     """FVU of each candidate by test and training: ``pairs_raw`` or ``pairs_best_gain``."""
+    tests = TESTS if measure == "raw" else TESTS[:2]
     cells = {
         (test, training): log_fvu(errors, training, test, measure)
-        for test in TESTS
+        for test in tests
         for training in TRAININGS
     }
-    names = [name for name in ORDER if name in set(errors["candidate"])]
+    names = [name for name in SHOWN if name in set(errors["candidate"])]
     rows = [
         {"candidate": name}
         | {
@@ -185,7 +188,7 @@ def errors_table(errors: pd.DataFrame, measure: str) -> Table:
     gain = "" if measure == "raw" else " after multiplication by the best single gain of each test"
     caption = (
         f"FVU{gain}: geometric mean over {errors['pair'].nunique()} pairs, 95 % interval by "
-        "bootstrap over pairs. SIMULATED."
+        "bootstrap over pairs; `zero` has 1. SIMULATED."
     )
     return Table(f"pairs_{measure}", caption, pd.DataFrame(rows), columns)
 
@@ -204,7 +207,7 @@ def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> Tabl
     ]
     logs = {cell: log_fvu(errors, cell[1], cell[0], cell[2]) for cell in cells}
     rows = []
-    for name in ORDER:
+    for name in SHOWN:
         if name == candidate or any(
             name not in own or candidate not in own for own in logs.values()
         ):
@@ -227,6 +230,36 @@ def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> Tabl
         "column: smallest ratio above 1 that so many pairs detect on the other car at the stop. SIMULATED."
     )
     return Table("pairs_ratios", caption, pd.DataFrame(rows, columns=[*columns]), columns)
+
+
+def errors_figure(errors: pd.DataFrame) -> Figure:
+    """FVU of each candidate on the three cars, at the stop and at convergence: figure ``pairs``."""
+    names = [name for name in SHOWN if name in set(errors["candidate"])]
+    with new_figure(DOUBLE_COLUMN, 0.9 + 0.24 * len(names)) as figure:
+        panels = figure.subplots(1, len(TESTS), sharex=True, sharey=True)
+        for axes, test in zip(panels, TESTS, strict=True):
+            for place, (training, marker) in enumerate((("stop", "o"), ("converged", "s"))):
+                logs = log_fvu(errors, training, test, "raw")
+                means = [geometric_mean(logs[name].to_numpy()) for name in names]
+                axes.errorbar(
+                    [own.value for own in means],
+                    np.arange(len(names)) + 0.24 * (place - 0.5),
+                    xerr=np.transpose(
+                        [(own.value - own.low, own.high - own.value) for own in means]
+                    ),
+                    fmt=marker,
+                    markersize=3,
+                    linewidth=1,
+                    label=WORDS[training],
+                )
+            axes.set_title(f"{test} car")
+            axes.set_xscale("log")
+            axes.set_xlabel("FVU")
+        panels[0].set_yticks(np.arange(len(names)), names)
+        panels[0].invert_yaxis()
+        legend_above(figure, panels[0], columns=2)
+    caption = f"FVU on {errors['pair'].nunique()} pairs of SIMULATED cars: geometric mean and 95 % interval over pairs."
+    return Figure("pairs", caption, figure)
 
 
 def n_seeds(errors: pd.DataFrame, networks: Sequence[str]) -> int:

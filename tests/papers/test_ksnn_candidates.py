@@ -1,9 +1,8 @@
-"""Tables and the scatter of the KS-NN study, from metrics made by the test."""
+"""Candidates of the KS-NN study, from metrics made by the test, and the paper's figures."""
 
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from refusals import refusal
 from study_parts import metric_rows, part_of
@@ -11,7 +10,7 @@ from study_parts import metric_rows, part_of
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.studies.artefacts import EvaluatedModel
-from vehest_papers.ksnn import paper, scatter, tables
+from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import (
     category_of,
     chosen,
@@ -19,7 +18,6 @@ from vehest_papers.ksnn.candidates import (
     runs_of,
     structure_of,
 )
-from vehest_papers.ksnn.schemes import Scheme
 
 SPLIT = Split(
     "scheme",
@@ -119,51 +117,6 @@ def test_validation_chooses_and_neither_tests_nor_diverged_runs_do():
         ("gru", "states_2", 1): (0.3, 0.2, 0.2),
     }
     assert chosen(runs_of(part(figures)))["seed"] == 1
-
-
-def test_sideslip_table_has_a_column_a_kind_of_data():
-    runs = runs_of(part())
-    drive = runs.rename(columns={"rmse_sideslip.f2": "rmse_sideslip.test"})
-    table = tables.sideslip(runs, drive, None, "simulated").frame.set_index("model")
-    assert table.loc[paper.LUENBERGER, "scheme_2"] == pytest.approx(math.sqrt(0.21))
-    assert table.loc[paper.LUENBERGER, "real_drive"] == table.loc[paper.LUENBERGER, "scheme_2"]
-    assert math.isnan(table.loc[paper.FACTOR_GRAPH, "scheme_2"])
-    assert table["real_whole"].isna().all()
-    assert dict(table["paper"].dropna()) == paper.TABLE_VI
-    assert set(paper.BASELINES) <= set(table.index)
-    assert (
-        tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header
-        == "ours: REAL F-2, scheme 2 [deg]"
-    )
-
-
-def test_stopping_and_candidates_count_what_was_trained():
-    table = tables.stopping(
-        {"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}
-    ).frame.set_index("model")
-    assert paper.LUENBERGER not in table.index
-    assert table.loc[paper.GRU, ["fits", "least", "median", "most"]].tolist() == [3, 10, 10, 20]
-    table = tables.candidates(runs_of(part()), ["c2", "f2"])
-    assert len(table) == 6
-    row = table[table["variant"] == "linear_no_bias_p2"].iloc[0]
-    assert (row["n_seeds"], row["seed"], row["fvu_f2"], row["epochs_max"]) == (2, 1, 0.13, 20)
-
-
-def test_the_scatter_shows_ours_filled_and_the_papers_hollow():
-    one = ("c2", "f2", paper.TABLE_IV)
-    two = ("f2", "c2", paper.TABLE_V)
-    schemes = [Scheme("scheme_1", "One", part(), *one), Scheme("scheme_2", "Two", part(), *two)]
-    figure = scatter.two_tests(schemes, "caption").static
-    assert len(figure.axes) == 4
-    upper_left = figure.axes[0]
-    points = np.concatenate([own.get_offsets() for own in upper_left.collections])
-    for expected in ((1 - 0.13, 1 - 0.11), (1 - 0.152, 1 - 0.133)):
-        assert np.isclose(points, expected).all(axis=1).any(), f"{expected} is not drawn"
-    lower_right = figure.axes[3]
-    points = np.concatenate([own.get_offsets() for own in lower_right.collections])
-    assert np.isclose(points, (0.210, 0.170)).all(axis=1).any(), (
-        "the paper's linear network without bias, C-2 against F-2"
-    )
 
 
 def test_published_figures_agree_with_each_other():
