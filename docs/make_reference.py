@@ -69,7 +69,10 @@ OVERVIEWS = {
         "RMSE(β) [deg], the truck **simulated**",
         {
             "test": "test",
-            **{key: key for key in ("LINT", "RATT", "RATTE", "zero", "static map")},
+            **{
+                key: key
+                for key in ("LINT", "RATT", "RATTE", "zero", "static map")
+            },
         },
     ),
     "cnn_ukf": (

@@ -245,9 +245,7 @@ def ingest(
         bool,
         typer.Option(
             "--download",
-            help=(
-                "First fetch missing files, and compare checksums; resumes an interrupted download."
-            ),
+            help="First fetch missing files, and compare checksums.",
         ),
     ] = False,
     dry_run: DryRun = False,

@@ -273,11 +273,10 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
             bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
 
         for file in download.fetch(progress):
-            resumed = f", resumed after {file.resumed_at / 1e6:.1f} MB" if file.resumed_at else ""
             words = {
                 "matched": "is there, with the recorded checksum",
                 "recorded": f"was there; its checksum is now recorded: sha256 {file.sha256}",
-                "fetched": f"{file.size / 1e6:.1f} MB{resumed}, sha256 {file.sha256}",
+                "fetched": f"{file.size / 1e6:.1f} MB, sha256 {file.sha256}",
             }
             bars.close(f"download {file.name}")
             messages.line(
