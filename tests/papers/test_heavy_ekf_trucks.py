@@ -181,7 +181,7 @@ def test_orders_have_a_row_a_claim_and_print_the_power_of_what_is_not_significan
     orders, tuning, every_entry = conditions.orders_tables(claims_of("heavy_ekf"), rows, [])
     assert len(orders.frame) == 3
     ratt_lint, ratte_ratt, _ = orders.frame["trucks, level, all tyres"]
-    assert "n.s., power 100 %" in ratt_lint
+    assert "n.s. (100 %)" in ratt_lint
     assert float(ratte_ratt.split()[0]) == pytest.approx(0.5, abs=0.01)
     assert ratte_ratt.endswith("lower")
     assert len(tuning.frame) == len(conditions.BY_TUNING)

@@ -42,7 +42,7 @@ ORDERS = {
 ORDERS_CAPTION = (
     "The paper's orders in every condition: ratio of RMSE(β), first filter over second, with its 95 % "
     "interval. 'lower' and 'higher': significant by Holm over this table; 'n.s.': no significant "
-    "difference, with the power to detect the paper's ratio. Trucks: SIMULATED, 20 drawn trucks, noise "
+    "difference, in brackets the power to detect the paper's ratio. Trucks: SIMULATED, 20 drawn trucks, noise "
     "levels tuned on all conditions. Slow laps: SIMULATED, three laps at 30 to 45 km/h. Ferrari: REAL."
 )
 TUNING_CAPTION = (
@@ -89,7 +89,7 @@ class Entry:
     @property
     def text(self) -> str:
         """Ratio, interval and outcome."""
-        power = f", power {100 * self.power:.0f} %" if self.outcome == "n.s." else ""
+        power = f" ({100 * self.power:.0f} %)" if self.outcome == "n.s." else ""
         ratio = figure_in_words(Figure(self.ratio, self.low, self.high))
         return f"{ratio} {self.outcome}{power}"
 

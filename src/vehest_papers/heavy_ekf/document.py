@@ -12,7 +12,7 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
-from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
+from vehest.report.document import REPORT, Block, Document, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import block_errors, conditions, laps, paper, region_map, tyres
@@ -48,7 +48,7 @@ from vehest_papers.kit.block_rows import (
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import CLAIMS, claims_table, one_line
+from vehest_papers.kit.verdict_table import CLAIMS, claims_table, decided_claims, one_line
 
 NAME = "heavy_ekf"
 TEMPLATE = Path(__file__).with_name("report.md.j2")
@@ -65,10 +65,6 @@ FIGURE_10 = "Sideslip angle during a fast lap (Figure 10 of the paper) and the e
 FERRARI_FIGURE = (
     "Sideslip angle on the real Ferrari, REAL, and the errors: each fifth of the 550 s is estimated with "
     "tyre curves and noise levels from the others."
-)
-CLAIMS_CAPTION = (
-    "The paper's claims, one row each, judged from tables/blocks.csv; docs/scorecard.md defines the "
-    "verdicts."
 )
 
 
@@ -108,7 +104,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         conditions.overview_table(rows, slips),
         region_map.map_figure(twin),
         region_map.regions_table(twin),
-        _short_claims(claims),
+        decided_claims(claims),
         *_figures(drives, estimates, trucks, ferrari),
     ]
     values = _values(artefacts, by_condition, trucks, one_line(content.recommendation))
@@ -189,19 +185,6 @@ def _figures(
             )
         )
     return figures
-
-
-def _short_claims(claims: Table) -> Table:
-    """Claims without sources and trainings."""
-    names = ("claim", "published", "ours", "data", "verdict")
-    columns = {
-        "claim": Column("claim"),
-        "published": Column("paper"),
-        "ours": Column("ours, 95 % interval"),
-        "data": Column("data"),
-        "verdict": Column("verdict"),
-    }
-    return Table("verdicts", CLAIMS_CAPTION, claims.frame[list(names)], columns)
 
 
 def _values(
