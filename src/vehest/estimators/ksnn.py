@@ -72,9 +72,11 @@ class Ksnn(WindowedEstimator):
     @property
     def variant(self) -> str:
         """Name of the structure as in Table III."""
-        return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (
-            f"_q{self.n_hidden}" if self.n_hidden else ""
-        ) + (f"_kinematic_{self.kinematic_gain:g}" if self.kinematic_gain else "")
+        return (
+            f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}"
+            + (f"_q{self.n_hidden}" if self.n_hidden else "")
+            + (f"_kinematic_{self.kinematic_gain:g}" if self.kinematic_gain else "")
+        )
 
     @property
     def full_title(self) -> str:
