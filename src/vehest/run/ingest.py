@@ -6,12 +6,13 @@ Parquet file each
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -98,9 +99,9 @@ def write_ingest(
     missing = [
         recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()
     ]
+    description = json.dumps(config["dataset"])
     tasks: list[Callable[..., None]] = [
-        partial(_make_part, dict(config["dataset"]), recording_id, parts)
-        for recording_id in missing
+        partial(_make_part, description, recording_id, parts) for recording_id in missing
     ]
     if min(jobs, len(tasks)) > 1 and has_to_compile(
         SLOW_KERNEL
@@ -148,8 +149,14 @@ def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataErro
     return error
 
 
-def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
-    _make(open_source(dataset), recording_id, parts)
+def _make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
+    _make(_opened(description), recording_id, parts)
+
+
+@lru_cache(maxsize=1)
+def _opened(description: str) -> Source:
+    """The source of a data set, opened once in a process: it checks all drives of the data set."""
+    return open_source(json.loads(description))
 
 
 def _make(source: Source, recording_id: str, folder: Path) -> None:
