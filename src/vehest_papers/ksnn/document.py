@@ -21,6 +21,7 @@ from vehest_papers.kit.reading import recordings_of, words_of_kinds
 from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
+    DECIDED,
     claims_table,
     figure_in_words,
     one_line,
@@ -97,7 +98,6 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         tables += [
             pair_claims(claims),
             errors_table(errors, "best_gain"),
-            ratios_table(errors),
             errors_figure(errors),
         ]
     if len(shares):
@@ -126,7 +126,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             for trial in artefacts.trials
         ],
     }
-    data = {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
+    data = {"pairs_ratios": ratios_table(errors).frame} if len(errors) else {}
+    data |= {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
     data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
     blocks = [*fill_template(TEMPLATE, values, tables), PATENT_NOTE]
@@ -153,10 +154,11 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
 
 
 def pair_claims(claims: Table) -> Table:
-    """The claims that pairs of cars decide."""
-    chosen = claims.frame[claims.frame["id"].str.endswith("_pairs")]
+    """The claims that pairs of cars decide, without those that are open."""
+    frame = claims.frame
+    chosen = frame[frame["id"].str.endswith("_pairs") & frame["verdict"].isin(DECIDED)]
     columns = {name: claims.columns[name] for name in ("claim", "published", "verdict")}
-    caption = "Claims over pairs of cars; the CSV has our values and what decided. SIMULATED."
+    caption = "Claims that the pairs of cars decide; the CSV has the others too. SIMULATED."
     return Table("pair_claims", caption, chosen, columns)
 
 

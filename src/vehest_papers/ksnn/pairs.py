@@ -30,6 +30,7 @@ NOT_STOPPED = ("zero", "static_map", paper.LUENBERGER)  # trained once, for both
 ORDER = ("zero", "static_map", *paper.CATEGORIES, paper.KINEMATIC_GAIN)
 SHOWN = ORDER[1:]  # the FVU of ``zero`` is 1
 N_RESAMPLES = 4000
+FVU_TICKS = (0.02, 0.05, 0.1, 0.2, 0.5)
 POWER = 0.8
 ALPHA = 0.05
 
@@ -87,7 +88,9 @@ def pair_errors(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
         assert match is not None
         for model in part.models:
             candidate = candidate_of(model)
-            trainings = TRAININGS if candidate in NOT_STOPPED else (match[2],)
+            trainings: tuple[str, ...] = (match[2],)
+            if candidate in NOT_STOPPED:
+                trainings = TRAININGS if match[2] == "converged" else ()
             for test in part.split.tests:
                 scored = part.scored(model, test)
                 sums = residuals(
@@ -254,6 +257,8 @@ def errors_figure(errors: pd.DataFrame) -> Figure:
                 )
             axes.set_title(f"{test} car")
             axes.set_xscale("log")
+            axes.set_xticks(FVU_TICKS, [f"{tick:g}" for tick in FVU_TICKS])
+            axes.minorticks_off()
             axes.set_xlabel("FVU")
         panels[0].set_yticks(np.arange(len(names)), names)
         panels[0].invert_yaxis()
