@@ -183,8 +183,7 @@ def _incomplete(
             "number": number,
             "fewer": "; ".join(fewer) or MISSING,
             "candidates": "; ".join(absent) or MISSING,
-            "parts": ", ".join(f"`{name}`" for name in parts if name in artefacts.not_trained)
-            or MISSING,
+            "parts": sum(name in artefacts.not_trained for name in parts),
         }
     ]
 
