@@ -294,6 +294,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
         *(f"figure_{number}_real" for number in (3, 4, 5, 6)),
         "figure_7",
         "friction_real",
+        "loss_curves",
     }
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {

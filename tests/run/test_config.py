@@ -29,7 +29,8 @@ def test_every_estimator_composes_with_any_split(
     for at, estimator in enumerate(estimators):
         split = splits[at * len(splits) // len(estimators)]
         config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])
-        assert (config["estimator"]["name"], config["split"]["name"]) == (estimator, split)
+        assert config["estimator"]["name"] == estimator
+        assert config["split"]["name"].startswith(split), "some add the recordings' names"
     assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
     assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
     assert (

@@ -82,6 +82,12 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     ConfigurationError
         A value that makes no sense.
     """
+    if "least_speed" in config:
+        raise ConfigurationError(
+            "evaluation.least_speed is now evaluation.min_sideslip_speed: slower samples are left "
+            "out of errors of sideslip, instead of counting as 0; leave it out for "
+            "1 m/s · sqrt(wheelbase / 2.7 m)"
+        )
     protocol = settings_from_config(Protocol, config, "evaluation")
     speeds = protocol.min_sideslip_speed
     if (
