@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_planted unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -145,7 +145,7 @@ learned_ukf_quick: $(INSTALLED) ## NNTF_UH, PC and GRU trained anew, one seed ea
 heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
-cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: at most 5 h on two cores, goes on where it was stopped
+cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: about 15 h on one core if nothing is published, goes on where it was stopped
 	$(BIN)/vehest run pipelines/cnn_ukf.yaml
 
 scorecard: $(INSTALLED) ## four papers, published and ours, from committed claims and errors by block: results/scorecard.md (seconds)
@@ -186,6 +186,9 @@ front_door: $(INSTALLED) ## ten logs as users bring them, from vehest new to a v
 
 unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that nobody has trained on (results/unseen_car); needs VEHEST_DATA, and committed choices
 	$(BIN)/python docs/make_unseen_car.py
+
+unseen_car_planted: $(INSTALLED) ## the same filter on 200 drawn cars in town and 100 at the limit, simulated (results/unseen_car/drawn_cars.md)
+	$(BIN)/python docs/unseen_car_planted.py
 
 unseen_car_record: $(INSTALLED) ## vehest identify on drives of one car, on 200 planted cars and in scenes (results/unseen_car/record.md); needs VEHEST_DATA
 	$(BIN)/python docs/unseen_car_record.py

@@ -36,7 +36,7 @@ from vehest.data.transforms import Resample
 from vehest.run.console import Messages
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.train import recording_file
+from vehest.run.train import stored_recording
 from vehest.sources.base import Source, open_source
 from vehest.trust import health_kernel as kernel
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
@@ -163,7 +163,7 @@ def of_split(output: Path, *words: str) -> Drives:
 
     def read(spans: Sequence[Span]) -> list[Recording]:
         return [
-            plain(read_recording(recording_file(data[own.dataset], own)).cut(own.start, own.stop))
+            plain(read_recording(stored_recording(data, own)).cut(own.start, own.stop))
             for own in spans
         ]
 

@@ -69,10 +69,7 @@ OVERVIEWS = {
         "RMSE(β) [deg], the truck **simulated**",
         {
             "test": "test",
-            **{
-                key: key
-                for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")
-            },
+            **{key: key for key in ("LINT", "RATT", "RATTE", "zero", "static map")},
         },
     ),
     "cnn_ukf": (

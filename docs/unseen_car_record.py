@@ -44,7 +44,13 @@ from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.report.style import fixed
 from vehest.run.console import Messages
-from vehest.run.identify import LATENESS, posterior_of, prior_of, record_of, without_prior
+from vehest.run.identify import (
+    YAW_RATE_LATENESS_SECONDS,
+    posterior_of,
+    prior_of,
+    record_of,
+    without_prior,
+)
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.table_records import record_tables
@@ -60,7 +66,7 @@ SHIFTS = np.arange(-0.12, 0.121, 0.03)  # s, of yaw rate
 SETTLED = 2.0
 STEP = 0.01  # s before the first sample, and between commands
 SHAPE = 1.4
-VERSION = "1"
+VERSION = "2"
 """Raised when the numbers of its tables move."""
 EXPONENT = 0.25
 COMPARED = 0.8  # of the tyres' curve, of the filter's; share of the tyres' limit where they have the same slip
@@ -80,7 +86,7 @@ filter's prior. `train_1` is the drive that has a reference elsewhere, and is in
 
 RMSE(β) of a held-out drive that starts from the record of the car's other drives, over that of a cold start ([CSV](carry_over.csv)):
 geometric means over a car's drives, and over cars. `vehest estimate --car` starts from κ and b with deviations times {widening}: better
-than cold on {better} of {drives} drives, six real (Ferrari, S90, TTS) and seven simulated.
+than cold on {better} of {drives} drives, {real} real and {simulated} simulated.
 C differs between calm driving and the limit: with it too, the worst drive has {worst} times the RMSE(β) of a cold start.
 
 {ratios}
@@ -651,13 +657,14 @@ def report(
             cells[number][f"{title} ({len(own)})"] = (
                 f"{fixed(own.mean(), 2)} ± {fixed(own.std(), 2)}, {within}"
             )
+    origins = rows["car"].map({car.title: car.origin for car in CARS})
     apart = pairs[pairs["z"].abs() > 1.645]["number"]
     excess = seen["RMSE(β)"] - seen["RMSE(β), v = 0"]
     beyond = seen[excess > seen["band of β, median"]]["scene"]
     worse = seen[excess > 0.0]["scene"]
     missed = 1e3 * (cars["delay_found"] - cars["delay"])
     return PAGE.format(
-        late=round(1e3 * LATENESS),
+        late=round(1e3 * YAW_RATE_LATENESS_SECONDS),
         of_planted=f"{fixed(missed.mean(), 0)} ± {fixed(missed.std(), 0)}",
         worse=int((shifts["once advanced by it"] > shifts["error"]).sum()),
         now=fixed(shifts["band holds"].mean(), 2),
@@ -682,6 +689,8 @@ def report(
         worst=fixed(ratios[f"κ, b, a_max, C; {WIDENING:g}"].max(), 2),
         better=int((ratios[f"κ, b; {WIDENING:g}"] < 1.0).sum()),
         drives=len(rows),
+        real=int((origins == "real").sum()),
+        simulated=int((origins == "simulated").sum()),
         widening=WIDENING,
         cars=len(cars),
     )

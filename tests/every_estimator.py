@@ -40,8 +40,8 @@ CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurren
 ONCE = PhaseSettings(max_epochs=1)
 GIVEN = IdentificationSettings(method="data")
 SAMPLED = {
-    SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
-    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
+    SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype=dtype),
+    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype=dtype, identification=GIVEN),
     EndToEndSettings: lambda dtype: EndToEndSettings(
         ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype
     ),

@@ -66,8 +66,8 @@ def test_types_of_the_page_s_lines_are_known_to_mypy(tmp_path):
     assert done.returncode == 0, done.stdout
     types = re.findall(r'Revealed type is "(.*)"', done.stdout)
     assert len(types) == 5
-    assert types[0].endswith("-> vehest.data.estimate.Estimate")
-    assert types[1:3] == ["vehest.data.recording.Recording", "vehest.data.estimate.Estimate"]
+    assert types[0].endswith("-> vehest.api.Estimate")
+    assert types[1:3] == ["vehest.api.Recording", "vehest.api.Estimate"]
     assert types[3].endswith("-> matplotlib.figure.Figure")
     assert types[4].endswith("-> vehest.api.OnlineEstimator")
     file.write_text("import vehest\nvehest.estimat\n", encoding="utf-8")

@@ -12,7 +12,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -21,10 +21,10 @@ from vehest.alignment.checks import refuse_errors
 from vehest.data.car import UNKNOWN_CAR
 from vehest.data.car import CarValues as CarValues
 from vehest.data.errors import ConfigurationError
-from vehest.data.estimate import Estimate as Estimate
+from vehest.data.estimate import Estimate as PlainEstimate
 from vehest.data.files import written_aside
 from vehest.data.limits import use_limits
-from vehest.data.recording import Recording as Recording
+from vehest.data.recording import Recording as PlainRecording
 from vehest.data.resampling import resampled
 from vehest.data.schema import settings_from_config
 from vehest.estimators.base import Estimator as Estimator
@@ -51,6 +51,47 @@ from vehest.trust.record import Trust, write_trust
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+
+
+class Recording(PlainRecording):
+    """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``."""
+
+    def plot(
+        self, *estimates: PlainEstimate, start: float | None = None, stop: float | None = None
+    ) -> Figure:
+        """Draw the drive with estimates of it; see `vehest.report.drive_figure.drive_figure`.
+
+        Parameters
+        ----------
+        *estimates : Estimate
+            Of this recording; band, health and course are those of the first.
+        start, stop : float, optional
+            Range that is drawn [s]; by default all of it.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A notebook shows it; ``savefig`` writes PNG, PDF or SVG.
+        """
+        from vehest.report.drive_figure import drive_figure
+
+        return drive_figure(self, estimates, start, stop)
+
+
+class Estimate(PlainEstimate):
+    """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``."""
+
+    def plot(
+        self,
+        recording: PlainRecording | None = None,
+        start: float | None = None,
+        stop: float | None = None,
+    ) -> Figure:
+        """Draw the estimate, with its recording where that is passed; see `Recording.plot`."""
+        from vehest.report.drive_figure import drive_figure
+
+        return drive_figure(recording, [self], start, stop)
 
 
 def load_model(model: str | Path = SELF_CALIBRATING, output: str | Path | None = None) -> Estimator:
@@ -80,8 +121,8 @@ def load_model(model: str | Path = SELF_CALIBRATING, output: str | Path | None =
 
 def train(
     estimator: str | Estimator,
-    train: Sequence[Recording],
-    validation: Sequence[Recording],
+    train: Sequence[PlainRecording],
+    validation: Sequence[PlainRecording],
     overrides: Sequence[str] = (),
     *,
     seed: int = 0,
@@ -140,8 +181,8 @@ def train(
 def _fitted(
     model: Estimator,
     settings: Any,
-    train: Sequence[Recording],
-    validation: Sequence[Recording],
+    train: Sequence[PlainRecording],
+    validation: Sequence[PlainRecording],
     seed: int,
 ) -> Estimator:
     """The model, fitted and calibrated."""
@@ -157,7 +198,7 @@ def _fitted(
 
 
 def score(
-    estimate: Estimate | Estimator, recordings: Recording | Sequence[Recording]
+    estimate: PlainEstimate | Estimator, recordings: PlainRecording | Sequence[PlainRecording]
 ) -> dict[str, float]:
     """Metrics of an estimate against the reference of its recording, or of a model on recordings.
 
@@ -186,8 +227,8 @@ def score(
     DataError
         A channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
-    drives = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    if isinstance(estimate, Estimate):
+    drives = [recordings] if isinstance(recordings, PlainRecording) else list(recordings)
+    if isinstance(estimate, PlainEstimate):
         if len(drives) != 1:
             raise ConfigurationError(
                 f"an estimate is scored against the recording that it was made of, not {len(drives)}"
@@ -261,15 +302,16 @@ def read_recording(
     options = estimate_options(overrides)
     dataset = options.dataset if references else without_references(options.dataset)
     if isinstance(log, str | Path):
-        return read_checked(Path(log), dataset, options.limits, columns or {})
+        recording = read_checked(Path(log), dataset, options.limits, columns or {})
+        return Recording(**_fields_of(recording))
     with use_limits(options.limits):
         recording = read_frame(log, dataset, columns or {})
     refuse_errors(recording, dataset.get("accept") or (), "DataFrame")
-    return recording
+    return Recording(**_fields_of(recording))
 
 
 def estimate(
-    recording: Recording,
+    recording: PlainRecording,
     model: Estimator | str | Path | None = None,
     *,
     wheelbase: float | None = None,
@@ -309,9 +351,9 @@ def estimate(
         A channel is missing, or the recording is sampled too slowly.
     """
     if isinstance(recording, Estimator):  # the order of earlier versions
-        recording, model = cast(Recording, model), recording
+        recording, model = cast(PlainRecording, model), recording
         warnings.warn("use vehest.estimate(recording, model)", DeprecationWarning, stacklevel=2)
-    if not isinstance(recording, Recording):
+    if not isinstance(recording, PlainRecording):
         raise ConfigurationError(
             "pass a recording, as vehest.read_recording(log, columns=…) reads it, "
             f"not a {type(recording).__name__}"
@@ -323,10 +365,14 @@ def estimate(
     elif not isinstance(model, Estimator):
         model = load_model(model)
     of_car, trust = _for_car(model, recording.car, _settings_for(model, recording))
-    return estimate_recording(of_car, recording, trust, same_vehicle)
+    return Estimate(**_fields_of(estimate_recording(of_car, recording, trust, same_vehicle)))
 
 
-def _settings_for(model: Estimator, recording: Recording) -> dict[str, Any]:
+def _fields_of(series: PlainRecording | PlainEstimate) -> dict[str, Any]:
+    return {field.name: getattr(series, field.name) for field in fields(series)}
+
+
+def _settings_for(model: Estimator, recording: PlainRecording) -> dict[str, Any]:
     """Settings with which a model does without a channel that a recording lacks."""
     if isinstance(model, SelfCalibrating) and "ax" not in recording:
         return {"measured_ax": False}
@@ -448,7 +494,7 @@ def online(
     return OnlineEstimator(GuardedStepper(of_car, trust, bus_rate_hz, elsewhere=is_other))
 
 
-def write_estimate(estimate: Estimate, path: str | Path) -> None:
+def write_estimate(estimate: PlainEstimate, path: str | Path) -> None:
     """Write an estimate as Parquet or CSV, by the file's ending.
 
     Raises:

@@ -38,16 +38,19 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Train, run and compare published estimators of a car's lateral velocity and sideslip angle.\n\n"
-    "Options of a command are set by overrides after it: `vehest train estimator=ksnn estimator.n_local=3 seed=7`.",
-    epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable data, 4 something is missing, "
+    help="Train, run and compare published estimators of a car's lateral velocity and sideslip "
+    "angle.\n\n"
+    "Options of a command are set by overrides after it: `vehest train estimator=ksnn "
+    "estimator.n_local=3 seed=7`.",
+    epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable "
+    "data, 4 something is missing, "
     "5 some jobs failed, 130 or 143 stopped by a signal.",
 )
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-LONGEST_LINE = 4_000
+MAX_ERROR_CHARACTERS = 4_000
 STAGES = "Single stages, all of which `run` includes"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
@@ -69,7 +72,7 @@ MODELS = _offer(
     lambda: [
         "pretrained",
         "self_calibrating",
-        *(own.name for own in Path(OUTPUT, "train").glob("[!.]*")),
+        *(model_folder.name for model_folder in Path(OUTPUT, "train").glob("[!.]*")),
     ]
 )
 OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
@@ -102,7 +105,10 @@ LauncherName = Annotated[
     str,
     typer.Option(
         "--launcher",
-        help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, as SLURM jobs (docs/many_machines.md).",
+        help=(
+            "Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, "
+            "as SLURM jobs (docs/many_machines.md)."
+        ),
         autocompletion=_offer(lambda: LAUNCHERS),
         rich_help_panel=CLUSTER,
     ),
@@ -111,8 +117,10 @@ Address = Annotated[
     str | None,
     typer.Option(
         "--address",
-        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is part of. "
-        "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: local, to try it here.",
+        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is "
+        "part of. "
+        "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: "
+        "local, to try it here.",
         show_default=False,
         rich_help_panel=CLUSTER,
     ),
@@ -121,7 +129,8 @@ Slurm = Annotated[
     list[str] | None,
     typer.Option(
         "--slurm",
-        help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, constraint, minutes (60), memory_gb (2). "
+        help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, "
+        "constraint, minutes (60), memory_gb (2). "
         "Repeatable.",
         show_default=False,
         rich_help_panel=CLUSTER,
@@ -188,7 +197,7 @@ def new_car(
         float | None,
         typer.Option("--steering-ratio", help="Overall steering ratio."),
     ] = None,
-    own: Annotated[
+    with_estimators: Annotated[
         list[str] | None,
         typer.Option(
             "--with",
@@ -201,9 +210,10 @@ def new_car(
 ) -> None:
     """Start with logs of your own car: `vehest new my_car lap*.csv`.
 
-    Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs do not decide, and writes
-    conf/dataset, conf/split and pipelines/my_car.yaml; where the logs have no reference, conf/dataset alone, and the command that estimates
-    without one. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
+    Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs
+    do not decide, and writes conf/dataset, conf/split and pipelines/my_car.yaml; where the logs
+    have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
+    Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.run.own_car.inspect import inspect
 
@@ -218,9 +228,9 @@ def new_car(
     )  # with torch: a file that is refused is so without it
 
     try:
-        further = [registered(word) for word in own or []]
+        extra_estimators = [registered(word) for word in with_estimators or []]
         examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
-        outcome = write(examined, left, further, dry_run=dry_run)
+        outcome = write(examined, left, extra_estimators, dry_run=dry_run)
     except VehestError as error:
         emit(as_json, {**found_in(examined), "stopped": str(error)}, [])
         raise
@@ -235,7 +245,7 @@ def ingest(
         bool,
         typer.Option(
             "--download",
-            help="First fetch missing files, and compare checksums; resumes an interrupted download.",
+            help="First fetch missing files, and compare checksums.",
         ),
     ] = False,
     dry_run: DryRun = False,
@@ -254,13 +264,13 @@ def ingest(
     ) as runner:
         if download:
             download_files(config, runner.messages, dry_run=dry_run)
-        made = runner.ingest(config)
+        artefact = runner.ingest(config)
     emit(
         as_json,
         {
-            "folder": str(made.folder),
-            "recordings": sorted(Path(n).stem for n in made.outputs),
-            "skipped": made.skipped,
+            "folder": str(artefact.folder),
+            "recordings": sorted(Path(n).stem for n in artefact.outputs),
+            "skipped": artefact.skipped,
         },
     )
 
@@ -282,8 +292,9 @@ def simulate(
 ) -> None:
     """Simulate a data set into the store: `vehest simulate sim_bmw seed=1`.
 
-    The same seed gives the same samples. Drives are made side by side; a run that was stopped continues with the missing ones. Drives
-    that spin or leave the road are kept, flagged in their provenance, and counted.
+    The same seed gives the same samples. Drives are made side by side; a run that was stopped
+    continues with the missing ones. Drives that spin or leave the road are kept, flagged in their
+    provenance, and counted.
     """
     from vehest.run.ingest import outcome_of, simulation_config
     from vehest.run.study_run import open_runner
@@ -331,13 +342,14 @@ def train(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Fit one estimator: `vehest train estimator=ksnn estimator.n_local=3 split=ferrari_drive seed=7`.
+    """Fit one estimator: `vehest train estimator=ksnn estimator.n_local=3 split=ferrari_drive
+    seed=7`.
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.run.study_run import train_one
+    from vehest.run.study_run import train_estimator
 
-    emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
+    emit(as_json, train_estimator(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"), rich_help_panel=STAGES)
@@ -348,7 +360,10 @@ def evaluate(
         typer.Option(
             "--model",
             "-m",
-            help="A model's folder, or the start of its name, `pretrained` or `self_calibrating`; by default what the overrides train.",
+            help=(
+                "A model's folder, or the start of its name, `pretrained` or `self_calibrating`; "
+                "by default what the overrides train."
+            ),
             autocompletion=MODELS,
         ),
     ] = None,
@@ -357,16 +372,18 @@ def evaluate(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Score a fitted estimator on the test ranges of a split: `vehest eval estimator=ksnn seed=7`, with the overrides of its training.
+    """Score a fitted estimator on the test ranges of a split: `vehest eval estimator=ksnn seed=7`,
+    with the overrides of its training.
 
-    Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
-    `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
+    Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a
+    sensor's fault as a further condition: `vehest eval estimator=ksnn fault=frozen
+    fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.run.study_run import evaluate_one
+    from vehest.run.study_run import evaluate_model
 
     emit(
         as_json,
-        evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note),
+        evaluate_model(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note),
     )
 
 
@@ -376,7 +393,10 @@ def estimate(
         str,
         typer.Argument(
             metavar="MODEL|FILE",
-            help="A model's folder, or the start of its name; or the recording at once, for the filter that comes with vehest.",
+            help=(
+                "A model's folder, or the start of its name; or the recording at once, for the "
+                "filter that comes with vehest."
+            ),
             autocompletion=MODELS,
         ),
     ],
@@ -384,7 +404,10 @@ def estimate(
         str | None,
         typer.Argument(
             metavar="FILE",
-            help="The recording after a model: a table, or with dataset=NAME one of its format; it needs no reference channels.",
+            help=(
+                "The recording after a model: a table, or with dataset=NAME one of its format; "
+                "it needs no reference channels."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -424,20 +447,29 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    The table contains v [m/s], β [rad and deg], half widths of their calibrated 90 % bands, and the health of each sample: 0 valid,
-    1 degraded, 2 invalid. An .mf4
-    is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
+    The table contains v [m/s], β [rad and deg], half widths of their calibrated 90 % bands, and the
+    health of each sample: 0 valid, 1 degraded, 2 invalid. An .mf4 is the log, MDF 4, with these as
+    channels of their own, a .mat the log's channels and these.
 
-    For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` uses the self-calibrating
-    filter, with a note; estimator.smoothed=true smooths over the whole drive (offline).
+    For a car without a model of its own, leave the model out: `vehest estimate lap.csv
+    estimator.wheelbase=2.7` uses the self-calibrating filter, with a note; estimator.smoothed=true
+    smooths over the whole drive (offline).
 
-    Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
+    Columns named like channels, in SI units, need no more; others are described once by `vehest new
+    NAME lap.csv`, then add `dataset=NAME`.
     """
+    from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
-    from vehest.run.plot import estimate_and_plot
 
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    outcome = estimate_and_plot(words, out, plot, strict=strict, car=car)
+    if plot is not None:
+        from vehest.run.plot import check_plot_of_estimate, plot_estimate
+
+        check_plot_of_estimate(out, plot)
+    outcome = estimate_file(words, out, strict=strict, car=car)
+    if plot is not None:
+        plot_estimate(words, out, plot)
+        outcome["plot"] = str(plot)
     emit(as_json, outcome, summary_lines(outcome))
 
 
@@ -453,7 +485,10 @@ def plot_drive(
         list[str] | None,
         typer.Argument(
             metavar="[ESTIMATE]... [OVERRIDES]...",
-            help="Tables of estimates, of `vehest estimate` or another tool; key=value …, as of `vehest estimate`.",
+            help=(
+                "Tables of estimates, of `vehest estimate` or another tool; key=value …, as of "
+                "`vehest estimate`."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -467,8 +502,9 @@ def plot_drive(
 ) -> None:
     """Draw a recording and estimates of it: `vehest plot lap.csv estimate.parquet -o drive.pdf`.
 
-    β with the 90 % band and the health of the first estimate, v, the measured channels, the course in colours of β; with a reference
-    also estimate over reference. The course is reckoned from u, v and the yaw rate, and drifts over minutes.
+    β with the 90 % band and the health of the first estimate, v, the measured channels, the course
+    in colours of β; with a reference also estimate over reference. The course is reckoned from u, v
+    and the yaw rate, and drifts over minutes.
     """
     from vehest.run.plot import plot_files
 
@@ -489,10 +525,11 @@ def identify(
     ] = Path("my_car.yaml"),
     as_json: AsJson = False,
 ) -> None:
-    """Identify a car's parameters on its drives, without a reference: `vehest identify lap*.csv estimator.wheelbase=2.7 -o my_car.yaml`.
+    """Identify a car's parameters on its drives, without a reference: `vehest identify lap*.csv
+    estimator.wheelbase=2.7 -o my_car.yaml`.
 
-    Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest estimate lap.csv --car my_car.yaml` starts from
-    wheelbase, leakage and rear axle.
+    Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest
+    estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
     from vehest.run.identify import identify_files, in_words
 
@@ -511,7 +548,10 @@ def replay(
         typer.Option(
             "--model",
             "-m",
-            help="A model's folder, or the start of its name, `self_calibrating`; by default the pre-trained one.",
+            help=(
+                "A model's folder, or the start of its name, `self_calibrating`; by default the "
+                "pre-trained one."
+            ),
             autocompletion=MODELS,
         ),
     ] = "pretrained",
@@ -531,7 +571,8 @@ def replay(
         str,
         typer.Option(
             "--signals",
-            help="CHANNEL=MESSAGE.SIGNAL, separated by commas, for signals that are not called like channels; a minus before the signal "
+            help="CHANNEL=MESSAGE.SIGNAL, separated by commas, for signals that are not called "
+            "like channels; a minus before the signal "
             "where it counts the other way than ISO 8855, :UNIT behind it where the DBC says none.",
         ),
     ] = "",
@@ -562,7 +603,10 @@ def replay(
         typer.Option(
             "--out",
             "-o",
-            help="Where estimates go: .csv, or .asc for their frames, with the DBC that describes them beside it.",
+            help=(
+                "Where estimates go: .csv, or .asc for their frames, with the DBC that describes "
+                "them beside it."
+            ),
         ),
     ] = None,
     write_dbc: Annotated[
@@ -572,10 +616,11 @@ def replay(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Replay a log's frames on a bus and let a model estimate online from them: `vehest replay drive.asc --dbc car.dbc -m MODEL`.
+    """Replay a log's frames on a bus and let a model estimate online from them: `vehest replay
+    drive.asc --dbc car.dbc -m MODEL`.
 
-    Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
-    Ctrl-C ends it; written files stay.
+    Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are
+    lost or late are missing samples. Ctrl-C ends it; written files stay.
     """
     options: dict[str, Any] = {
         name: value
@@ -643,17 +688,21 @@ def export(
         bool,
         typer.Option(
             "--onnx",
-            help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file.",
+            help=(
+                "Write a network as one step in ONNX instead, with its state going in and out; "
+                "-o names the file."
+            ),
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a model as C99 for a control unit: `vehest export MODEL -o c --precision float`.
 
-    One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
-    file, test vectors, and a README with units.
+    One step with explicit state: the method with the checks of its samples, band and health; a
+    Makefile, a program that runs a drive from a file, test vectors, and a README with units.
 
-    dataset=NAME gives the values of the car, as for `vehest estimate`, and so does dataset.car.wheelbase=2.7 without one.
+    dataset=NAME gives the values of the car, as for `vehest estimate`, and so does
+    dataset.car.wheelbase=2.7 without one.
     """
     from vehest.api import read_recording
     from vehest.configuration.estimate_options import estimate_options
@@ -693,7 +742,10 @@ def compare(
         list[str] | None,
         typer.Argument(
             metavar="[ESTIMATE]... [OVERRIDES]...",
-            help="Tables with time and v [m/s] or β [rad or deg], made by any tool, or by `vehest estimate`; then key=value …",
+            help=(
+                "Tables with time and v [m/s] or β [rad or deg], made by any tool, or by `vehest "
+                "estimate`; then key=value …"
+            ),
             show_default=False,
         ),
     ] = None,
@@ -711,8 +763,10 @@ def compare(
         typer.Option(
             "--column",
             metavar="QUANTITY=COLUMN",
-            help="Column of time, vy or sideslip in a table of another tool, such as sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
-            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; repeatable.",
+            help="Column of time, vy or sideslip in a table of another tool, such as "
+            "sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
+            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; "
+            "repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -721,16 +775,20 @@ def compare(
         typer.Option(
             "--shift",
             metavar="SECONDS|auto",
-            help="Added to the times of other tools' tables; auto: by correlation with the reference.",
+            help=(
+                "Added to the times of other tools' tables; auto: by correlation with the "
+                "reference."
+            ),
         ),
     ] = "0",
     as_json: AsJson = False,
 ) -> None:
     """Score estimates of any tool on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
 
-    The zero-sideslip baseline and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all
-    estimates have, with 95 % intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
-    A model that was trained on the recording is listed and left out of the verdict.
+    The zero-sideslip baseline and a static map, fitted on the other half of the drive, are scored
+    too. Scores cover the part that all estimates have, with 95 % intervals over blocks of the
+    drive; an estimate is called best only if it is significantly below all others. A model that was
+    trained on the recording is listed and left out of the verdict.
     """
     from vehest.run.compare_files import compare_files
 
@@ -751,7 +809,10 @@ def run(
     minutes: Annotated[
         float | None,
         typer.Option(
-            help="Stop after this time, report included; unfinished jobs are listed, and the same command goes on with them."
+            help=(
+                "Stop after this time, report included; unfinished jobs are listed, and the same "
+                "command goes on with them."
+            )
         ),
     ] = None,
     retrain: Annotated[
@@ -761,7 +822,8 @@ def run(
         bool | None,
         typer.Option(
             "--train-missing/--no-train-missing",
-            help="Train what is neither here nor published, or leave it out and name it in the report. By default it is trained, unless "
+            help="Train what is neither here nor published, or leave it out and name it in the "
+            "report. By default it is trained, unless "
             "results/STUDY is published without some trainings.",
             show_default=False,
         ),
@@ -770,17 +832,21 @@ def run(
         bool,
         typer.Option(
             "--publish-weights",
-            help="Add the weights of each training to results/STUDY/weights.safetensors as it ends, instead of those of all with the report.",
+            help=(
+                "Add the weights of each training to results/STUDY/weights.safetensors as it "
+                "ends, instead of those of all with the report."
+            ),
         ),
     ] = False,
     launcher: LauncherName = "local",
     address: Address = None,
     slurm: Slurm = None,
 ) -> None:
-    """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
+    """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run
+    pipelines/quickstart.yaml`.
 
-    Existing artefacts are reused, and so are published weights of trainings with the same key. Overrides
-    apply to every sweep that has their key. Sweeps run in the order of the file.
+    Existing artefacts are reused, and so are published weights of trainings with the same key.
+    Overrides apply to every sweep that has their key. Sweeps run in the order of the file.
     """
     options = RunOptions(
         force,
@@ -803,7 +869,10 @@ def report(
     pipeline: Annotated[
         str | None,
         typer.Argument(
-            help="A file in pipelines/, or its name; with --check studies or pipelines, or none for all.",
+            help=(
+                "A file in pipelines/, or its name; with --check studies or pipelines, or none "
+                "for all."
+            ),
             autocompletion=PIPELINES,
             show_default=False,
         ),
@@ -813,7 +882,8 @@ def report(
         bool,
         typer.Option(
             "--check",
-            help="Draw nothing; list published results in ./results, of all or the named studies, that differ from today's code, "
+            help="Draw nothing; list published results in ./results, of all or the named studies, "
+            "that differ from today's code, "
             "configuration and data.",
         ),
     ] = False,
@@ -824,16 +894,21 @@ def report(
 ) -> None:
     """Draw a study's tables, figures and page from existing artefacts; trains nothing.
 
-    `vehest report --check` needs neither models nor an output root. A line a study: up to date; stale, and what has changed; or not known.
-    Exit code 3 unless all are up to date; without names, those that results/stale.yaml lists may be stale.
+    `vehest report --check` needs neither models nor an output root. A line a study: up to date;
+    stale, and what has changed; or not known. Exit code 3 unless all are up to date; without names,
+    those that results/stale.yaml lists may be stale.
     """
     if check:
         from vehest.run.published import check_listed, check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         names = [word for word in words if is_file_name(word)]
-        others = [word for word in words if not is_file_name(word)]
-        verdicts = check_published(names, others) if names else check_listed(others)
+        overrides_of_check = [word for word in words if not is_file_name(word)]
+        verdicts = (
+            check_published(names, overrides_of_check)
+            if names
+            else check_listed(overrides_of_check)
+        )
         emit(as_json, verdicts, map(in_words, verdicts))
         failed = any(
             verdict["failure"] if "failure" in verdict else verdict["state"] != "up to date"
@@ -869,10 +944,12 @@ def sweep(
     address: Address = None,
     slurm: Slurm = None,
 ) -> None:
-    """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
+    """Train and score all combinations of several values: `vehest sweep estimator=ksnn
+    estimator.n_local=2,3 seed='range(5)'`.
 
-    Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
-    on the validation range. Existing artefacts are reused, a failed job stops no other, the same command finishes what is missing.
+    Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval
+    (Student's t), and marks the one that is best on the validation range. Existing artefacts are
+    reused, a failed job stops no other, the same command finishes what is missing.
     """
     options = RunOptions(
         force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ()
@@ -914,49 +991,53 @@ def prune(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List artefacts that no current configuration can reuse, ask, and remove them: `vehest prune output=FOLDER`.
+    """List artefacts that no current configuration can reuse, ask, and remove them: `vehest prune
+    output=FOLDER`.
 
-    These are artefacts of other versions, damaged or half-written ones, and those whose inputs are gone. Models and recordings of current
-    versions stay with any settings, and so do files that vehest has not made.
+    These are artefacts of other versions, damaged or half-written ones, and those whose inputs are
+    gone. Models and recordings of current versions stay with any settings, and so do files that
+    vehest has not made.
     """
     from vehest.run.prune import remove_unused, unused_artefacts
 
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
-    found = unused_artefacts(Path(str(config["output"])))
-    total = sum(one["bytes"] for one in found)
+    unused = unused_artefacts(Path(str(config["output"])))
+    total = sum(entry["bytes"] for entry in unused)
     rows = [
         [
-            one["path"],
-            f"{one['bytes'] / 1e6:.3f} MB",
-            str(timedelta(seconds=one["seconds"])),
-            one["reason"],
+            entry["path"],
+            f"{entry['bytes'] / 1e6:.3f} MB",
+            str(timedelta(seconds=entry["seconds"])),
+            entry["reason"],
         ]
-        for one in found
+        for entry in unused
     ]
-    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if found else []
+    tables = (
+        [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if unused else []
+    )
     emit(
         False,
         None,
         []
         if as_json
         else [
-            *shown,
-            f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove",
+            *tables,
+            f"{len(unused)} to remove, {total / 1e6:.3f} MB" if unused else "nothing to remove",
         ],
     )
     removed: list[str] = []
-    if found and not dry_run:
+    if unused and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("no terminal for questions; use --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
             remove_unused(
-                [Path(one["path"]) for one in found], lambda path: removed.append(str(path))
+                [Path(entry["path"]) for entry in unused], lambda path: removed.append(str(path))
             )
     emit(
         as_json,
-        {"found": found, "bytes": total, "removed": removed},
+        {"found": unused, "bytes": total, "removed": removed},
         [f"{len(removed)} removed"] if removed else [],
     )
 
@@ -1025,7 +1106,9 @@ def data_check(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
+    """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units
+    and signs; exit code 3 on errors.
+    """
     from vehest.run.inspect_data import check
 
     findings, lines = check(source, overrides or [])
@@ -1040,7 +1123,9 @@ def data_usable(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """List for every estimator whether these recordings suffice, which channels are missing, and how to supply them."""
+    """List for every estimator whether these recordings suffice, which channels are missing, and
+    how to supply them.
+    """
     from vehest.run.inspect_data import examine_usability
 
     emit(as_json, *examine_usability(source, overrides or []))
@@ -1057,7 +1142,10 @@ def data_align(
         typer.Option(
             "--estimate",
             "-e",
-            help="What to estimate, separated by commas: lever_arm, mounting, delay, offsets, steering_ratio.",
+            help=(
+                "What to estimate, separated by commas: lever_arm, mounting, delay, offsets, "
+                "steering_ratio."
+            ),
         ),
     ] = "",
     recording: Annotated[
@@ -1087,7 +1175,10 @@ def data_align(
         float,
         typer.Option(
             "--tilt",
-            help="Roll and pitch of the body beyond what follows the accelerations [rad]; 0: free of gravity.",
+            help=(
+                "Roll and pitch of the body beyond what follows the accelerations [rad]; 0: free "
+                "of gravity."
+            ),
         ),
     ] = 0.001,
     max_ay: Annotated[
@@ -1108,22 +1199,26 @@ def data_align(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.
+    """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio:
+    `vehest data align lap.csv -e delay,offsets`.
 
-    Prints the estimates with their uncertainty, and the transforms that would correct it. Applies nothing.
+    Prints the estimates with their uncertainty, and the transforms that would correct it. Applies
+    nothing.
     """
     from vehest.alignment.settings import AlignmentSettings
     from vehest.run.align import align_recording, as_plain, in_words, write_alignment
 
-    asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
+    quantities = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(
-        asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed
+        quantities, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed
     )
-    found = align_recording(source, overrides or [], recording, settings)
+    alignment = align_recording(source, overrides or [], recording, settings)
     if out is not None:
-        write_alignment(found, out)
+        write_alignment(alignment, out)
     emit(
-        as_json, {**as_plain(found), "out": None if out is None else str(out)}, in_words(found, out)
+        as_json,
+        {**as_plain(alignment), "out": None if out is None else str(out)},
+        in_words(alignment, out),
     )
 
 
@@ -1131,9 +1226,9 @@ def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
     from vehest.run.signals import DryRunStop, Stopped, StopSignals
 
-    gc.set_threshold(
-        10_000
-    )  # new objects, after which cycles are looked for; at 700, libraries and compilers spend 8 % of a run on it
+    # New objects, after which cycles are looked for: at 700, libraries and compilers spend 8 % of a
+    # run on it.
+    gc.set_threshold(10_000)
     open_streams()
     stop = StopSignals()
     try:
@@ -1169,7 +1264,9 @@ def main() -> None:
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
-"""What Typer raises for options, arguments and commands that it does not know; newer ones carry their own copy of Click."""
+"""What Typer raises for options, arguments and commands that it does not know; newer ones carry
+their own copy of Click.
+"""
 
 
 def _fail_usage(error: Any) -> None:
@@ -1196,7 +1293,9 @@ def _fail(message: str, exit_code: int) -> NoReturn:
         sys.stdout.flush()
     except (OSError, ValueError):
         silence(sys.stdout)
-    complain(f"error: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + '…'}")
+    complain(
+        f"error: {line if len(line) <= MAX_ERROR_CHARACTERS else line[:MAX_ERROR_CHARACTERS] + '…'}"
+    )
     sys.exit(exit_code)
 
 
@@ -1209,7 +1308,9 @@ def _run_study(
     sweep: bool = False,
     only_report: bool = False,
 ) -> None:
-    """Run a study or sweep, or repeat its record; prints tables and the report's path; raises `JobsFailedError` where some jobs failed."""
+    """Run a study or sweep, or repeat its record; prints tables and the report's path; raises
+    `JobsFailedError` where some jobs failed.
+    """
     from vehest.run.run_cache import RunCache
 
     cache = RunCache("sweep" if sweep else "run", name or "", overrides)
@@ -1220,18 +1321,18 @@ def _run_study(
         ran = run_study(name, overrides, options, cache, sweep=sweep, only_report=only_report)
     page = ran.folder / ran.summary.page
     summary = ran.summary
-    own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
+    outcome: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:
-        own = {"report": str(page), "published": str(ran.published) if ran.published else None}
-    shown: list[str | TerminalTable] = [
+        outcome = {"report": str(page), "published": str(ran.published) if ran.published else None}
+    lines: list[str | TerminalTable] = [
         *summary.tables,
         *(summary.note.split("\n") if summary.note else []),
         f"report: {page}",
     ]
     emit(
         as_json,
-        {**own, **json.loads(summary.figures)},
-        [*shown, *([f"published: {ran.published}"] if ran.published else [])],
+        {**outcome, **json.loads(summary.figures)},
+        [*lines, *([f"published: {ran.published}"] if ran.published else [])],
     )
     if ran.failed is not None:
         raise ran.failed

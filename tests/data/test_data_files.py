@@ -17,7 +17,7 @@ class InterruptedHereError(Exception):
     """Something that goes wrong half-way."""
 
 
-def test_nothing_stands_at_the_place_before_the_end_and_the_digest_is_that_of_the_bytes(tmp_path):
+def test_file_appears_complete_with_the_digest_of_its_bytes(tmp_path):
     path = tmp_path / "deep" / "er" / "file"
     with written_aside(path) as aside:
         aside.write_text("new")

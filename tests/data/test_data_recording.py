@@ -54,7 +54,7 @@ def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
     assert piece.start_time == pytest.approx(recording.time[first], abs=1e-12, rel=1e-15)
 
 
-def test_ranges_without_samples_missing_channels_and_estimates_of_unknown_quantities_are_refused():
+def test_empty_ranges_missing_channels_and_unknown_quantities_are_refused():
     with pytest.raises(
         DataError,
         match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s",
@@ -72,7 +72,7 @@ def test_ranges_without_samples_missing_channels_and_estimates_of_unknown_quanti
         Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
 
 
-def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_references():
+def test_samples_are_immutable_copies_and_estimators_receive_no_references():
     samples = np.zeros(3)
     recording = Recording("r", "car", 10.0, 0.0, {"ay": samples})
     samples[0] = 1.0

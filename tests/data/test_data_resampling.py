@@ -78,7 +78,7 @@ def test_plain_decimation_takes_every_nth_sample_as_it_is(length, step):
     assert out["ay"].tolist() == samples.tolist()[::step]
 
 
-def test_the_same_rate_changes_nothing_and_channels_with_gaps_are_refused_by_the_filter_alone():
+def test_resampling_to_the_same_rate_keeps_channels_with_gaps():
     recording = recorded(np.random.default_rng(0).standard_normal(99), 100.0)
     for method in ("polyphase", "decimate"):
         assert Resample(100.0, method=method)(recording) is recording

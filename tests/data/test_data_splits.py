@@ -101,7 +101,7 @@ def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
         Split("s", (Span("d", "r", 0, 10),), (Span("d", "v"),), {"wet": (Span("d", "r", 5, 6),)})
 
 
-def test_plain_values_make_a_split_of_which_tests_alone_will_do_and_a_stretch_runs_forward():
+def test_plain_values_make_a_split_with_tests_alone():
     for start, stop in ((2.0, 1.0), (1.0, 1.0), (math.nan, 1.0), (0.0, math.nan)):
         with pytest.raises(ConfigurationError, match="is not before stop"):
             Span("d", "r", start, stop)
@@ -406,7 +406,7 @@ def catalogue_of(*recordings):
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_as_long_as_the_course_is_driven_round_once_and_are_named_from_either_end():
+def test_laps_last_one_round_and_count_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4

@@ -323,7 +323,7 @@ def damaged(value, *wheels, start=500, stop=650):
     return rolling(**broken)
 
 
-def test_speed_from_wheels_inverts_what_rolling_wheels_do_also_of_the_rear_wheels_alone():
+def test_speed_from_wheels_inverts_rolling_wheels():
     drive, u = rolling()
     np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
@@ -363,7 +363,7 @@ def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels):
     assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
 
 
-def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all():
+def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter():
     frequency = 0.5
     rate = 100.0
     time = np.arange(3000) / rate
@@ -469,7 +469,7 @@ def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch)
     np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)
     low_pass = LowPass(2.0, design="fir", reach=50.0)
     through_spectra = low_pass(lap(n_samples=12_000))["ay"]
-    monkeypatch.setattr(transforms, "LONGEST_DIRECT", 20_000)
+    monkeypatch.setattr(transforms, "MAX_DIRECT_TAPS", 20_000)
     np.testing.assert_allclose(through_spectra, low_pass(lap(n_samples=12_000))["ay"], atol=1e-12)
 
 

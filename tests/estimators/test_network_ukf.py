@@ -361,3 +361,26 @@ def test_floor_of_the_variance_is_a_setting_of_both_hybrids(least_variance):
     estimator.network = estimator.new_network()
     found = estimator.output_of(torch.full((2, 4), -40.0))
     np.testing.assert_allclose(found.variance.numpy(), least_variance, rtol=1e-6)
+
+
+def test_losses_beyond_the_limit_are_tangents_through_the_filter_and_in_its_searches():
+    _, own = end_to_end()
+    batch = next(iter(own.batches(torch.Generator().manual_seed(0))))
+    skid = batch._replace(sideslip=batch.sideslip + 1.0)  # rad, far beyond any limit
+    own.training = replace(own.training, loss_limit=3.0)
+    first, second = (
+        float(own.loss(skid._replace(sideslip=skid.sideslip + step)).detach())
+        for step in (0.0, 0.1)
+    )
+    slope = 2 * 2 * np.radians(3.0)  # of both angles
+    assert second - first == pytest.approx(slope * 0.1, rel=1e-6)
+    estimator = estimator_of("cnn_ukf")
+    pseudo = [
+        PseudoMeasurement(drive["sideslip_ref"] + 0.4, np.full(len(drive), 1e-12))
+        for drive in DATA.train
+    ]
+    plain = estimator.mean_squared_error(DATA.train, pseudo=pseudo)
+    limited = estimator.mean_squared_error(DATA.train, pseudo=pseudo, limit=3.0)
+    assert limited < 0.5 * plain
+    with pytest.raises(ConfigurationError, match=r"training\.loss_limit is of squared errors"):
+        EnsembleSettings(loss_limit=3.0)

@@ -1,5 +1,7 @@
 """Networks over single samples: compiled layers, masks of dropout, members that do not touch each other, and the feed-forward network."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -212,4 +214,17 @@ def test_inputs_are_scaled_by_their_range_or_to_z_scores():
     assert (
         estimator_class("sideslip_ffnn").from_config({"normalisation": "standard"}).variant
         == "full_standard"
+    )
+
+
+def test_a_network_reports_its_limited_squares():
+    limit = 0.5  # deg
+    estimator, record = fitted(replace(QUICK, loss_limit=limit))
+    drive = DATA.validation[0]
+    estimate = estimator.estimate([drive.without_references()])[0]
+    error = np.abs(np.degrees(estimate["sideslip"] - drive["sideslip_ref"]))
+    assert error.max() > limit
+    squares = np.where(error <= limit, np.square(error), limit * (2.0 * error - limit))
+    assert np.degrees(np.degrees(record.metrics["best_validation_loss"])) == pytest.approx(
+        squares.mean(), rel=1e-3
     )

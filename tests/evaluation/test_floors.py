@@ -88,7 +88,7 @@ def markov(generator, n, deviation, time_constant):
     return values
 
 
-def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent_and_a_perfect_estimate_scores_it():
+def test_white_noise_of_a_reference_is_estimated_within_a_few_per_cent():
     """In sideslip too: the truth itself, held against the reference."""
     for sigma in (0.003, 0.02, 0.1):
         floor = reference_floor([drive_of(noisy_reference(sigma), Span("d", "drive"), PROTOCOL)])
@@ -174,7 +174,7 @@ def test_bound_is_that_of_tichavsky_and_others():
             )
 
 
-def test_long_drives_are_bounded_in_chunks_of_the_same_outcome_and_gaps_and_standstill_finitely(
+def test_bound_of_a_long_drive_is_the_same_in_chunks(
     monkeypatch,
 ):
     drive = drive_of(single_track_drive(60.0), Span("d", "track"), PROTOCOL)
@@ -213,7 +213,7 @@ def test_white_and_slow_noise_are_told_apart_and_their_times_found():
     assert noise == Noise(0.0, pytest.approx(0.7, rel=0.1), pytest.approx(2.5, rel=0.2))
 
 
-def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_reference():
+def test_more_inputs_never_raise_the_bound():
     drives = [drive_of(single_track_drive(), Span("d", "track"), PROTOCOL)]
     spread = reference_spread(drives)
     for car in (False, True):

@@ -104,7 +104,7 @@ def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
     assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
 
 
-def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_have_their_states():
+def test_weighted_metrics_match_a_hand_calculation():
     zero = np.zeros(2)
     other_states = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
     is_scored = np.ones(2, dtype=bool)
@@ -172,7 +172,7 @@ def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_
     assert moving["mse_sideslip"] == everywhere["mse_sideslip"]  # of a paper: all samples
 
 
-def test_a_car_that_stands_throughout_has_no_sideslip_error_but_one_of_lateral_velocity(drive):
+def test_standing_car_has_an_error_of_lateral_velocity_alone(drive):
     at_rest = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
     recording = replace(drive, channels={**drive.channels, **at_rest})
     estimate = _estimate(recording.time, np.full(len(recording), 0.1), 20.0, 0.0)
@@ -187,7 +187,7 @@ def test_a_car_that_stands_throughout_has_no_sideslip_error_but_one_of_lateral_v
     assert (list(ranking.order), ranking.winner, ranking.n_blocks) == ([], None, 0)
 
 
-def test_speed_from_which_sideslip_is_scored_follows_the_wheelbase_unless_it_is_given():
+def test_min_sideslip_speed_follows_the_wheelbase_unless_set():
     assert min_sideslip_speed(None) == min_sideslip_speed(2.7) == 1.0
     assert min_sideslip_speed(0.324) == pytest.approx(0.3464, abs=1e-4)
     by_car = Protocol().with_wheelbases({"car": 2.7, "model": 0.675, "unknown": None})
@@ -262,7 +262,7 @@ def figures(recording, vy):
     return lever_arm_figures([scored(recording, vy)], [(recording, span)], PROTOCOL)
 
 
-def test_a_planted_lever_arm_is_found_and_leaves_no_error_and_nothing_is_given_where_the_point_is_known_or_undeclared():
+def test_planted_lever_arm_is_estimated_only_where_the_reference_point_is_unknown():
     recording = drive()
     for x in (-0.4, 0.0, 0.27):
         values = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])

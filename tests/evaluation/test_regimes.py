@@ -54,7 +54,7 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     assert masks["steady"][(time < 9.7) | ((time > 11.5) & (time < 19.7)) | (time > 21.8)].all()
 
 
-def test_regimes_of_a_range_are_those_of_the_whole_drive_and_slopes_are_known_across_a_gap():
+def test_regimes_of_a_range_are_those_of_the_whole_drive():
     regimes = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     cut = regimes_of(stepped_drive(), Span("d", "steps", 5.0, 20.5), Protocol(RATE, 0.0, 1.5))
     for name, mask in cut.items():
@@ -111,7 +111,7 @@ def test_evaluation_writes_regimes_as_subsets_and_prints_figures_of_all_samples_
     assert "share" not in by_subset["all"]
 
 
-def test_the_speed_of_a_test_follows_the_car_of_its_data_set_and_another_car_evaluates_again(place):
+def test_min_sideslip_speed_follows_the_car_of_the_data_set(place):
     run = ("estimator=static_map", "split=mine", "tracking=none")
     assert place("train", *run)[0] == 0
     folders = []

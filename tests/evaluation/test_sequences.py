@@ -38,7 +38,7 @@ def recording(seconds, start_time=100.0):
     return Recording("r", "car", 100.0, start_time, channels)
 
 
-def test_ranges_are_cut_from_their_starts_where_the_reference_state_is_taken_and_remainders_left_out():
+def test_sequences_start_at_the_range_start_and_omit_the_remainder():
     drive = recording(35.0)
     spans = [Span("d", "r"), Span("d", "r", 103.0, 114.0), Span("d", "r", 100.0, 105.0)]
     pieces = sequences(spans, lambda span: drive, Protocol(sequence_seconds=10.0, rate_hz=100.0))

@@ -46,7 +46,7 @@ def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_se
     assert 0.91 <= median <= 0.99
 
 
-def test_a_shift_is_found_although_sequences_differ_more_and_one_lucky_training_of_three_proves_nothing():
+def test_shift_is_significant_and_one_lucky_training_of_three_is_not():
     generator = np.random.default_rng(2)
     hard = np.repeat(20.0 * generator.random(N_SEQUENCES), LENGTH)
     first, second = (hard + losses(generator, 3, 0.1) for _ in range(2))
@@ -101,7 +101,7 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
     assert root_intervals(sums, sizes) == [root_interval(candidate, sizes) for candidate in sums]
 
 
-def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone():
+def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds():
     """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
     sizes = np.ones(40)
     even = np.full((3, 40), 0.0)

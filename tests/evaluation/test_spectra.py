@@ -18,7 +18,7 @@ from vehest_papers.kit.spectra import (
 RATE = 20.0
 
 
-def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_any_colour():
+def test_density_of_white_noise_is_its_variance_over_the_band():
     """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
     density = periodogram([noise], RATE)
@@ -77,7 +77,7 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
     )
 
 
-def test_level_is_the_mean_of_a_third_of_an_octave_and_what_cannot_be_read_is_refused():
+def test_level_is_the_mean_of_a_third_of_an_octave():
     spectrum = periodogram([np.random.default_rng(4).standard_normal(2048)], RATE)
     inside = [
         density

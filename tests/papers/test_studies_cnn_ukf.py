@@ -26,23 +26,25 @@ from vehest.estimators.networks.sample_network import INPUTS
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score_all
-from vehest.report.document import Figure, Table
+from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
 from vehest_papers.cnn_ukf import (
     block_errors,
+    calibration,
     document,
     documents,
+    factorial,
     measures,
     networks,
     observability,
     paper,
     perturbed,
-    search,
 )
 from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors, sums_of
 from vehest_papers.cnn_ukf.limited import limited
+from vehest_papers.cnn_ukf.manoeuvres import car_of
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.subjects import (
     OFFLINE,
@@ -68,7 +70,6 @@ SPLIT = Split(
     {"test": tuple(Span("car", name, 1.5) for name in TESTS)},
 )
 TRAINED = {"phase": {"patience": 6, "max_epochs": 30}, "batch_size": 32, "steps": 256}
-POINT = "point"
 SAMPLES = SampleSettings(PhaseSettings(learning_rate=1e-3, max_epochs=1))
 
 
@@ -96,7 +97,7 @@ def fitted_models(data):
 
 
 def further_networks(data):
-    """A recurrent network with all 17 inputs, and a point of the search."""
+    """A recurrent network with all 17 inputs."""
     recurrent = estimator_class("velocity_gru").from_config(
         {"inputs": list(INPUTS["full"]), "outputs": ["vy"], "n_states": 4}
     )
@@ -104,10 +105,7 @@ def further_networks(data):
     recurrent.fit(
         data, SequenceSettings(phase, sequence_steps=100, validation_steps=100, dropped_steps=20)
     )
-    narrower = estimator_class("sideslip_ffnn").from_config({"hidden": [5, 6]})
-    narrower.seed(0)
-    narrower.fit(data, SAMPLES)
-    return {paper.RECURRENT: (recurrent, [0, 1]), POINT: (narrower, [0])}
+    return {paper.RECURRENT: (recurrent, [0, 1])}
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +118,9 @@ def everything(tmp_path_factory):
     models = []
     rows = []
     fitted = fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]]))
-    for number, (candidate, (estimator, seeds)) in enumerate(fitted.items()):
+    for number, (estimator, seeds) in enumerate(fitted.values()):
         for seed in seeds:
-            home = folder / f"{candidate if candidate == POINT else number}-{seed}"
+            home = folder / f"{number}-{seed}"
             home.mkdir()
             save_model(estimator, home)
             (home / "fit.csv").write_text("metric,value\nbest_validation_loss,1.0\nbest_epoch,1\n")
@@ -176,11 +174,7 @@ def everything(tmp_path_factory):
 @pytest.fixture(scope="module")
 def part(everything):
     """What Table II needs."""
-    of_table = [
-        own
-        for own in everything.models
-        if own.estimator != "velocity_gru" and not own.model_folder.name.startswith(POINT)
-    ]
+    of_table = [own for own in everything.models if own.estimator != "velocity_gru"]
     return replace(everything, models=of_table)
 
 
@@ -192,69 +186,73 @@ def runs(part):
 @pytest.fixture(scope="module")
 def report(part, everything):
     """Of a study whose parts are all made from the same small models."""
-    names = ("full", "before", "free", "ablation", "z_scores", "limited", "recurrent", "search_5_6")
-    models = {
-        "before": [own for own in part.models if own.estimator == "cnn_ukf"],
-        "free": [
-            own
-            for own in part.models
-            if own.variant.endswith("_smooth") or own.estimator == "cnn_ukf"
-        ],
-        "ablation": [
-            replace(own, variant=f"full_no_{removed}")
-            for removed in ("adaptive_process", "adaptive_distrust", "pseudo_measurement")
-            for own in part.models
-            if own.estimator == "cnn_ukf"
-        ],
-        "z_scores": [own for own in part.models if own.estimator in ("sideslip_ffnn", "cnn_ukf")],
-        "limited": [
-            own
-            for own in part.models
-            if own.estimator in ("sideslip_ffnn", "ensemble_ukf", "cnn_ukf")
-        ],
-        "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
-        "search_5_6": [own for own in everything.models if own.model_folder.name.startswith(POINT)],
+    of_estimator = {
+        name: [own for own in part.models if own.estimator == name]
+        for name in ("cnn_ukf", "ensemble_ukf", "sideslip_ffnn")
     }
-    parts = {name: replace(part, models=models.get(name, part.models)) for name in names}
-    return documents(
-        StudyArtefacts(
-            "cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []
-        )
-    )["report"]
+    smooth = [own for own in part.models if own.variant.endswith("_smooth")]
+    removed = ("adaptive_process", "adaptive_distrust", "pseudo_measurement")
+    models = {
+        "full": part.models,
+        "before": of_estimator["cnn_ukf"],
+        "free": [*smooth, *of_estimator["cnn_ukf"]],
+        "ablation": [
+            replace(own, variant=f"full_no_{element}")
+            for element in removed
+            for own in of_estimator["cnn_ukf"]
+        ],
+        "z_scores": [*of_estimator["sideslip_ffnn"], *of_estimator["cnn_ukf"]],
+        "limited": [own for models in of_estimator.values() for own in models],
+        "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
+        "factorial_plain_paper": [own for own in part.models if own.variant == "dugoff_full"],
+        "factorial_smooth_paper": [*smooth, *of_estimator["cnn_ukf"]],
+        "floor_1e-8": of_estimator["ensemble_ukf"],
+    }
+    return report_of(part, models)
+
+
+def report_of(part, models, not_trained=None):
+    """The report of a study whose parts have these models."""
+    parts = {name: replace(part, models=of_part) for name, of_part in models.items()}
+    titles = {name: f"Part {name}" for name in models}
+    artefacts = StudyArtefacts("cnn_ukf", "t", "a", "c", titles, parts, [])
+    return documents(replace(artefacts, not_trained=not_trained or {}))["report"]
+
+
+def text_of(report):
+    return "\n".join(block if isinstance(block, str) else block.caption for block in report.blocks)
+
+
+def table_of(report, name):
+    (table,) = (own for own in report.blocks if isinstance(own, Table) and own.name == name)
+    return table.frame
 
 
 def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict_with_an_interval(
     report,
 ):
-    text = "\n".join(block if isinstance(block, str) else block.caption for block in report.blocks)
+    text = text_of(report)
     shown = {block.name for block in report.blocks if isinstance(block, Figure)}
-    assert {f"figure_{number}" for number in range(4, 15)} == shown
+    assert {*(f"figure_{number}" for number in range(4, 15)), "loss_curves"} == shown
     of_tables = {block.name for block in report.blocks if isinstance(block, Table)}
-    assert {
-        "claims",
-        "overview",
+    assert of_tables == {
         "table_2",
-        "table_3",
+        "by_car",
+        "factorial",
+        "effects",
         "ablation",
-        "perturbed",
-        "observability",
-        "filters",
-        "scaling",
-        "budget",
-        "networks_alone",
-        "networks_limited",
-        "oracles",
-        "search",
-    } <= of_tables
+        "floor",
+        "calibration",
+        "verdicts",
+        "table_3",
+        "overview",
+    }
+    assert {"claims", "perturbed", "observability", "filters", "scaling", "budget"} <= set(
+        report.data
+    )
     assert "SIMULATED data" in text
     assert not re.search(r"\bnan\b", text)
-    words = sum(len(block.split()) for block in report.blocks[:2])
-    assert words <= 300
-    (claims,) = (
-        block.frame
-        for block in report.blocks
-        if isinstance(block, Table) and block.name == "claims"
-    )
+    claims = report.data["claims"]
     content = claims_of("cnn_ukf")
     assert set(claims["id"]) == {claim.id for claim in content.claims}
     assert set(claims["verdict"]) <= set(VERDICTS)
@@ -263,6 +261,85 @@ def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict
         "model_based_above_cnn_ukf_braking",
         "model_based_above_cnn_ukf_skidpad",
     }, "no such manoeuvres in this test"
+
+
+def test_first_screen_and_report_are_short(report, tmp_path):
+    write_document(report, tmp_path, page=False)
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    first_300 = " ".join(text.split()[:300])
+    for word in ("**Question.**", "**Answer.**", "**Evidence.**", "**Recommendation.**"):
+        assert word in first_300
+    assert len(text.split()) <= 3000
+    assert "{% if" not in document.TEMPLATE.read_text(encoding="utf-8")
+
+
+def test_factorial_has_a_ratio_for_each_effect_with_cells_and_names_what_is_not_trained(report):
+    cells = table_of(report, "factorial").set_index(["curve", "noise"])
+    assert cells.loc[("plain", "free")].tolist() == ["not trained yet"] * 3
+    assert cells.loc[("smooth", "paper's"), "ensemble"] == "not trained yet"
+    effects = table_of(report, "effects").set_index("effect")
+    assert effects["cells"].to_dict() == {
+        "smooth over plain tyres": 1,
+        "free over the paper's process noise": 0,
+        "ensemble over no network": 0,
+        "end to end over no network": 1,
+        "end to end over ensemble": 0,
+    }
+    floors = table_of(report, "floor").set_index(["candidate", "floor"])
+    assert floors.loc[(paper.DEEP, "1e-8"), "correlation"] == pytest.approx(
+        floors.loc[(paper.DEEP, "1e-6"), "correlation"]
+    )
+    assert floors.loc[(paper.CNN, "1e-7"), "mse_nonlinear"] == "not trained yet"
+
+
+def test_effects_are_geometric_means_over_manoeuvres_and_cells():
+    levels = {("plain", "paper"): 2.0, ("smooth", "paper"): 1.0, ("plain", "free"): 1.0}
+    levels[("smooth", "free")] = 0.25
+    made = {
+        factorial.cell_name((curve, noise, "none")): [
+            made_run("any", [size * WAVE * level for size in (1.0, 2.0, 3.0)])
+        ]
+        for (curve, noise), level in levels.items()
+    }
+    effects = factorial.effects_of(ManoeuvreErrors(made))
+    figure, cells = effects["smooth over plain tyres"]
+    assert cells == 2
+    assert figure.value == pytest.approx(np.sqrt(0.5**2 * 0.25**2))
+    assert effects["end to end over ensemble"][1] == 0
+
+
+def test_raw_coverage_is_that_of_the_filters_normal_distribution():
+    class Given:
+        def with_covariances(self, model, test):
+            zero = np.zeros(4)
+            errors = np.array([0.5, -0.9, 1.5, -3.0])
+            variance = np.ones((4, 1, 1))
+            yield Scored(zero, errors, zero, zero, zero, zero, zero > -1, {}, variance, ("vy",))
+
+    run = made_run("any", [WAVE])
+    assert calibration.raw_coverages(run, Given()).tolist() == [0.5, 0.75]
+
+
+def test_a_partial_study_names_what_is_not_trained(part):
+    models = [own for own in part.models if own.estimator in ("zero", "sideslip_ffnn")]
+    report = report_of(part, {"full": models}, {"full": ["cnn_ukf-seed0"], "ablation": ["a", "b"]})
+    text = text_of(report)
+    assert "3 planned trainings are not done, of the parts `full`, `ablation`" in text
+    assert "CNN-UKF; " in text
+    assert "DE-UKF is not trained yet" in text
+    assert set(table_of(report, "table_2")["candidate"]) == {paper.DATA, paper.ZERO}
+    states = report.data["training"].set_index("candidate")["training"]
+    assert states[paper.CNN] == states[paper.MODEL] == "not trained"
+
+
+def test_errors_are_given_by_car():
+    names = ("soft_lap_on_001", "standard_lap_on_001", "laden_lap_on_001", "test_lap_1")
+    assert [car_of(name) for name in names] == [
+        "softer tyres",
+        "as in training",
+        "laden",
+        "as in training",
+    ]
 
 
 def test_report_writes_the_errors_of_every_manoeuvre_and_seed(report, part, runs):
@@ -474,11 +551,11 @@ def test_twice_the_epochs_check_the_full_set():
     assert "by -75.0 %" in row.reason
 
 
-def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_cut():
+def test_a_drive_is_scored_whole_or_until_it_slides_and_the_report_counts_those_that_slide():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
     part = Scored(np.arange(4.0), angle, angle, angle, angle, angle, np.ones(4, dtype=bool))
     assert len(until(part, 0.21).time) == 2
-    assert len(until(part, 0.3).time) == 4
+    assert len(until(part, 0.3).time) == len(until(part, np.inf).time) == 4
 
     def driven(*largest):
         test = {
@@ -487,12 +564,8 @@ def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_
         }
         return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
 
-    assert (
-        document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0))
-        == "2 of 4 drives, with up to 180° and 43°, are"
-    )
-    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
-    assert document._cut_in_words(driven(3.0)) == "no drive is"
+    assert document._number_beyond(driven(3.0, 43.0, 11.9, 180.0), 0.21) == 2
+    assert document._number_beyond(driven(3.0), 0.21) == 0
 
 
 def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, runs, monkeypatch):
@@ -574,28 +647,8 @@ def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(part, runs,
     changed = limited({**runs, paper.DEEP: of_full}, learnt, prepared)
     assert [run.kpis.mse for run in changed.rescaled] != pytest.approx(as_tuned, rel=1e-2)
     assert paper.MODEL in changed.comparison  # the filter of the full set
-    with pytest.raises(DataError, match="no CNN-UKF among the models of part 'limited'"):
-        limited(runs, {name: learnt[name] for name in (paper.DATA, paper.DEEP)}, prepared)
-
-
-def test_the_search_compares_validation_with_the_papers_widths(everything, runs):
-    point = replace(
-        everything,
-        models=[own for own in everything.models if own.model_folder.name.startswith(POINT)],
-    )
-    parts = {
-        "search_5_6": runs_of(point, Prepared(point)),
-        "z_scores": {paper.DATA: runs[paper.DATA]},
-    }
-    assert list(search.points_of(parts, runs)) == [(5, 6), (10, 6)]
-    table = search.search_table(parts, runs, "D")
-    assert table.frame["ratio"].tolist()[1] == "–"
-    assert table.frame["weights"].tolist() == [5 * 18 + 6 * 6 + 7, 10 * 18 + 6 * 11 + 7]
-    wild = replace(runs[paper.DATA][0], test={})  # the search knows no test
-    assert (
-        search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist()
-        == table.frame["validation"].tolist()
-    )
+    partial = limited(runs, {paper.DATA: learnt[paper.DATA]}, prepared)
+    assert set(partial.outputs) == set()
 
 
 def test_manoeuvres_in_two_ranges_and_reports_without_a_main_part_are_refused(part):

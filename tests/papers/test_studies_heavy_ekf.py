@@ -1,4 +1,4 @@
-"""Pieces of the study of heavy-vehicle laps, on a short drive of a filter whose curves and levels are given."""
+"""Measures of the study of heavy-vehicle laps, on a short drive."""
 
 import math
 from dataclasses import replace
@@ -8,14 +8,11 @@ import pytest
 
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, TrackNoise
-from vehest.vehicle.parameters import SingleTrackParameters
-from vehest_papers.heavy_ekf import accuracy, tables, tyres, vehicle, watching
-from vehest_papers.heavy_ekf.document import WHEELS
-from vehest_papers.heavy_ekf.subjects import Filter, corners
+from vehest_papers.heavy_ekf import accuracy
+from vehest_papers.heavy_ekf.subjects import corners
 
 RATE = 20.0
-TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
+WHEEL_RADIUS = 0.48
 
 
 def short_drive(seconds=60.0):
@@ -39,7 +36,7 @@ def short_drive(seconds=60.0):
     }
     sides = {"fl": 1.04, "fr": -1.04, "rl": 1.04, "rr": -1.04}
     channels |= {
-        f"wheel_speed_{wheel}": (u - yaw_rate * side) / WHEELS.wheel_radius
+        f"wheel_speed_{wheel}": (u - yaw_rate * side) / WHEEL_RADIUS
         for wheel, side in sides.items()
     }
     references = {
@@ -49,61 +46,6 @@ def short_drive(seconds=60.0):
         "sideslip_ref": 0.01 * yaw_rate,
     }
     return Recording("short", "truck", RATE, 0.0, channels | references, "simulated")
-
-
-@pytest.fixture(scope="module")
-def ratte():
-    curves = AxleCurves(0.013, 487e3, 0.0077, 622e3)
-    return RationalFilter(
-        RationalFilter.settings_type(
-            car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003)
-        )
-    )
-
-
-def test_every_fault_leaves_the_filter_finite_and_the_monitor_sees_another_sign(ratte):
-    drive = short_drive()
-    for name, apply in watching.faults(WHEELS).items():
-        estimate = ratte.estimate([apply(drive).without_references()])[0]
-        assert all(np.isfinite(values).all() for values in estimate.channels.values()), name
-    wrong = watching.faults(WHEELS)["yaw rate of the other sign"](drive)
-    sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
-    limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))
-    assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
-    nis = np.repeat([2.0, 6.0, 0.0], 200)
-    dof = np.repeat([2.0, 1.0, 0.0], 200)
-    np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
-
-
-def test_table_of_bad_input_names_the_drive_backwards(ratte):
-    drive = short_drive()
-    filters = {"RATTE": Filter("RATTE", None, ratte)}
-    table, *words = watching.bad_input_table(filters, drive, [drive], WHEELS, 2.0, "SIMULATED")
-    said = table.frame.set_index("fault")["check"]
-    assert said["nothing"] == "–"
-    assert said["the drive backwards"] == "reverse: vx"
-    assert not any("the drive backwards" in str(block) for block in words)
-
-
-def test_convergence_counts_from_the_last_time_outside():
-    time = np.arange(6.0) + 100.0
-    assert tyres.convergence_time(time, np.array([2.0, 1.0, 1.5, 1.05, 1.0, 0.95]), 1.0) == 3.0
-    assert tyres.convergence_time(time, np.full(6, 1.05), 1.0) == 0.0
-    assert tyres.convergence_time(time, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.2]), 1.0) == math.inf
-
-
-def test_gains_are_those_of_the_figures_and_locked_axles_named():
-    rmse = {
-        (name, f"{kind}_{drive}"): value
-        for name, value in (("LINT", 1.0), ("RATT", 0.5), ("RATTE", 0.25))
-        for kind in tables.TYRES
-        for drive in tables.DRIVES
-    }
-    frame = tables.gains_table(rmse).frame
-    assert frame["nominal_laps"].tolist() == ["50 %", "50 %", "75 %"]
-    assert frame["paper"].tolist() == ["37 %", "44 %", "65 %"]
-    assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
-    assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""
 
 
 def estimated(drive, gain, noise=0.0):

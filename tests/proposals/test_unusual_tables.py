@@ -56,13 +56,13 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     assert recording.rate_hz == 50.0
 
 
-@pytest.mark.parametrize("of_names", [True, False], ids=["names", "rows"])
-def test_a_delimiter_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names):
+@pytest.mark.parametrize(
+    ("of_names", "of_rows"), [(",", ""), ("", ","), ("", ",,"), (",", ",,"), (",,", "")]
+)
+def test_delimiters_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names, of_rows):
     table = usual(drive())
     lines = lines_of(table)
-    lines = (
-        [lines[0] + ",", *lines[1:]] if of_names else [lines[0], *(row + "," for row in lines[1:])]
-    )
+    lines = [lines[0] + of_names, *(row + of_rows for row in lines[1:])]
     file = tmp_path / "lap.csv"
     file.write_text("\n".join(lines), encoding="utf-8")
     assert_yaw_rate_is(read_back(file)[1], table)
@@ -110,13 +110,35 @@ TIMES = {
     "day first": lambda at: at.strftime("%d/%m/%Y %H:%M:%S.%f"),
     "milliseconds by a colon": lambda at: at.strftime("%H:%M:%S:") + at.strftime("%f")[:3],
     "timedelta": lambda at: f"{at.day % 31} days {at:%H:%M:%S.%f}",
+    "month by name": lambda at: at.strftime("%d-%b-%Y %H:%M:%S.%f"),
+    "year of two digits": lambda at: at.strftime("%m/%d/%y %I:%M:%S.%f%p"),
+    "ISO without marks": lambda at: at.strftime("%Y%m%dT%H%M%S.%fZ"),
+    "underscore": lambda at: at.strftime("%Y-%m-%d_%H:%M:%S.%f"),
+    "hhmmss": lambda at: at.strftime("%H%M%S.%f"),
 }
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01)])
+def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, seconds):
+    table = usual(drive())
+    table["Time [s]"] /= seconds
+    file = exact(tmp_path / "lap.csv", table.rename(columns={"Time [s]": f"time [{unit}]"}))
+    clock = inspect("my_car", [file]).log.clock
+    assert (clock.asked, read_back(file)[1].rate_hz) == (False, 50.0)
+
+
+def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path):
+    table = usual(drive()).rename(columns={"Time [s]": "time [ticks]"})
+    table["time [ticks]"] *= 100.0
+    clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
+    assert (clock.unit, clock.asked) == ("ms", True)
 
 
 @pytest.mark.parametrize("name", TIMES)
 def test_times_of_a_clock_in_other_forms_go_on_past_midnight(tmp_path, name):
     table = usual(drive())
     table["Time [s]"] = clock_texts(TIMES[name])
+    table = table.rename(columns={"Time [s]": "Time"})
     made, recording = read_back(write(tmp_path / "lap.csv", table))
     assert (made.dataset["time"]["unit"], recording.rate_hz) == ("clock", 50.0)
     assert_yaw_rate_is(recording, table)
@@ -139,15 +161,17 @@ def test_durations_of_parquet_are_times_and_columns_that_are_not_read_are_named(
     assert [note for note in made.notes if note.startswith("not read: column 'ok' holds bool")]
 
 
-def long_format():
-    rows = ((k, name, k % 7) for k in range(200) for name in ("speed", "accy_can"))
-    return "time,lap,telemetry_name,telemetry_value\n" + "".join(
-        f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows
-    )
+def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
+    rows = ((k, name, k % 7) for k in range(n_rows) for name in ("speed", "accy_can"))
+    if n_rows > 600:  # one quantity after the other
+        rows = sorted(rows, key=lambda row: row[1])
+    return f"{header}\n" + "".join(f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows)
 
 
 UNSUITED = {
     "long format": (long_format(), "'telemetry_name' names the quantity, 'telemetry_value' holds"),
+    "names of a database": (long_format("_time,lap,_field,_value"), "'_field' names the quantity"),
+    "one quantity after the other": (long_format(n_rows=700), "'telemetry_name' names the"),
     "raw frames": (
         "Time,ID,DLC,Data\n" + "".join(f"{k},1A{k % 9},2,00 {k % 256:02X}\n" for k in range(99)),
         "raw frames of a CAN bus; decode them by the bus's DBC",
@@ -173,6 +197,22 @@ def test_a_file_without_a_column_a_signal_is_named_with_the_way_out(tmp_path, na
     assert said in str(refused.value)
 
 
+def test_long_format_in_parquet_is_named_too(tmp_path):
+    long = usual(drive(10.0)).melt("Time [s]", var_name="signal", value_name="value")
+    long.to_parquet(tmp_path / "lap.parquet")
+    with pytest.raises(DataError, match="'signal' names the quantity, 'value' holds it"):
+        inspect("my_car", [tmp_path / "lap.parquet"])
+
+
+def test_decimal_commas_in_quotes_between_commas_are_read(tmp_path):
+    table = usual(drive())
+    lines = [[f'"{cell}"' for cell in line.split(",")] for line in lines_of(table)]
+    text = "\n".join(",".join(cells).replace(".", ",") for cells in lines)
+    (tmp_path / "lap.csv").write_text(text, encoding="utf-8")
+    _, recording = read_back(tmp_path / "lap.csv")
+    assert_yaw_rate_is(recording, table)
+
+
 def test_a_column_of_names_beside_columns_of_signals_is_no_long_format(tmp_path):
     table = usual(drive()).assign(name="lap", value=np.arange(6000) % 50)
     assert inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel["ay"]
@@ -195,7 +235,7 @@ def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_pa
     np.testing.assert_allclose(recording["vy_ref"][~slow], d["vy"][~slow], atol=1e-2)
 
 
-@pytest.mark.parametrize("code", [-9999.0, 1e20, 327.67, 3.4028e38])
+@pytest.mark.parametrize("code", [-9999.0, 1e20, 327.67, 3.4028e38, 409.5, -128.0])
 def test_numbers_that_loggers_write_for_nothing_are_missing_samples(tmp_path, code):
     d = drive()
     table = usual(d)

@@ -11,6 +11,7 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.evaluation.metrics import accuracy, score_whole
+from vehest.report.drive_figure import drive_figure
 
 RATE = 20.0
 
@@ -46,7 +47,7 @@ def axes_of(figure, label):
 
 
 def test_page_has_a_panel_for_each_signal_and_the_legend_names_the_lines(drive):
-    figure = drive.plot(estimate_of(drive))
+    figure = drive_figure(drive, [estimate_of(drive)])
     assert labels(figure)[:7] == [
         "sideslip β [deg]",
         "health",
@@ -68,7 +69,7 @@ def test_page_has_a_panel_for_each_signal_and_the_legend_names_the_lines(drive):
 
 def test_lines_are_reference_and_estimate_in_degrees(drive):
     estimate = estimate_of(drive)
-    top = axes_of(drive.plot(estimate), "sideslip β [deg]")
+    top = axes_of(drive_figure(drive, [estimate]), "sideslip β [deg]")
     lines = {line.get_label(): line for line in top.get_lines()}
     middle = len(drive) // 2
     at = drive.time[middle]
@@ -81,7 +82,7 @@ def test_lines_are_reference_and_estimate_in_degrees(drive):
 
 
 def test_health_is_coloured_where_the_estimate_is_invalid(drive):
-    axes = axes_of(drive.plot(estimate_of(drive)), "health")
+    axes = axes_of(drive_figure(drive, [estimate_of(drive)]), "health")
     _, invalid = axes.collections
     (path,) = invalid.get_paths()
     first, end = path.get_extents().get_points()[:, 0]
@@ -91,7 +92,7 @@ def test_health_is_coloured_where_the_estimate_is_invalid(drive):
 
 def test_error_in_the_picture_is_that_of_the_metric(drive):
     estimate = estimate_of(drive)
-    figure = drive.plot(estimate)
+    figure = drive_figure(drive, [estimate])
     legend = axes_of(figure, "estimated β [deg]").get_legend()
     scored = accuracy([score_whole(estimate, drive)])
     assert scored["rmse_vy"] == pytest.approx(0.1, rel=1e-3)
@@ -103,13 +104,13 @@ def test_course_follows_a_circle():
     steps = np.ones(round(4 * np.pi * 50))
     channels = {"vx": 10.0 * steps, "yaw_rate": 0.5 * steps, "ay": 5.0 * steps}
     drive = Recording("circle", "car", 50.0, 0.0, channels | {"vy_ref": 0.0 * steps})
-    axes = axes_of(drive.plot(), "y [m]")
+    axes = axes_of(drive_figure(drive), "y [m]")
     points = np.concatenate(axes.collections[0].get_segments())
     assert np.hypot(points[:, 0], points[:, 1] - 20.0) == pytest.approx(20.0, abs=0.01)
 
 
 def test_two_estimates_by_one_estimator_differ_in_name_and_dash(drive):
-    figure = drive.plot(estimate_of(drive), estimate_of(drive, error=0.3))
+    figure = drive_figure(drive, [estimate_of(drive), estimate_of(drive, error=0.3)])
     lines = {line.get_label(): line for line in axes_of(figure, "v [m/s]").get_lines()}
     assert {"mine", "mine (2)"} <= lines.keys()
     assert lines["mine"].get_linestyle() != lines["mine (2)"].get_linestyle()
@@ -117,22 +118,22 @@ def test_two_estimates_by_one_estimator_differ_in_name_and_dash(drive):
 
 def test_what_is_not_there_is_left_out(drive):
     bare = drive.without_references().select(["vx", "ay"])
-    assert labels(bare.plot()) == ["speed u [m/s]", "$a_y$ [m/s²]"]
+    assert labels(drive_figure(bare)) == ["speed u [m/s]", "$a_y$ [m/s²]"]
     estimate = estimate_of(drive)
-    assert labels(estimate.plot()) == ["sideslip β [deg]", "health", "v [m/s]"]
+    assert labels(drive_figure(None, [estimate])) == ["sideslip β [deg]", "health", "v [m/s]"]
     plain = replace(estimate, channels={name: estimate[name] for name in ("vy", "sideslip")})
-    assert labels(plain.plot()) == ["sideslip β [deg]", "v [m/s]"]
+    assert labels(drive_figure(None, [plain])) == ["sideslip β [deg]", "v [m/s]"]
     alone = drive.select(["vy_ref"])
-    assert "there is nothing to draw" in refusal(alone.plot, DataError)
+    assert "there is nothing to draw" in refusal(lambda: drive_figure(alone), DataError)
 
 
 def test_a_range_is_drawn_alone_and_one_without_samples_is_refused(drive):
-    figure = estimate_of(drive).plot(drive, start=10.0, stop=12.0)
+    figure = drive_figure(drive, [estimate_of(drive)], 10.0, 12.0)
     assert axes_of(figure, "v [m/s]").get_xlim() == (10.0, pytest.approx(11.99))
-    assert "no samples between" in refusal(lambda: drive.plot(start=500.0), DataError)
+    assert "no samples between" in refusal(lambda: drive_figure(drive, start=500.0), DataError)
 
 
 def test_a_notebook_shows_it_and_the_same_drive_gives_the_same_bytes(drive):
-    picture = drive.plot(estimate_of(drive))._repr_png_()
+    picture = drive_figure(drive, [estimate_of(drive)])._repr_png_()
     assert picture.startswith(b"\x89PNG")
-    assert drive.plot(estimate_of(drive))._repr_png_() == picture
+    assert drive_figure(drive, [estimate_of(drive)])._repr_png_() == picture

@@ -10,7 +10,7 @@ from vehest.report.document import Column, Document, Table, bars_of, write_docum
 from vehest.report.explorer import explorer_json, packed, reckoned_course
 
 
-def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay_gaps():
+def test_packed_values_are_exact_within_half_a_step_and_keep_gaps():
     rng = np.random.default_rng(1)
     values = 30.0 * rng.standard_normal(5_000)
     values[100:120] = np.nan
@@ -26,7 +26,7 @@ def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay
     assert np.isnan(back["nothing"]).all()
 
 
-def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate_and_starts_anew_after_a_gap():
+def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate():
     n = 4_001
     step = 0.05
     x, y = reckoned_course(np.full(n, 20.0), np.full(n, -1.0), np.full(n, 0.2), step)

@@ -27,7 +27,7 @@ def said(part):
     return " ".join(verdict_of(part, "test")[0])
 
 
-def test_the_one_below_all_others_is_recommended_with_its_interval_what_it_beats_and_the_seed_chosen_on_validation(
+def test_best_estimator_is_recommended_with_interval_and_chosen_seed(
     part,
 ):
     found = verdict_of(without(part, "luenberger", "gru"), "test")
@@ -62,7 +62,7 @@ def test_of_two_that_are_alike_neither_is_significantly_worse(part):
     assert "**No estimator is recommended**: none was compared with" in bare
 
 
-def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_commands_take(part):
+def test_commands_use_the_recommended_model(part):
     """Luenberger comes first in the list, and GRU, alike on the test, has the lowest error on validation."""
     metrics = part.metrics.copy()
     metrics.loc[

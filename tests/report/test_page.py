@@ -79,9 +79,7 @@ def press(driver, text):
     button.click()
 
 
-def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_all_rows_those_of_the_leaderboard(
-    chromium, toy
-):
+def test_errors_over_filtered_rows_follow_the_signals(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     fill(chromium, "speed from [m/s]", "30")
@@ -279,9 +277,7 @@ def test_strip_of_sensor_health_has_a_legend(chromium, hour):
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
 
 
-def test_appendices_are_one_folded_list_at_the_end_and_the_contents_name_what_is_open(
-    chromium, toy
-):
+def test_appendices_are_one_folded_list_at_the_end(chromium, toy):
     opened(chromium, toy[0])
     after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
     found = chromium.execute_script(after)

@@ -187,7 +187,7 @@ def written(artefacts, tmp_path_factory):
     return folder
 
 
-def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test_and_the_lower_one_in_a_tie(
+def test_seed_is_chosen_on_validation_and_the_lower_one_in_a_tie(
     artefacts,
 ):
     row = row_of(leaderboard(artefacts), "ksnn")
@@ -243,7 +243,7 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
     assert (row["n_seeds"], row["n_parameters"], row["epochs"]) == (3, 20, 11)
 
 
-def test_leaderboard_is_sorted_by_the_sideslip_error_over_all_seeds_within_each_test_set(tmp_path):
+def test_leaderboard_is_sorted_by_sideslip_error_within_each_test_set(tmp_path):
     spans = {
         "late": (Span("toy", "lap", 60.0, 85.0),),
         "early": (Span("toy", "lap", 60.0, 66.0), Span("toy", "lap", 70.0, 80.0)),
@@ -267,9 +267,7 @@ def test_leaderboard_is_sorted_by_the_sideslip_error_over_all_seeds_within_each_
     } <= set(names)
 
 
-def test_narrower_subsets_and_other_conditions_do_not_enter_nor_does_a_way_through_csv(
-    artefacts, tmp_path
-):
+def test_subsets_and_other_conditions_do_not_enter_the_leaderboard(artefacts, tmp_path):
     other = artefacts.metrics.assign(value=99.0)
     metrics = pd.concat(
         [artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")]
@@ -307,7 +305,7 @@ def test_diverged_estimator_comes_last_and_shows_dashes(artefacts):
     )
 
 
-def test_two_values_for_one_run_and_several_seeds_without_validation_metrics_are_refused(artefacts):
+def test_ambiguous_runs_and_seeds_without_validation_are_refused(artefacts):
     twin = with_value(
         artefacts, 7.0, estimator="gru", seed=1, test_set="test", metric="rmse_vy"
     ).metrics
@@ -498,7 +496,7 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
 
 
-def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_figures_name_no_date(
+def test_markdown_report_has_valid_links_even_tables_and_undated_figures(
     written,
 ):
     text = (written / "report.md").read_text(encoding="utf-8")
@@ -696,7 +694,7 @@ def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefa
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
 
 
-def test_paths_of_figures_are_given_to_a_hundredth_of_a_point_and_pages_are_small_or_left_out(
+def test_paths_of_figures_have_hundredths_of_a_point(
     tmp_path,
 ):
     static = MatplotlibFigure()
@@ -722,7 +720,7 @@ def test_document_refuses_names_that_cannot_name_its_files(names):
         Document("Names", [Table(name, "", pd.DataFrame()) for name in names])
 
 
-def test_table_columns_line_up_with_the_digits_asked_for_and_dashes_for_missing_values():
+def test_table_columns_have_common_decimals_and_dashes_for_missing_values():
     frame = pd.DataFrame(
         {"error": [0.31234, 0.78, math.nan], "count": [12, 345678, 9], "name": ["a", None, "c"]}
     )
@@ -743,7 +741,7 @@ def test_table_columns_line_up_with_the_digits_asked_for_and_dashes_for_missing_
     assert (decimals_for([0.31, 0.44, 12.0]), decimals_for([math.nan])) == (3, 0)
 
 
-def test_each_family_has_one_hue_each_estimator_a_line_and_colours_stand_out_on_dark_and_light_pages():
+def test_each_family_has_one_hue_with_contrast_on_dark_and_light_pages():
     assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
     assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [

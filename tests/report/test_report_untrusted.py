@@ -48,9 +48,7 @@ def _rendered(folder):
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_name_ends_as_text_in_both_forms_of_a_report_and_reads_as_it_is_written(
-    tmp_path, name
-):
+def test_hostile_name_is_plain_text_in_both_forms_of_a_report(tmp_path, name):
     (tmp_path / "plain").mkdir()
     (tmp_path / "hostile").mkdir()
     write_document(_document("plain"), tmp_path / "plain")

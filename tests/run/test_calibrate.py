@@ -95,7 +95,7 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
         assert ("this model has no calibration" in json.loads(said)["verdict"]) != found
 
 
-def test_estimates_hold_the_bands_of_the_calibration_twice_as_wide_where_the_test_is_said_to_be_elsewhere(
+def test_bands_are_twice_as_wide_on_a_test_elsewhere(
     evaluated,
 ):
     place, model, evaluation = evaluated
@@ -142,9 +142,7 @@ def test_a_run_calibrates_each_model_once_and_shows_it(place):
     assert f" 4 {STAGE}" in line
 
 
-def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_folder_comes_first(
-    evaluated, tmp_path
-):
+def test_missing_calibration_is_made_again(evaluated, tmp_path):
     place, model, evaluation = evaluated
     found = calibration_of(model, place.folder / "outputs")
     (found.folder / "trust.yaml").unlink()
@@ -228,7 +226,7 @@ def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place)
     assert not (place.folder / "outputs" / STAGE).exists()
 
 
-def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_have_seen_the_test(
+def test_model_without_training_uses_no_calibration_of_its_test(
     place,
 ):
     place.change(

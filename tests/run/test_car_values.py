@@ -56,7 +56,7 @@ def settings_after(model, car=None, settings=None, record=None):
     return found.settings.wheelbase, found.settings.cg_to_rear_axle, " ".join(remarks)
 
 
-def test_the_command_line_comes_before_the_record_before_the_data_set_before_the_default(
+def test_command_line_precedes_record_data_set_and_default(
     self_calibrating,
 ):
     car = CarValues(wheelbase=2.4, cg_to_rear_axle=1.07)
@@ -131,6 +131,11 @@ def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
     assert values(config, first, other) == (None, None)
     given = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
     assert with_car_values(given, [car_of(first)]) is given
+    filter_of = {"name": "self_calibrating", "wheelbase": 2.7, "cg_to_rear_axle": None}
+    assert values({"estimator": filter_of}, first) == (2.4, 1.1)  # 2.7 m is its default
+    assert values({"estimator": filter_of}, first, other) == (2.7, None)
+    assert values({"estimator": filter_of}, TABLE | {"name": "one"}) == (2.7, None)
+    assert values({"estimator": filter_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     without = {"estimator": {"name": "zero"}}
     assert with_car_values(without, [car_of(first)]) is without
 
@@ -155,9 +160,7 @@ def model():
     )
 
 
-def test_a_band_is_the_same_under_every_name_of_a_data_set_unless_it_names_another_car(
-    place, model
-):
+def test_band_depends_on_the_car_and_not_on_the_name_of_a_data_set(place, model):
     vehest.save_model(model, place.folder / "own")
     write_lap(references=False)
     write_dataset("first")

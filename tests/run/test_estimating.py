@@ -92,7 +92,7 @@ def test_the_summary_names_the_point_of_the_self_calibrating_filter(saved):
     assert len(note) < 200
 
 
-def test_a_speed_that_stands_at_0_is_a_warning_health_accuses_it_and_strict_refuses_it(saved):
+def test_speed_stuck_at_zero_is_a_warning_and_refused_by_strict(saved):
     lap({"vx": np.zeros(3000)})
     said = "vx: constant at 0 m/s throughout; check the sensor, or leave the channel out"
     saved.refused(
@@ -129,7 +129,7 @@ def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accep
 
 
 def in_parts(monkeypatch, seconds=7.0):
-    monkeypatch.setattr("vehest.data.recording.LONGEST_PART", seconds)
+    monkeypatch.setattr("vehest.data.recording.MAX_PART_SECONDS", seconds)
     monkeypatch.setattr("vehest.sources.tabular.LARGE", 0)
 
 

@@ -15,7 +15,7 @@ from vehest.configuration.composition import compose_config
 from vehest.configuration.files import choices, packaged
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
-from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
+from vehest.run.evaluate_faults import FaultSettings, faults_of, union_of_faults
 from vehest.run.study import jobs_of, read_study
 from vehest.run.versions import code_of
 from vehest.trust.faults import KINDS, is_fault
@@ -65,7 +65,7 @@ def test_every_file_is_a_fault_with_every_key_and_a_word_on_each(kind):
     )
 
 
-def test_a_list_takes_what_it_does_not_say_from_the_kind_stands_before_the_choice_and_holds_a_fault_once():
+def test_list_of_faults_uses_defaults_of_its_kinds_and_precedes_the_choice():
     listed = (
         "faults=[{kind:drift,channel:ay,severity:mild},{kind:bias,channel:ax,size:0.4,start:3}]"
     )
@@ -74,14 +74,14 @@ def test_a_list_takes_what_it_does_not_say_from_the_kind_stands_before_the_choic
     assert (bias.condition, bias.start, bias.duration) == ("bias:ax:0.4", 3.0, 10.0)
     assert faults_of(compose_config("eval")) == ()
     fault = FaultSettings("bias", "ay", "mild")
-    assert all_of([[fault], [fault]]) == (fault,)
+    assert union_of_faults([[fault], [fault]]) == (fault,)
     assert "two faults are both called bias:ay:mild" in refusal(
-        lambda: all_of([[fault], [replace(fault, start=4.0)]]), ConfigurationError
+        lambda: union_of_faults([[fault], [replace(fault, start=4.0)]]), ConfigurationError
     )
-    assert len(all_of([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
+    assert len(union_of_faults([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
 
 
-def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_in_each():
+def test_fault_start_is_drawn_between_20_and_40_percent_of_each_range():
     fault = FaultSettings("bias", "ay", "mild", duration=5.0)
     onsets = np.array([fault.within(10.0, 100.0, position).onset for position in range(50)])
     assert 30.0 <= onsets.min() < 32.0
@@ -189,7 +189,7 @@ def test_values_that_are_not_finite_leave_finite_errors(trained):
     assert None not in found, "JSON has null for what is not finite"
 
 
-def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_without_faults_the_key_holds_nothing_of_them(
+def test_key_of_an_evaluation_contains_its_faults_alone(
     trained,
 ):
     first = evaluated(trained, "fault=noise")
@@ -252,7 +252,7 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
     )
 
 
-def test_a_fault_that_suits_no_channel_is_named_the_others_go_on_and_under_one_fault_settings_are_chosen_on_validation(
+def test_fault_without_its_channel_is_named_and_other_jobs_continue(
     place,
 ):
     quick = ("sweep", "split=mine", "tracking=none")

@@ -18,7 +18,7 @@ from vehest.inference.car_values import LIMITS, Number, calibrated, read_car, wi
 from vehest.inference.models import pretrained_folder
 from vehest.run.estimate import findings_of, wheelbase_findings
 from vehest.run.identify import (
-    LATENESS,
+    YAW_RATE_LATENESS_SECONDS,
     Normal,
     posterior_of,
     prior_of,
@@ -56,7 +56,7 @@ def model():
     )
 
 
-def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(model):
+def test_identified_values_of_a_car_reduce_the_error(model):
     record = record_of(
         model,
         {
@@ -151,7 +151,9 @@ def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(
     on_time, found = (posterior_of(model, recording("lap", own)) for own in (channels, late))
     for name in ("compliance", "rear_axle"):
         moved = found[name].mean - on_time[name].mean
-        assert moved == pytest.approx(0.04 / LATENESS * on_time[name].of_lateness, rel=0.4)
+        assert moved == pytest.approx(
+            0.04 / YAW_RATE_LATENESS_SECONDS * on_time[name].of_lateness, rel=0.4
+        )
         assert (
             abs(getattr(record_of(model, {"lap": found}), name).value - PLANTED[name])
             < 1.645 * getattr(record_of(model, {"lap": found}), name).deviation

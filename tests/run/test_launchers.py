@@ -64,9 +64,9 @@ def made_in(output):
 
 def test_progress_has_no_more_bars_than_fit_a_terminal():
     with FINE.bars() as bars:
-        for number in range(console.MOST_BARS + 5):
+        for number in range(console.MAX_BARS + 5):
             bars.step(f"training {number}", 0, 1, "starting")
-        assert len(bars.tasks) == console.MOST_BARS
+        assert len(bars.tasks) == console.MAX_BARS
 
 
 def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
@@ -132,9 +132,7 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert not old.exists()
 
 
-def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_back_failures_as_values(
-    place, monkeypatch
-):
+def test_without_ray_one_line_names_the_extra_to_install(place, monkeypatch):
     place.refused(
         "run",
         "small",
@@ -191,9 +189,7 @@ def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_what_jobs_ask_of_slurm_has_the_names_of_submitit_and_without_slurm_a_line_says_where_to_run(
-    tmp_path, monkeypatch
-):
+def test_slurm_options_have_the_names_of_submitit(tmp_path, monkeypatch):
     asked = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
     assert asked == {
         "slurm_partition": "long",

@@ -34,7 +34,7 @@ def steered(place):
     return place
 
 
-def test_whole_recording_is_a_test_without_training_and_the_model_is_the_same_for_every_split(
+def test_model_without_training_is_the_same_for_every_split(
     steered,
 ):
     folders = [

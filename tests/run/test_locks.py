@@ -12,7 +12,7 @@ from processes import start
 from vehest.artefacts.artefact import StagePlan, read_artefact
 from vehest.artefacts.locks import Lock, held
 from vehest.run import group
-from vehest.run.group import _held
+from vehest.run.group import _locked
 from vehest.run.train import TrainJob
 
 pytestmark = pytest.mark.apart
@@ -40,7 +40,7 @@ def held_elsewhere(output, stage, name):
         process.communicate()
 
 
-def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(
+def test_lock_ends_with_its_process_and_waiting_names_the_holder_once(
     tmp_path,
 ):
     lock = Lock(tmp_path, "train", "a model")
@@ -65,13 +65,13 @@ def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, m
     asked = iter([False, False, True])
     with (
         held_elsewhere(tmp_path, "compile", "health"),
-        group._compiled_by_one(tmp_path, lambda: next(asked)),
+        group._compile_lock(tmp_path, lambda: next(asked)),
     ):
         assert next(asked, "all") == "all"
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: False)
     with (
         held_elsewhere(tmp_path, "compile", "health"),
-        group._compiled_by_one(tmp_path, pytest.fail),
+        group._compile_lock(tmp_path, pytest.fail),
     ):
         pass
 
@@ -87,7 +87,7 @@ def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
     second.release()
 
 
-def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path):
+def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
     plans = [
         StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", tmp_path)
         for seed in range(3)
@@ -96,7 +96,7 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
     first = jobs[0].plan.lock
     second = jobs[1].plan.lock
     assert first.take()
-    with _held(jobs, lambda: False, pytest.fail) as free:
+    with _locked(jobs, lambda: False, pytest.fail) as free:
         assert [job.seed for job in free] == [1, 2]
         assert not second.take()
     assert second.take(), "a group that is done with its members holds none"
@@ -107,10 +107,10 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
         said.append(waiting)
         first.release()
 
-    with _held(jobs[:2], lambda: False, others_end) as free:
+    with _locked(jobs[:2], lambda: False, others_end) as free:
         assert [job.seed for job in free] == [0]
     assert [waiting.label for waiting in said] == [jobs[0].plan.folder.name]
-    with _held(jobs[1:2], lambda: True, said.append) as free:
+    with _locked(jobs[1:2], lambda: True, said.append) as free:
         assert free == [], "who is asked to stop waits no longer"
     second.release()
 
@@ -196,7 +196,7 @@ print(at_once(1, "alone"), at_once(3, "together"))
 """
 
 
-def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(
+def test_three_runs_at_once_make_each_artefact_and_mlflow_run_once(
     place,
 ):
     from mlflow import MlflowClient

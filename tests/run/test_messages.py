@@ -224,7 +224,7 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
     assert r"one\udcff" in (report.parent / "tables" / "ranges.csv").read_text(encoding="utf-8")
 
 
-def test_ranges_count_what_they_expand_to_and_the_limit_of_jobs_is_raised_by_an_override(place):
+def test_limit_of_jobs_counts_expanded_ranges(place):
     for text in (
         "range(7)",
         "range(2,9,3)",

@@ -1,5 +1,6 @@
 """`vehest plot` and `vehest estimate --plot`: pictures and a page of a drive, complete or not at all."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,10 @@ def test_recording_is_drawn_in_every_format(log, ending):
     assert outcome["has_reference"]
     content = Path(f"drive{ending}").read_bytes()
     assert content.startswith(STARTS[ending])
+    if ending == ".html":  # the page loads nothing
+        assert b'src="data:image/svg+xml' in content
+        loads = rb"<(?:script|img|iframe)[^>]*\ssrc=\"(?!data:)|<link\b|@import|url\((?!data:|#)"
+        assert re.findall(loads, content) == []
 
 
 def test_estimate_is_drawn_as_it_is_made_and_afterwards(log):

@@ -46,7 +46,7 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
     assert (bands > 0.0).all()
 
 
-def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_signal(place):
+def test_estimate_of_the_shipped_model_loads_no_torch_pandas_or_scipy_signal(place):
     write_csv(place.folder / "lap.csv", 9)
     program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
     for out in ("lap.parquet", "estimate.csv"):
@@ -58,7 +58,7 @@ def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_
         )
 
 
-def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equals_sign_is_no_override(
+def test_named_model_is_used_and_a_folder_is_no_recording(
     place,
 ):
     write_csv(place.folder / "speed=30.csv", 9)

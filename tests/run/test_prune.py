@@ -64,7 +64,7 @@ def name_of(artefact):
     return f"{artefact.stage}/{artefact.folder.name}"
 
 
-def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_installed(root):
+def test_artefacts_of_present_versions_are_kept(root):
     assert root.found() == {}
     inputs = {
         artefact.folder.name: artefact.digest
@@ -90,7 +90,7 @@ def test_what_other_code_has_made_is_found(root):
     assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
 
 
-def test_what_was_made_of_a_model_or_a_calibration_that_is_gone_is_found_but_not_a_model_without_its_recordings(
+def test_artefacts_without_their_model_or_calibration_are_unused(
     root,
 ):
     shutil.rmtree(root.trusted.folder)
@@ -102,7 +102,7 @@ def test_what_was_made_of_a_model_or_a_calibration_that_is_gone_is_found_but_not
     assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
 
 
-def test_recordings_of_outdated_code_keep_what_was_made_from_them_and_damaged_ones_are_found(root):
+def test_damaged_recordings_are_unused_and_outdated_ones_keep_their_artefacts(root):
     manifest = root.ingested.folder / "manifest.json"
     manifest.write_text(manifest.read_text().replace(root.ingested.code, "0" * 16))
     assert root.found() == {name_of(root.ingested): OUTDATED}
@@ -147,9 +147,7 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
     assert root.found() == {}
 
 
-def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(
-    elsewhere, root, capsys
-):
+def test_yes_removes_what_was_listed_and_a_dry_run_nothing(elsewhere, root, capsys):
     outdated = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
     assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err

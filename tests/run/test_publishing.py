@@ -172,7 +172,7 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, 
     assert place(*CHECK)[:2] == (0, "small: up to date\n")
 
 
-def test_published_results_are_up_to_date_by_study_and_by_file_and_after_what_trains_nothing_new(
+def test_published_results_are_up_to_date_by_study_and_by_file(
     checked,
 ):
     for words in (
@@ -230,9 +230,7 @@ def test_estimators_that_come_and_go_are_named(checked):
     } <= named
 
 
-def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_are_not_compared(
-    checked, monkeypatch
-):
+def test_changed_code_and_changed_data_are_distinguished(checked, monkeypatch):
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
@@ -269,7 +267,7 @@ def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(ch
     )
 
 
-def test_what_cannot_be_checked_is_one_line_and_a_pipeline_that_cannot_be_run_any_more_is_stale(
+def test_pipeline_that_cannot_be_run_is_stale(
     checked,
 ):
     for words, code, says in (
@@ -309,7 +307,7 @@ def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_resul
     assert contents(checked.folder / "results") == before
 
 
-def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_and_damaged_weights_refused(
+def test_published_weights_are_used_for_their_key_alone(
     checked,
 ):
     pipeline = checked.change("pipelines/small.yaml")

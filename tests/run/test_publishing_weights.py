@@ -63,9 +63,7 @@ def stop_once_published(patch, n_models):
     patch.setattr(runner, "publish_weights", publish_weights)
 
 
-def test_a_study_stopped_in_a_part_goes_on_from_an_empty_output_root_with_what_is_missing(
-    pair, monkeypatch
-):
+def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
     with monkeypatch.context() as patch:
         stop_once_published(patch, 4)
         code, _, _ = pair(*RUN)
@@ -93,9 +91,7 @@ def test_a_study_stopped_in_a_part_goes_on_from_an_empty_output_root_with_what_i
         assert (pair.folder / "results/pair" / name).read_bytes() == published[name], name
 
 
-def test_models_of_a_run_that_was_killed_are_published_by_the_next_and_former_ones_stay(
-    pair, monkeypatch
-):
+def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
     pair.done(*RUN[:3])
     former = PublishedWeights(pair.folder / FILE)
     report = (pair.folder / "results/pair/report.md").read_bytes()

@@ -84,7 +84,7 @@ def test_right_references_are_not_warned_of(small):
         assert "warning" not in small.done(command, "small", "tracking=none")[1]
 
 
-def test_the_warnings_of_a_study_come_once_for_each_recording_though_parts_share_them(small):
+def test_warnings_of_a_study_come_once_for_each_recording(small):
     channels = small.change("conf/dataset/mine.yaml")["channels"]
     small.change("conf/dataset/mine.yaml", channels={**channels, **_reversed(small)})
     part = {"split": "mine", "sweeps": [["estimator=zero"]], "title": "a part"}

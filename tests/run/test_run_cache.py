@@ -125,7 +125,7 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
     assert cached()
 
 
-def test_a_study_on_raw_files_that_changed_or_by_force_is_made_anew_and_other_overrides_are_another(
+def test_study_runs_anew_where_raw_files_changed_or_by_force(
     study,
 ):
     assert "reused" not in study.done("run", *WORDS, "--force")[1]

@@ -86,9 +86,7 @@ def model(tmp_path):
     return folder
 
 
-def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_counted_by_tensor(
-    model, tmp_path
-):
+def test_model_is_read_with_its_types_and_finite_numbers(model, tmp_path):
     described = read_description(model)
     assert isinstance(described, Description)
     assert (described.estimator, described.about.seed, described.about.datasets) == (
@@ -361,7 +359,7 @@ def test_tables_that_are_damaged_are_one_line(tmp_path):
     assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
 
 
-def test_a_damaged_checkpoint_counts_as_none_and_a_damaged_record_of_a_study_is_an_error(tmp_path):
+def test_damaged_checkpoint_counts_as_none(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)

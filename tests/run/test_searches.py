@@ -57,7 +57,7 @@ def n_trained(err):
     return err.count("epochs,")
 
 
-def test_validation_chooses_and_a_part_that_states_another_value_is_named_until_it_agrees(tuned):
+def test_part_that_ignores_the_chosen_value_is_named(tuned):
     _, err = tuned.done(*RUN)
     remark = "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: training.learning_rate=0.01"
     assert remark in " ".join(err.split())

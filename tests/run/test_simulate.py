@@ -59,9 +59,7 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, m
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
-def test_the_ordinary_ingest_makes_the_same_which_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(
-    place, monkeypatch
-):
+def test_ingest_makes_the_same_drives_as_simulate(place, monkeypatch):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     folder = place.told("simulate", "sim", "seed=1")["folder"]
     again = place.told("simulate", "sim", "dataset.seed=1")

@@ -89,7 +89,7 @@ def test_interval_is_that_of_students_t_and_a_lost_seed_is_not_dropped():
 KEYS = ("estimator.n_local",)
 
 
-def test_best_is_chosen_on_validation_though_another_is_better_on_the_test_and_never_with_a_failed_seed():
+def test_best_combination_is_chosen_on_validation_without_failed_seeds():
     scores = {
         (2,): ([0.4, 0.5], [0.1, 0.1]),
         (3,): ([0.3, 0.4], [0.8, 0.9]),
@@ -178,7 +178,7 @@ def test_darker_is_larger_and_a_missing_cell_is_grey():
     assert red == green == blue
 
 
-def test_report_names_command_budget_split_kind_and_how_many_others_the_interval_of_the_chosen_one_covers():
+def test_report_of_a_sweep_names_command_budget_split_and_kind():
     scores = {
         (2,): [0.4, 0.5],
         (3,): [0.9, 0.9],

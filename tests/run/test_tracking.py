@@ -23,7 +23,7 @@ from vehest.run.tracking import Tracker
 pytestmark = pytest.mark.apart
 
 
-def test_runs_are_tracked_with_parameters_metrics_and_model_and_then_recognised_without_mlflow(
+def test_runs_are_tracked_with_parameters_metrics_and_model(
     place,
 ):
     place.done("run", "small")
@@ -435,9 +435,7 @@ def test_a_server_may_not_choose_a_folder_of_this_machine(
     assert RestServer.uploads == []
 
 
-def test_a_server_that_changes_its_answer_receives_the_artefacts_at_the_first_address(
-    tmp_path, rest_server, monkeypatch
-):
+def test_artefacts_go_to_the_first_address_of_a_server(tmp_path, rest_server, monkeypatch):
     outside = tmp_path / "outside"
     addresses = ["mlflow-artifacts:/1/run", str(outside)]
     monkeypatch.setattr(RestServer, "addresses", addresses)

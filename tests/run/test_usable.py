@@ -179,14 +179,14 @@ def test_channels_of_a_settings_choice_and_references_of_outputs_count():
     assert needed("estimator=zero") == set()
 
 
-def test_estimators_of_another_package_or_without_a_file_in_conf_say_themselves_what_they_need():
+def test_estimators_of_other_packages_state_their_needs():
     kind = estimator_class("static_map")
     other = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
     assert set(lacking_to_train(other, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
     found = usability(
         "luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))]
     )
-    assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
+    assert (found.usable, found.rate_hz, found.configured_rate_hz) == ("yes", 50.0, 100.0)
 
 
 LOGS = {
@@ -266,7 +266,7 @@ def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
     assert after.usable == ("with settings" if after.of_car else "yes")
 
 
-def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to_those_whom_they_concern():
+def test_missing_references_gaps_and_channels_are_named_by_estimator():
     found = rows(log(FULL - {"vy_ref"}))
     assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == (
         "not to train",
@@ -296,7 +296,7 @@ def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to
         assert derivation_of(channel, held, gappy, 50.0) is None
 
 
-def test_every_transform_that_makes_a_channel_is_known_and_the_store_tells_gaps_and_rate(tmp_path):
+def test_every_transform_that_makes_a_channel_is_listed(tmp_path):
     assert set(MAKES) <= set(TRANSFORMS)
     recording = log(set(UNITS))
     for name, channel in MAKES.items():
@@ -351,7 +351,7 @@ def test_bare_file_is_told_by_its_columns(place):
     assert place("data", "usable", "nowhere.csv")[0] == 2
 
 
-def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which_works(place):
+def test_training_without_a_channel_is_refused_with_a_working_remedy(place):
     add_logged(place, LOGS["speed and accelerations"])
     place.refused(
         "train",
@@ -550,7 +550,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
 
 
-def test_rates_that_recordings_have_are_left_alone_and_what_a_lower_one_means_is_told():
+def test_available_rates_are_kept_and_lowered_ones_explained():
     def at(rate_hz):
         return RecordingSummary("lap", rate_hz, frozenset())
 
@@ -569,7 +569,7 @@ def test_rates_that_recordings_have_are_left_alone_and_what_a_lower_one_means_is
     assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text
 
 
-def test_an_estimator_of_another_package_that_cannot_be_loaded_is_listed_with_the_reason(
+def test_broken_estimator_of_another_package_is_listed_with_the_reason(
     monkeypatch,
 ):
     class Broken:

@@ -33,7 +33,7 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
     assert code_of("ingest", "tabular") == "ingest=1 tabular=1"
 
 
-def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_its_own(
+def test_renamed_module_retrains_nothing(
     monkeypatch,
 ):
     before = trainings()

@@ -168,3 +168,26 @@ def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_
     }  # beyond 7 m/s² after that
     assert limited.tests == full.tests
     assert len(limited.train) == 161
+
+
+def test_sim_bmw_cars_has_125_manoeuvres_of_each_group_on_three_cars():
+    drives = configuration("dataset", "sim_bmw_cars")["drives"]
+    groups = Counter()
+    cars = Counter()
+    for drive in drives:
+        groups[drive["manoeuvre"]["name"]] += drive["count"]
+        cars[drive["id"].partition("_")[0]] += drive["count"]
+    assert groups == dict.fromkeys(TEST_MANOEUVRES, 125)
+    assert cars == {"standard": 336, "laden": 336, "soft": 328}
+    assert {drive["vehicle"] for drive in drives if drive["id"].startswith("soft")} == {"soft"}
+    assert all("payload" in drive for drive in drives if drive["id"].startswith("laden"))
+    assert len({drive["id"] for drive in drives}) == len(drives)
+
+
+def test_skids_are_trained_on_and_tests_are_of_sim_bmw_cars_alone():
+    for name in ("sim_bmw_cars", "sim_bmw_cars_limited"):
+        own = configuration("split", name)
+        learnt = [entry["keep"]["magnitude"] for entry in (*own["train"], *own["validation"])]
+        assert not any("sideslip_ref" in bounds for bounds in learnt)
+        assert {entry["dataset"] for entry in own["train"]} == {"sim_bmw"}
+        assert {entry["dataset"] for entry in own["tests"]["test"]} == {"sim_bmw_cars"}

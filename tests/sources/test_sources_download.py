@@ -17,10 +17,8 @@ from refusals import refusal
 from place import run_vehest
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.store import read_recording
-from vehest.sources import resuming
 from vehest.sources.base import open_source
-from vehest.sources.download import CHECKSUMS, UNDER_WAY, Download, Outcome, download_of
-from vehest.sources.resuming import ATTEMPTS, CHUNK
+from vehest.sources.download import CHECKSUMS, Download, Outcome, download_of
 
 SIZE = 300_000
 BYTES = np.random.default_rng(0).integers(0, 256, SIZE, dtype=np.uint8).tobytes()
@@ -38,16 +36,11 @@ class Server(ThreadingHTTPServer):
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
         self.contents = {"a.csv": BYTES}
-        self.etag = '"one"'
-        self.modified = None
-        self.ranges = True  # whether it knows them
-        self.careless = False  # whether it ignores If-Range
-        self.changed = None  # the file and its ETag after the first answer
         self.breaks = []  # after how many bytes the next answers break off
         self.statuses = []  # of the next answers
         self.headers = {"Content-Type": "text/csv"}
         self.length = True  # whether it tells the length
-        self.asked = []  # path, Range, If-Range
+        self.asked = []  # paths
         self.sent = []
 
     @property
@@ -61,8 +54,7 @@ class Handler(BaseHTTPRequestHandler):
     def do_GET(self):
         server = self.server
         name = unquote(self.path.rsplit("/", 1)[-1])
-        asked = self.headers.get("Range")
-        server.asked.append((self.path, asked, self.headers.get("If-Range")))
+        server.asked.append(self.path)
         assert self.headers.get("Accept-Encoding") == "identity"
         status = server.statuses.pop(0) if server.statuses else 200
         if name not in server.contents:
@@ -73,35 +65,15 @@ class Handler(BaseHTTPRequestHandler):
             self.end_headers()
             return
         whole = server.contents[name]
-        start = 0
-        same = server.careless or self.headers.get("If-Range") in (
-            None,
-            server.etag,
-            server.modified,
-        )
-        if asked and server.ranges and same:
-            start = int(asked.removeprefix("bytes=").rstrip("-"))
-        self.send_response(206 if start else 200)
-        if start:
-            self.send_header("Content-Range", f"bytes {start}-{len(whole) - 1}/{len(whole)}")
-        length = str(len(whole) - start) if server.length else None
-        about = {
-            "ETag": server.etag,
-            "Last-Modified": server.modified,
-            "Content-Length": length,
-            **server.headers,
-        }
-        for key, value in about.items():
-            if value:
-                self.send_header(key, value)
+        self.send_response(200)
+        length = {"Content-Length": str(len(whole))} if server.length else {}
+        for key, value in {**length, **server.headers}.items():
+            self.send_header(key, value)
         self.end_headers()
-        stop = server.breaks.pop(0) if server.breaks else len(whole) - start
-        body = whole[start : start + stop]
+        body = whole[: server.breaks.pop(0)] if server.breaks else whole
         server.sent.append(len(body))  # before the client can have it and ask for more
         self.wfile.write(body)
         self.close_connection = True
-        if server.changed:
-            server.contents["a.csv"], server.etag = server.changed
 
     def log_message(self, format, *args):
         """Nothing on standard error."""
@@ -110,7 +82,6 @@ class Handler(BaseHTTPRequestHandler):
 @pytest.fixture
 def server(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setattr(resuming, "PAUSE", 0.0)
     made = Server()
     thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
@@ -144,63 +115,18 @@ def test_a_file_arrives_byte_for_byte_and_is_recorded(server, tmp_path):
     (outcome,) = download(server, tmp_path / "new" / "folder").fetch()
     assert outcome == Outcome("a.csv", "fetched", sha256(BYTES), SIZE)
     assert_only(tmp_path / "new" / "folder")
-    assert server.asked == [("/a.csv", None, None)]
+    assert server.asked == ["/a.csv"]
 
 
-def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(
-    server, tmp_path
-):
-    server.breaks = [CHUNK + 7] * (ATTEMPTS + 2)
-    (outcome,) = download(server, tmp_path).fetch()
-    assert_only(tmp_path)
-    assert [asked[1:] for asked in server.asked[1:]] == [
-        (f"bytes={k * CHUNK}-", '"one"') for k in range(1, ATTEMPTS + 3)
-    ]
-    assert outcome.resumed_at == (ATTEMPTS + 2) * CHUNK
-
-
-def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(server, tmp_path):
-    server.breaks = [4 * CHUNK, 0, 0, 0, 0, 0]
+def test_a_download_that_breaks_off_is_one_line_and_leaves_nothing(server, tmp_path):
+    server.breaks = [200_000]
     message = refused(download(server, tmp_path))
     assert message.startswith(f"cannot fetch {server.url}/a.csv: ")
-    assert message.endswith(
-        "put the file into the data set's folder by hand; "
-        "when the server answers again, the same command goes on after what has arrived"
-    )
-    assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[: 4 * CHUNK]
-    assert not (tmp_path / CHECKSUMS).exists()
-    server.breaks = []
-    (outcome,) = download(server, tmp_path).fetch()
-    assert outcome.resumed_at == 4 * CHUNK
-    assert_only(tmp_path)
-
-
-@pytest.mark.parametrize("modified", [None, "Sat, 22 Feb 2014 10:00:00 GMT"])
-def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
-    server.ranges = False
-    server.etag = None
-    server.modified = modified
-    server.breaks = [200_000]
-    (outcome,) = download(server, tmp_path).fetch()
-    assert (outcome.resumed_at, server.sent, server.asked[1][1] is None) == (
-        0,
-        [200_000, SIZE],
-        modified is None,
-    )
-    assert_only(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("size", "careless"), [(SIZE, False), (250_000, True), (100_000, False), (100_000, True)]
-)
-def test_a_file_that_changes_between_attempts_is_never_mixed(server, tmp_path, size, careless):
-    other = BYTES[::-1][:size]
-    server.breaks = [200_000]
-    server.changed = (other, '"two"')
-    server.careless = careless
+    assert message.endswith("put the file into the data set's folder by hand")
+    assert files(tmp_path) == {}
     list(download(server, tmp_path).fetch())
-    assert_only(tmp_path, other)
-    assert server.asked[1][2] == '"one"'
+    assert_only(tmp_path)
+    assert server.sent == [200_000, SIZE]
 
 
 def test_two_processes_do_not_fetch_into_one_folder(server, tmp_path):
@@ -234,7 +160,6 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     assert (tmp_path / "a.csv").read_bytes() == b"changed"
     (tmp_path / "a.csv").unlink()
     server.contents["a.csv"] = BYTES[:-1] + b"?"
-    server.etag = '"two"'
     assert f"or {tmp_path / CHECKSUMS}" in refused(download(server, tmp_path), DataError)
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
@@ -243,33 +168,32 @@ def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one
     server, tmp_path
 ):
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
-    assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
+    assert "a.csv: it is a web page, not a file" in refused(download(server, tmp_path))
     server.headers = {}
     server.length = False
     assert "does not state its length" in refused(download(server, tmp_path))
     server.asked = []
-    server.statuses = [503, 404]  # the first passes
+    server.statuses = [404]
     message = refused(download(server, tmp_path))
     assert message == (
         f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; "
         "correct download.url or put the file into the data set's folder by hand"
     )
-    assert (len(server.asked), files(tmp_path)) == (2, {})
+    assert (len(server.asked), files(tmp_path)) == (1, {})
     (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
     assert CHECKSUMS in refused(download(server, tmp_path), DataError)
-    assert len(server.asked) == 2
+    assert len(server.asked) == 1
 
 
-def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server, tmp_path):
+def test_a_full_disk_is_one_line_and_leaves_nothing(server, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # files may not grow beyond
     try:
         assert "no room left to write" in refused(download(server, tmp_path))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[:200_000]
-    (outcome,) = download(server, tmp_path).fetch()
-    assert outcome.resumed_at == 200_000
+    assert files(tmp_path) == {}
+    list(download(server, tmp_path).fetch())
     assert_only(tmp_path)
 
 
@@ -335,7 +259,7 @@ def test_ingest_fetches_what_is_missing_then_ingests(server, tmp_path, monkeypat
             (fetched, "download", "two.csv"),
             (ingested, "ingest", "mine"),
         ]
-        assert [path for path, _, _ in server.asked] == ["/files/one.csv", "/files/two.csv"]
+        assert server.asked == ["/files/one.csv", "/files/two.csv"]
     (stored,) = (tmp_path / "outputs" / "ingest").glob("mine-*/two.parquet")
     assert read_recording(stored)["vx"][0] == 21.0
 

@@ -175,6 +175,7 @@ class Saying:
     channels = ("yaw_rate", "vx", "ay")
     skippable = ()
     causal = True
+    adapts = False
     warm_up_steps = 0
     horizon_steps = 0
     name = "saying"

@@ -403,8 +403,7 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     speed = "vx" if "vx" in recording else "vx_ref"
     if speed not in recording:
         return
-    runs = true_runs(recording[speed] < -REVERSE_SPEED)
-    runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
+    runs = _lasting_runs(recording[speed] < -REVERSE_SPEED, recording)
     if len(runs):
         lowest = min(float(recording[speed][begin:end].min()) for begin, end in runs.tolist())
         message = (
@@ -437,8 +436,7 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         # in most turns it would be the sign of a channel that is wrong
         is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(turns)
         backwards = against & (recording["vx"] < MAX_REVERSE_SPEED) & is_part
-    runs = true_runs(backwards & (recording["vx"] > REVERSE_SPEED))
-    runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
+    runs = _lasting_runs(backwards & (recording["vx"] > REVERSE_SPEED), recording)
     if len(runs):
         message = (
             f"unsigned: positive while the car reverses in {len(runs)} "
@@ -450,6 +448,12 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             "vx",
             f"{message}; exclude the range (start and stop in the split), or record a signed speed",
         )
+
+
+def _lasting_runs(backwards: BoolArray, recording: Recording) -> NDArray[np.int64]:
+    """Runs, (N, 2), in which the car goes backwards for `REVERSE_SECONDS` or more."""
+    runs = true_runs(backwards)
+    return runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:

@@ -1,1 +1,4 @@
-"""Channels, recordings, estimates, their store, transforms, splits and windows; limits and schemas of files."""
+"""Channels, recordings, estimates, their store, transforms, splits and windows.
+
+Limits and schemas of files.
+"""

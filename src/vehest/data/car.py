@@ -12,7 +12,8 @@ PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
 SAME_CAR_RANGES = {"wheelbase": (1.05, "m"), "mass": (1.25, "kg")}
 """Value -> factor by which it may differ for one car, and its unit.
 
-Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % of a small car's mass.
+Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % of a small car's
+mass.
 """
 
 
@@ -61,14 +62,14 @@ class CarValues:
             self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None, imu_to_rear_axle=imu
         )
 
-    def difference_to(self, other: CarValues) -> str:
+    def difference_to(self, second: CarValues) -> str:
         """Why this and another car cannot be the same: ``wheelbase 0.33 m, not 2.7 m``; else empty.
 
         They cannot where a value that both have differs by more than `SAME_CAR_RANGES`.
         """
         for name, (factor, unit) in SAME_CAR_RANGES.items():
             value = getattr(self, name)
-            expected = getattr(other, name)
+            expected = getattr(second, name)
             if value is None or expected is None:
                 continue
             if max(value, expected) > factor * min(value, expected):

@@ -1,7 +1,8 @@
 """Table of channels: canonical name, unit, meaning and the range that a road vehicle can reach.
 
-Axes are those of ISO 8855 (x forward, y left, z up, counter-clockwise positive), units are SI, angles are radians.
-Channels whose name ends in ``_ref`` come from a reference sensor; estimators never see them.
+Axes are those of ISO 8855 (x forward, y left, z up, counter-clockwise positive), units are SI,
+angles are radians. Channels whose name ends in ``_ref`` come from a reference sensor; estimators
+never see them.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class Channel:
     meaning: str  # measured quantity, with its sign convention
     low: float  # smallest value that a road vehicle can produce [unit]
     high: float  # largest value that a road vehicle can produce [unit]
-    rests: bool = False  # whether it may stay at exactly zero while the car moves, as the pressure of a brake does
+    rests: bool = False  # may stay exactly zero while the car moves, as a brake pressure does
 
     @property
     def is_reference(self) -> bool:
@@ -127,9 +128,16 @@ CHANNELS: dict[str, Channel] = _table()
 
 
 def channel(name: str) -> Channel:
-    """Look up a channel. Raises `DataError`: the name is not in the table."""
+    """Look up a channel.
+
+    Raises
+    ------
+    DataError
+        The name is not in the table.
+    """
     if name not in CHANNELS:
         raise DataError(
-            f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}"
+            f"channel '{name}' is not known to vehest; known channels: "
+            f"{', '.join(sorted(CHANNELS))}"
         )
     return CHANNELS[name]

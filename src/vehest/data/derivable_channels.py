@@ -8,7 +8,9 @@ from typing import Any
 
 from vehest.data.derived import WHEELS, AccelerationFromSpeed
 
-SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate
+# cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below
+# half of that rate
+SHARE_OF_RATE = 0.2
 
 UNKNOWN = {
     "wheel_radius": "rolling radius of the tyres [m]",
@@ -46,21 +48,26 @@ class Derivation:
         }
 
     def in_words(self) -> str:
-        """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel (ratio: of …)``."""
+        """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel
+        (ratio: of …)``.
+        """
         entries = ", ".join(
-            "{" + ", ".join(f"{key}: {_shown(value)}" for key, value in entry.items()) + "}"
+            "{" + ", ".join(f"{key}: {_as_text(value)}" for key, value in entry.items()) + "}"
             for entry in self.transforms
         )
         *first, last = self.of
         meanings = "; ".join(f"{name}: {meaning}" for name, meaning in self.meanings.items())
-        made_of = f"{', '.join(first)} and {last}" if first else last
-        return f"transforms: [{entries}] of {made_of}" + (f" ({meanings})" if meanings else "")
+        inputs = f"{', '.join(first)} and {last}" if first else last
+        return f"transforms: [{entries}] of {inputs}" + (f" ({meanings})" if meanings else "")
 
 
 def derivation_of(
     channel: str, channels: Collection[str], gappy: Collection[str], rate_hz: float
 ) -> Derivation | None:
-    """Derivation of a missing channel from those that are there, some with gaps; None where nothing makes it."""
+    """Derivation of a missing channel from those that are there, some with gaps.
+
+    None where nothing makes it.
+    """
     wheels = tuple(name for wheel in WHEELS if (name := f"wheel_speed_{wheel}") in channels)
     if channel == "vx" and wheels:
         return Derivation(wheels, ({"name": "speed_from_wheels", "wheel_radius": None},))
@@ -80,16 +87,20 @@ def derivation_of(
         return None
     if speed in channels:
         return Derivation((*of, speed), (entry,))
-    made = derivation_of("vx", channels, (), rate_hz)
-    return None if made is None else Derivation((*of, *made.of), (*made.transforms, entry))
+    derived_speed = derivation_of("vx", channels, (), rate_hz)
+    return (
+        None
+        if derived_speed is None
+        else Derivation((*of, *derived_speed.of), (*derived_speed.transforms, entry))
+    )
 
 
-def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
+def channels_made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
     """Channels that transforms make of others, as far as their names tell."""
     return frozenset(
         MAKES[name] for entry in transforms if (name := str(entry.get("name"))) in MAKES
     )
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return "…" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

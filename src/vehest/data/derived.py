@@ -20,13 +20,13 @@ WHEELS = ("fl", "fr", "rl", "rr")
 STANDSTILL_SPEED = 0.1  # m/s
 
 
-def _known(name: str) -> str:
+def _checked_channel(name: str) -> str:
     if name not in CHANNELS:
         raise ValueError(f"there is no channel '{name}'; 'vehest data channels' lists them")
     return name
 
 
-ChannelName = Annotated[str, AfterValidator(_known)]  # name of a channel of the table
+ChannelName = Annotated[str, AfterValidator(_checked_channel)]  # name of a channel of the table
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -38,7 +38,7 @@ def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
 class SteeringRatio:
     """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio."""
 
-    ratio: float  # how far the angle turns for a unit of ``steer``; negative if it counts the other way
+    ratio: float  # angle for a unit of ``steer``; negative if it counts the other way
     offset: float = 0.0  # what it shows going straight ahead [rad]
     channel: ChannelName = "handwheel"  # the angle; ``steer`` itself may be it
 
@@ -47,14 +47,24 @@ class SteeringRatio:
             raise ConfigurationError("a steering ratio must be a number other than zero")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the angle has them. Raises `DataError`: the channel is missing."""
+        """Set ``steer``.
+
+        It has gaps where the angle has them.
+
+        Raises
+        ------
+        DataError
+            The channel is missing.
+        """
         steer = (recording[self.channel] - self.offset) / self.ratio
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
 
 @dataclass(frozen=True)
 class SteeringCurve:
-    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear."""
+    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces,
+    as of a linkage that is not linear.
+    """
 
     inputs: tuple[float, ...]  # values of the channel at the corners, increasing
     angles: tuple[
@@ -69,31 +79,44 @@ class SteeringCurve:
             or not np.all(np.diff(self.inputs) > 0)
         ):
             raise ConfigurationError(
-                "a steering curve needs two corners or more: inputs that increase, and as many angles"
+                "a steering curve needs two corners or more: inputs that increase, and as many "
+                "angles"
             )
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the channel has them. Raises `DataError`: the channel is missing."""
+        """Set ``steer``.
+
+        It has gaps where the channel has them.
+
+        Raises
+        ------
+        DataError
+            The channel is missing.
+        """
         steer = np.interp(recording[self.channel], self.inputs, self.angles)
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
 
 @dataclass(frozen=True)
 class SpeedFromWheels:
-    """Make the forward speed ``vx`` from wheel speeds, each brought to the centre of gravity, without those that slip or dropped out.
+    """Make the forward speed ``vx`` from wheel speeds, each brought to the centre of gravity,
+    without those that slip or dropped out.
 
-        u_FL = ω_FL R cos δ + r t_F/2,   u_FR = ω_FR R cos δ - r t_F/2,   u_RL = ω_RL R + r t_R/2,   u_RR = ω_RR R - r t_R/2
+        u_FL = ω_FL R cos δ + r t_F/2,   u_FR = ω_FR R cos δ - r t_F/2,   u_RL = ω_RL R + r t_R/2,
+        u_RR = ω_RR R - r t_R/2
 
-    A wheel counts while it is within ``tolerance`` of their median, and ``vx`` is the mean of those that count, which moves by no more than
-    ``most_acceleration`` allows. Where fewer than two count, ``ax`` carries the speed on (or nothing, where there is no ``ax``), for
-    ``hold_seconds``; after them the median counts, since something must. Wheels that the recording does not have do not count; one
-    alone counts as it is. Without ``steer`` the front wheels point straight ahead.
+    A wheel counts while it is within ``tolerance`` of their median, and ``vx`` is the mean of those
+    that count, which moves by no more than ``most_acceleration`` allows. Where fewer than two
+    count, ``ax`` carries the speed on (or nothing, where there is no ``ax``), for ``hold_seconds``;
+    after them the median counts, since something must. Wheels that the recording does not have do
+    not count; one alone counts as it is. Without ``steer`` the front wheels point straight ahead.
 
-    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of
+    plausibility is vehest's own.
     """
 
     wheel_radius: PositiveFloat  # rolling radius R [m]
-    track_front: NonNegativeFloat = 0.0  # t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up
+    track_front: NonNegativeFloat = 0.0  # t_F [m]; 0: not known
     track_rear: NonNegativeFloat = 0.0  # t_R [m]; the same
     tolerance: PositiveFloat = 0.3  # absolute part of it [m/s]; 5 % of the median come on top
     most_acceleration: PositiveFloat = 12.0  # of the car, forwards or backwards [m/s²]
@@ -101,14 +124,19 @@ class SpeedFromWheels:
     relative_tolerance: ClassVar[float] = 0.05
 
     def corrected(self, recording: Recording) -> FloatArray:
-        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
+        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right,
+        rear left, rear right; NaN without it.
 
-        Raises `DataError` where there is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
+        Raises
+        ------
+        DataError
+            There is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
         """
         names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
         if not set(names) & set(recording.channels):
             raise DataError(
-                f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}"
+                f"recording '{recording.id}' has no wheel speed to make vx of; declare one of "
+                f"{', '.join(names)}"
             )
         missing = np.full(len(recording), np.nan)
         wheels = self.wheel_radius * np.stack(
@@ -124,7 +152,10 @@ class SpeedFromWheels:
         return wheels + sides[:, None] * recording["yaw_rate"]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``vx``, without gaps, since wheels that were not measured do not count; `DataError` if none ever was."""
+        """Set ``vx``, without gaps, since wheels that were not measured do not count.
+
+        `DataError` if none ever was.
+        """
         speeds = self.corrected(recording)
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
@@ -135,11 +166,12 @@ class SpeedFromWheels:
         )
         if not np.isfinite(speeds).any():
             raise DataError(
-                f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made"
+                f"recording '{recording.id}': no wheel speed was measured together with yaw_rate "
+                "and steer; vx cannot be made"
             )
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
         step = 1.0 / recording.rate_hz
-        most = self.most_acceleration * step
+        max_change = self.most_acceleration * step
         patience = round(min(self.hold_seconds * recording.rate_hz, len(recording)))
         number = counts.sum(0)
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
@@ -147,22 +179,23 @@ class SpeedFromWheels:
             np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         )
         vx = np.empty(len(recording))
-        held = 0
+        n_samples_carried = 0
         now = math.nan
         rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
-            held = 0 if agreeing >= enough else held + 1
-            wanted = wheels if agreeing >= enough else median
+            n_samples_carried = 0 if agreeing >= enough else n_samples_carried + 1
+            target = wheels if agreeing >= enough else median
             if math.isnan(now):
-                now = wanted
-            elif (held and held <= patience) or math.isnan(wanted):
+                now = target
+            elif (n_samples_carried and n_samples_carried <= patience) or math.isnan(target):
                 now += gain
             else:
-                now += min(max(wanted - now, -most), most)
+                now += min(max(target - now, -max_change), max_change)
             vx[k] = now
         if not np.isfinite(vx).any():
             raise DataError(
-                f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks"
+                f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and "
+                "the tracks"
             )
         vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][
             0
@@ -174,8 +207,8 @@ class SpeedFromWheels:
 class AccelerationFromSpeed:
     """Make the longitudinal acceleration ``ax`` from a speed: ax ≈ dvx/dt, low-passed.
 
-    An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
-    v = 0.5 m/s and r = 0.4 rad/s.
+    An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small
+    where sideslip is: 0.2 m/s² for v = 0.5 m/s and r = 0.4 rad/s.
 
     Source: Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
     """
@@ -187,16 +220,24 @@ class AccelerationFromSpeed:
     )
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``ax``. Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate."""
+        """Set ``ax``.
+
+        Raises
+        ------
+        DataError
+            The speed is missing or has gaps, or the cut-off lies beyond half the sampling rate.
+        """
         speed = recording[self.channel]
         rate = recording.rate_hz
         if np.isnan(speed).any():
             raise DataError(
-                f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it"
+                f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be "
+                "made of it"
             )
         if not self.cutoff_hz < rate / 2:
             raise DataError(
-                f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at {self.cutoff_hz:g}"
+                f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at "
+                f"{self.cutoff_hz:g}"
             )
         sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate, output="sos")
         if self.direction == "causal":
@@ -210,9 +251,11 @@ class AccelerationFromSpeed:
 
 @dataclass(frozen=True)
 class VelocityFromSideslip:
-    """Make the reference ``vy_ref`` from ``sideslip_ref``, as an optical sensor gives it: v = u·tan β.
+    """Make the reference ``vy_ref`` from ``sideslip_ref``, as an optical sensor gives it: v = u·tan
+    β.
 
-    It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set, moves it from there.
+    It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set,
+    moves it from there.
 
     Attributes
     ----------
@@ -223,7 +266,8 @@ class VelocityFromSideslip:
     min_speed: NonNegativeFloat = 0.0
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
+        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the
+        speed has them.
 
         At standstill, where the angle means nothing, 90 degrees and more become 0.
         """
@@ -231,16 +275,17 @@ class VelocityFromSideslip:
         angle = recording["sideslip_ref"]
         if self.min_speed:
             angle = np.where(np.abs(recording[speed]) < self.min_speed, 0.0, angle)
-        beyond = np.abs(angle) >= 0.5 * np.pi
-        moving = beyond & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
+        is_sideways = np.abs(angle) >= 0.5 * np.pi
+        moving = is_sideways & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
         if moving.any():
             worst = int(np.argmax(np.where(moving, np.abs(angle), 0.0)))
-            what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
+            problem = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
             raise DataError(
-                f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only"
+                f"recording '{recording.id}': {problem}; lateral velocity follows from less than "
+                "90 degrees only"
             )
         return recording.with_channels(
-            {"vy_ref": recording[speed] * np.tan(np.where(beyond, 0.0, angle))},
+            {"vy_ref": recording[speed] * np.tan(np.where(is_sideways, 0.0, angle))},
             made_of=("sideslip_ref", speed),
         )
 
@@ -250,7 +295,10 @@ class SideslipFromVelocity:
     """Make the reference ``sideslip_ref`` from ``vy_ref``: β = atan2(v, u)."""
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``sideslip_ref``, by ``vx_ref`` or else ``vx``; gaps where they have them; `DataError` where one is missing."""
+        """Set ``sideslip_ref``, by ``vx_ref`` or else ``vx``.
+
+        Gaps where they have them; `DataError` where one is missing.
+        """
         speed = speed_of_reference(recording)
         return recording.with_channels(
             {"sideslip_ref": np.arctan2(recording["vy_ref"], recording[speed])},
@@ -265,14 +313,17 @@ def speed_of_reference(recording: Recording) -> str:
 
 @dataclass(frozen=True)
 class ScaleToWheelbase:
-    """See a car as one of another wheelbase: times and lengths in units that leave accelerations and angles as they are.
+    """See a car as one of another wheelbase: times and lengths in units that leave accelerations
+    and angles as they are.
 
-    With λ = to/wheelbase, lengths grow by λ and times by √λ: velocities by √λ, yaw rates by 1/√λ. A 1:10 car and a full-size one
-    that are geometrically similar on similar tyres then drive the same manoeuvre. Channels that are no lengths, times or angles
-    (forces, torques, currents, pressures) are left out.
+    With λ = to/wheelbase, lengths grow by λ and times by √λ: velocities by √λ, yaw rates by 1/√λ. A
+    1:10 car and a full-size one that are geometrically similar on similar tyres then drive the same
+    manoeuvre. Channels that are no lengths, times or angles (forces, torques, currents, pressures)
+    are left out.
 
-    Source: Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
-    testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
+    Source: Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g);
+    e.g. Brennan & Alleyne, Using a scale testbed, IEEE Control Systems Magazine 21 (3), 2001, for
+    vehicles.
     """
 
     wheelbase: PositiveFloat  # of the car [m]

@@ -1,7 +1,8 @@
 """Errors that a user can act on; each message is one line that names the cause and the remedy.
 
-Functions that read a file raise `MissingError` where it is not there, and `DataError` where it is damaged, more than the limits or lacks
-something. Functions that take plain values of a configuration (``…_from_config``, settings) raise `ConfigurationError`.
+Functions that read a file raise `MissingError` where it is not there, and `DataError` where it is
+damaged, more than the limits or lacks something. Functions that take plain values of a
+configuration (``…_from_config``, settings) raise `ConfigurationError`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from difflib import get_close_matches
 class VehestError(Exception):
     """Base of all errors caused by input or environment rather than by a defect of vehest.
 
-    Attributes:
-        exit_code: status that the command line leaves with (documented in docs/cli.md).
+    Attributes
+    ----------
+    exit_code
+        Status that the command line leaves with (documented in docs/cli.md).
     """
 
     exit_code = 1
@@ -59,19 +62,29 @@ def counted(names: Sequence[str]) -> str:
     )
 
 
+def abbreviated(names: Sequence[str], max_named: int) -> str:
+    """The first of some names, and the number of the others: ``a, b and 3 more``."""
+    n_more = len(names) - max_named
+    return ", ".join(names[:max_named]) + (f" and {n_more} more" if n_more > 0 else "")
+
+
 def closest(name: str, choices: Iterable[str]) -> str:
     """The choice that is spelt most like a name; empty if none is close."""
     return next(iter(get_close_matches(name, list(choices), n=1)), "")
 
 
 def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
-    """What was probably meant by an unknown name, to append to a message; empty if no choice is close."""
+    """What was probably meant by an unknown name, to append to a message.
+
+    Empty if no choice is close.
+    """
     close = closest(name, choices)
     return f"; did you mean '{prefix}{close}'?" if close else ""
 
 
 def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]]) -> str:
-    """Message on an option that a family of estimators does not have, with the one that was probably meant.
+    """Message on an option that a family of estimators does not have, with the one that was
+    probably meant.
 
     Parameters
     ----------
@@ -91,10 +104,10 @@ def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]])
     hint = suggestion(option, names.get(family, ()), "estimator.")
     if not hint:
         families = {
-            other: name
-            for other, options in names.items()
+            candidate: name
+            for candidate, options in names.items()
             for name in options
-            if other != family and _spelling(name) == _spelling(option)
+            if candidate != family and _spelling(name) == _spelling(option)
         }
         if families:
             name = next(iter(families.values()))
@@ -108,7 +121,9 @@ def _spelling(name: str) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Text from a file as it can be shown: control characters but those to keep, and bytes that are no UTF-8, as escapes."""
+    """Text from a file as it can be shown: control characters but those to keep, and bytes that are
+    no UTF-8, as escapes.
+    """
     return "".join(
         character
         if is_printable(character) or character in keep
@@ -118,5 +133,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def is_printable(character: str) -> bool:
-    """Whether a character shows as itself: none that controls a terminal, changes the direction of writing, or has no meaning."""
+    """Whether a character shows as itself: none that controls a terminal, changes the direction of
+    writing, or has no meaning.
+    """
     return unicodedata.category(character) not in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}

@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording, clock_tolerance
+from vehest.data.recording import clock_tolerance
 from vehest.data.time_series import TimeSeries
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Mode = Literal["causal", "offline"]
 
@@ -38,11 +35,13 @@ QUANTITIES: dict[str, str] = {
     "health": "1",
     "health_reason": "1",
 }
-"""Quantities of an estimate, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
-axle's force per slip angle where there is none, ``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
-innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it. ``band_vy`` and ``band_sideslip`` are
-half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number
-(`vehest.trust`)."""
+"""Quantities of an estimate, with units. ``rim_speed`` is the driven wheels' angular speed times
+their radius; a cornering stiffness is an axle's force per slip angle where there is none,
+``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
+innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at
+it. ``band_vy`` and ``band_sideslip`` are half widths of the calibrated 90 % band, ``health`` is 0
+(valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number (`vehest.trust`).
+"""
 
 IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "band_sideslip"}
 """Columns of written tables in degrees -> the quantity [rad] that each repeats for people."""
@@ -65,8 +64,13 @@ def number_cell(value: float) -> str:
 class Estimate(TimeSeries):
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
-    NaN means that the method has no estimate yet (a window that is not full). Raises `ValueError`: a quantity is unknown or of another
-    length, the covariance is not of shape (T, n, n), or its rows have no n different names.
+    NaN means that the method has no estimate yet (a window that is not full).
+
+    Raises
+    ------
+    ValueError
+        A quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its
+        rows have no n different names.
     """
 
     recording_id: str  # the recording it was made from
@@ -83,13 +87,13 @@ class Estimate(TimeSeries):
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
-        where = f"estimate of '{self.recording_id}'"
+        subject = f"estimate of '{self.recording_id}'"
         lengths = {len(values) for values in self.channels.values()}
         for name in self.channels.keys() - QUANTITIES.keys():
-            raise ValueError(f"{where}: unknown quantity '{name}'")
+            raise ValueError(f"{subject}: unknown quantity '{name}'")
         if len(lengths) != 1:
             raise ValueError(
-                f"{where}: quantities must have one common length, not {sorted(lengths)}"
+                f"{subject}: quantities must have one common length, not {sorted(lengths)}"
             )
         n_rows = len(self.covariance_of)
         shape = None if self.covariance is None else self.covariance.shape
@@ -97,9 +101,10 @@ class Estimate(TimeSeries):
             shape != ((len(self), n_rows, n_rows) if n_rows else None)
             or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows
         ):
-            what = f"not {shape} and ({', '.join(self.covariance_of)})"
+            actual = f"not {shape} and ({', '.join(self.covariance_of)})"
             raise ValueError(
-                f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}"
+                f"{subject}: a covariance must be of shape (T, n, n) and covariance_of name n "
+                f"quantities, {actual}"
             )
 
     @property
@@ -118,31 +123,27 @@ class Estimate(TimeSeries):
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
 
-    def plot(
-        self,
-        recording: Recording | None = None,
-        start: float | None = None,
-        stop: float | None = None,
-    ) -> Figure:
-        """Draw the estimate, with its recording where that is passed; see `Recording.plot`."""
-        from vehest.report.drive_figure import drive_figure
-
-        return drive_figure(recording, [self], start, stop)
-
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
-        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate."""
+        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
+        NaN outside the estimate.
+        """
         index = self._held_index(times)
         return np.where(index < 0, np.nan, self[name][index])
 
     def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
-        """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate.
+        """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in
+        the future, NaN outside the estimate.
 
-        Raises `DataError`: the estimate has no covariance of one of them.
+        Raises
+        ------
+        DataError
+            The estimate has no covariance of one of them.
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"
             raise DataError(
-                f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}"
+                f"estimator '{self.estimator}' gives a covariance of {have}, not of "
+                f"{', '.join(names)}"
             )
         index = self._held_index(times)
         rows = [self.covariance_of.index(name) for name in names]

@@ -33,10 +33,15 @@ _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.from
 
 @contextmanager
 def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]:
-    """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
+    """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it
+    is removed.
 
     A file that is there may always be replaced, a folder by ``replace_folder``.
-    Raises `MissingError`: the disk is full or the folder cannot be written to.
+
+    Raises
+    ------
+    MissingError
+        The disk is full or the folder cannot be written to.
     """
     aside = aside_of(path)
     try:
@@ -68,7 +73,12 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
 def regular_file(path: Path) -> Path:
     """A file that can be read to its end: no folder, pipe or device.
 
-    Raises `MissingError`: there is nothing. Raises `DataError`: it is something else, or cannot be looked at.
+    Raises
+    ------
+    MissingError
+        There is nothing.
+    DataError
+        It is something else, or cannot be looked at.
     """
     try:
         mode = os.stat(path).st_mode
@@ -87,7 +97,13 @@ def regular_file(path: Path) -> Path:
 
 
 def without_links(path: Path) -> Path:
-    """The absolute path behind all links; raises `DataError` where links lead to each other."""
+    """The absolute path behind all links.
+
+    Raises
+    ------
+    DataError
+        Links lead to each other.
+    """
     try:
         return path.resolve()
     except (OSError, RuntimeError):  # the latter up to Python 3.12
@@ -95,17 +111,21 @@ def without_links(path: Path) -> Path:
 
 
 def file_name(name: str, ending: str = "") -> str:
-    """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
-    at 100 bytes, and the start of its hash added."""
-    kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
-    if kept != name or not name or len(kept.encode()) > 120:
+    """A name as one component of a path, another for another name: what is no letter, digit or one
+    of ``_-+=.`` is replaced, a name cut at 100 bytes, and the start of its hash added.
+    """
+    component = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
+    if component != name or not name or len(component.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
-        kept = f"{kept.encode()[:100].decode('utf-8', 'ignore')}~{digest}"
-    return f"{kept}{ending}"
+        component = f"{component.encode()[:100].decode('utf-8', 'ignore')}~{digest}"
+    return f"{component}{ending}"
 
 
 def no_room(error: BaseException) -> OSError | None:
-    """The full disk behind an error, also one that a library only words; None where the cause is another."""
+    """The full disk behind an error, also one that a library only words.
+
+    None where the cause is another.
+    """
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in NO_ROOM:
@@ -148,7 +168,10 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Remove files of ended writers in ``folder``; those of running processes stay. Returns their number."""
+    """Remove files of ended writers in ``folder``.
+
+    Those of running processes stay. Returns their number.
+    """
     leftovers = (
         [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)]
         if folder.is_dir()
@@ -160,10 +183,13 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def is_left_over(path: Path) -> bool:
-    """Whether ``path`` was written aside and its process has ended; of another host: whether it is a day old."""
+    """Whether ``path`` was written aside and its process has ended.
+
+    Of another host: whether it is a day old.
+    """
     if not path.name.startswith(ASIDE_PREFIX):
         return False
-    process, host = found.groups() if (found := _ASIDE.match(path.name)) else ("0", None)
+    process, host = match.groups() if (match := _ASIDE.match(path.name)) else ("0", None)
     if (
         host in (None, _host()) and os.name == "posix"
     ):  # elsewhere os.kill would end what it asks for
@@ -175,7 +201,10 @@ def is_left_over(path: Path) -> bool:
 
 
 def aside_of(path: Path, name: str = "") -> Path:
-    """A free place beside ``path`` for this process, for ``path`` itself or another name; files that stay there are removed later."""
+    """A free place beside ``path`` for this process, for ``path`` itself or another name.
+
+    Files that stay there are removed later.
+    """
     return path.with_name(
         f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}"
     )
@@ -193,7 +222,8 @@ def sha256_of(path: Path) -> str:
 
 
 def stamp_of(*paths: Path) -> str:
-    """Hash of names, sizes, times and inodes of files and of all files below folders, but for compiled code; links are followed.
+    """Hash of names, sizes, times and inodes of files and of all files below folders, but for
+    compiled code; links are followed.
 
     Times of inodes show files that were replaced by others of the same size and date.
     """
@@ -219,7 +249,9 @@ def stamp_of(*paths: Path) -> str:
 
 @cache
 def _host() -> str:
-    """Start of a hash of this host's name, since process numbers mean nothing on another host that shares the folder."""
+    """Start of a hash of this host's name, since process numbers mean nothing on another host that
+    shares the folder.
+    """
     return hashlib.sha256(socket.gethostname().encode("utf-8", "surrogateescape")).hexdigest()[:8]
 
 
@@ -234,7 +266,9 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
-    for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
+    for file in (
+        [entry for entry in path.rglob("*") if entry.is_file()] if path.is_dir() else [path]
+    ):
         descriptor = os.open(
             file, os.O_RDWR
         )  # Windows flushes no file that is open for reading alone

@@ -1,4 +1,6 @@
-"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one another."""
+"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one
+another.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,14 @@ from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 
-FEWEST = 3  # one to test, one to stop on, the rest to learn from
+MIN_FOLDS = 3  # one to test, one to stop on, the rest to learn from
 
 
 @dataclass(frozen=True)
 class FoldsFile:
     """How a split is cross-validated."""
 
-    number: Annotated[int, Field(ge=FEWEST)] = 5  # of folds, three or more
+    number: Annotated[int, Field(ge=MIN_FOLDS)] = 5  # of folds, three or more
     of: Literal["recordings", "laps", "seconds"] = (
         "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
     )
@@ -35,9 +37,12 @@ class FoldsFile:
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
-    """The blocks of recordings, each with the span that names it, in order; `DataError` where laps need a missing speed or yaw rate."""
+    """The blocks of recordings, each with the span that names it, in order.
+
+    `DataError` where laps need a missing speed or yaw rate.
+    """
     blocks = []
-    for whole, recording in recordings:
+    for span, recording in recordings:
         bounds = [recording.start_time, recording.end_time]
         if folds.of == "laps":  # the rest before the first or after the last belongs to that lap
             bounds += [stop for _, stop in laps_of(recording)[:-1]]
@@ -47,61 +52,73 @@ def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) ->
                 recording.start_time + block * folds.block_seconds for block in range(1, number)
             ]
         edges = sorted(set(bounds))
-        blocks += [replace(whole, start=start, stop=stop) for start, stop in pairwise(edges)]
+        blocks += [replace(span, start=start, stop=stop) for start, stop in pairwise(edges)]
     return blocks
 
 
 def fold_of(
-    blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str
+    blocks: Sequence[Span], folds: FoldsFile, fold: int, subject: str
 ) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
-    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
+    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and
+    folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
-    Raises `ConfigurationError` where there is no such fold, or too few blocks to fill them.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such fold, or too few blocks to fill them.
     """
     if not 0 <= fold < folds.number:
-        raise ConfigurationError(f"{where}: fold {fold} is not one of 0 to {folds.number - 1}")
+        raise ConfigurationError(f"{subject}: fold {fold} is not one of 0 to {folds.number - 1}")
     lengths = np.array([block.stop - block.start for block in blocks])
     middles = np.cumsum(lengths) - 0.5 * lengths
     dealt = np.minimum((middles / lengths.sum() * folds.number).astype(np.int64), folds.number - 1)
     empty = sorted(set(range(folds.number)) - set(dealt.tolist()))
     if empty:
-        what = f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number {empty[0]} stays empty"
+        problem = (
+            f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number "
+            f"{empty[0]} stays empty"
+        )
         raise ConfigurationError(
-            f"{where}: {what}; take fewer folds, or of: seconds with a shorter block_seconds"
+            f"{subject}: {problem}; take fewer folds, or of: seconds with a shorter block_seconds"
         )
     roles = np.where(dealt == fold, 2, np.where(dealt == (fold + 1) % folds.number, 1, 0)).tolist()
     train, validation, test = (
         _joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3)
     )
     if not (train and validation):
-        what = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from"
-        raise ConfigurationError(f"{where}: {what}; set folds.gap_seconds lower")
+        problem = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from"
+        raise ConfigurationError(f"{subject}: {problem}; set folds.gap_seconds lower")
     return train, validation, test
 
 
 def _joined(
     blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float
 ) -> tuple[Span, ...]:
-    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has another role; dropped where that is all."""
+    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has
+    another role.
+
+    Dropped where that is all.
+    """
     joined: list[tuple[Span, int]] = []
-    for block, own in zip(blocks, roles, strict=True):
-        if joined and own == joined[-1][1] and _touch(joined[-1][0], block):
-            joined[-1] = (replace(joined[-1][0], stop=block.stop), own)
+    for block, block_role in zip(blocks, roles, strict=True):
+        if joined and block_role == joined[-1][1] and _touch(joined[-1][0], block):
+            joined[-1] = (replace(joined[-1][0], stop=block.stop), block_role)
         else:
-            joined.append((block, own))
+            joined.append((block, block_role))
     spans: list[Span] = []
-    for place, (span, own) in enumerate(joined):
+    for place, (span, block_role) in enumerate(joined):
         before = place > 0 and _touch(joined[place - 1][0], span)
         after = place + 1 < len(joined) and _touch(span, joined[place + 1][0])
         start = span.start + gap * before
         stop = span.stop - gap * after
-        if own == role and start < stop:
+        if block_role == role and start < stop:
             spans.append(replace(span, start=start, stop=stop))
     return tuple(spans)
 
 
-def _touch(one: Span, other: Span) -> bool:
-    return (one.dataset, one.recording) == (other.dataset, other.recording) and math.isclose(
-        one.stop, other.start
+def _touch(first: Span, second: Span) -> bool:
+    return (first.dataset, first.recording) == (second.dataset, second.recording) and math.isclose(
+        first.stop, second.start
     )

@@ -11,23 +11,32 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
-POINTS = 8192  # of the path at most
-LEAST_CORRELATION = 0.6  # between the curvatures of a lap and of the next; drivers take other lines, the course stays
-LEAST_SHARE_OF_BEST = 0.9  # of the best correlation, from which the shorter of two periods is taken: two laps repeat too
-MOST_TURN_OFF = 0.8  # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
-STEADY = 0.2  # spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
-INCOMPLETE = 0.005  # share of a lap that a last one may lack and count as complete
-SEARCH = 0.04  # share of a lap by which the next boundary is looked for before and after where it is expected
+MAX_POINTS = 8192  # of the path at most
+# between the curvatures of a lap and of the next; drivers take other lines, the course stays
+MIN_LAP_CORRELATION = 0.6
+# of the best correlation, from which the shorter of two periods is taken: two laps repeat too
+MIN_SHARE_OF_BEST = 0.9
+# rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
+MAX_HEADING_ERROR = 0.8
+# spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
+MAX_CIRCLE_SPREAD = 0.2
+MAX_MISSING_SHARE = 0.005  # share of a lap that a last one may lack and count as complete
+# share of a lap by which the next boundary is looked for before and after where it is expected
+SEARCH_SHARE = 0.04
 
 
 def laps_of(recording: Recording) -> list[tuple[float, float]]:
-    """Start and stop of each complete lap [s], one after another; empty where nothing repeats, as in less than two laps.
+    """Start and stop of each complete lap [s], one after another; empty where nothing repeats, as
+    in less than two laps.
 
     The path is that of ``vx`` and ``yaw_rate``, driven forwards. The first lap begins where the
     recording does, wherever that is on the course.
 
-    Args:
-        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks them.
+    Parameters
+    ----------
+    recording : Recording
+        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks
+        them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")
@@ -35,11 +44,11 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     heading = np.cumsum(np.where(speed > 0.0, turning, 0.0)) / recording.rate_hz
     if len(recording) < 16 or not distance[-1] > 0.0:
         return []
-    points = min(POINTS, len(recording))
+    points = min(MAX_POINTS, len(recording))
     grid = np.linspace(0.0, distance[-1], points)
     turned = np.interp(grid, distance, heading)
     curvature = np.diff(turned) / (grid[1] - grid[0])
-    if np.std(curvature) < STEADY * abs(float(np.mean(curvature))):
+    if np.std(curvature) < MAX_CIRCLE_SPREAD * abs(float(np.mean(curvature))):
         bounds = _turns(turned)
     else:
         period = _period(curvature, turned)
@@ -52,19 +61,23 @@ def _first_of(recording: Recording, *names: str) -> FloatArray:
     name = next((name for name in names if name in recording), None)
     if name is None:
         raise DataError(
-            f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps can be found"
+            f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps "
+            "can be found"
         )
     return np.nan_to_num(recording[name])
 
 
 def _turns(turned: FloatArray) -> list[int]:
     """Points at which whole turns of a circle are done."""
-    whole = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
-    return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(whole))) + 1).tolist()]
+    n_turns = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
+    return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(n_turns))) + 1).tolist()]
 
 
 def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
-    """Points after which the curvature repeats and the heading is the same again; None where that is never."""
+    """Points after which the curvature repeats and the heading is the same again.
+
+    None where that is never.
+    """
     correlation = _correlations(curvature)
     lags = np.arange(len(correlation))
     sums = np.concatenate([[0.0], np.cumsum(turned)])
@@ -72,17 +85,19 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
     off = np.abs(mean_turn - 2.0 * math.pi * np.rint(mean_turn / (2.0 * math.pi)))
     peak = np.zeros(len(correlation), dtype=bool)
     peak[1:-1] = (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
-    found = np.flatnonzero(
-        peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8)
+    periods = np.flatnonzero(
+        peak & (correlation > MIN_LAP_CORRELATION) & (off < MAX_HEADING_ERROR) & (lags >= 8)
     )
-    if not len(found):
+    if not len(periods):
         return None
-    best = correlation[found].max()
-    return int(found[correlation[found] >= LEAST_SHARE_OF_BEST * best][0])
+    best = correlation[periods].max()
+    return int(periods[correlation[periods] >= MIN_SHARE_OF_BEST * best][0])
 
 
 def _correlations(samples: FloatArray) -> FloatArray:
-    """Pearson's correlation of samples with themselves some points later, for lags up to half of them."""
+    """Pearson's correlation of samples with themselves some points later, for lags up to half of
+    them.
+    """
     number = len(samples)
     size = 1 << (2 * number - 1).bit_length()
     spectrum = np.fft.rfft(samples, size)
@@ -104,9 +119,11 @@ def _correlations(samples: FloatArray) -> FloatArray:
 
 
 def _boundaries(curvature: FloatArray, period: int) -> list[int]:
-    """Points at which laps begin: each a period after the one before, moved to where the two laps fit best."""
+    """Points at which laps begin: each a period after the one before, moved to where the two laps
+    fit best.
+    """
     bounds = [0]
-    reach = max(round(SEARCH * period), 1)
+    reach = max(round(SEARCH_SHARE * period), 1)
     while bounds[-1] + period < len(curvature):
         last = bounds[-1]
         length = min(
@@ -123,7 +140,7 @@ def _boundaries(curvature: FloatArray, period: int) -> list[int]:
         ]
         bounds.append(int(starts[int(np.argmin(misfits))]))
     if len(bounds) > 1 and len(curvature) - bounds[-1] >= period - max(
-        round(INCOMPLETE * period), 2
+        round(MAX_MISSING_SHARE * period), 2
     ):
         bounds.append(len(curvature))
     return bounds

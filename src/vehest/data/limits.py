@@ -1,4 +1,6 @@
-"""Bounds on the work that a file or a configuration may ask for: defaults that honest recordings stay below, and a way to raise them."""
+"""Bounds on the work that a file or a configuration may ask for: defaults that honest recordings
+stay below, and a way to raise them.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from vehest.data.schema import validated
 class Limits:
     """Bounds on what one input may take; an hour of 55 channels at 1 kHz stays below each."""
 
-    samples: PositiveInt = 20_000_000  # samples of one channel of a recording, also after its clock has been made even and after resampling
+    samples: PositiveInt = 20_000_000  # of one channel of a recording, also after resampling
     columns: PositiveInt = 10_000  # columns that the header of a table may name
     memory: PositiveInt = (
         1_600_000_000  # what reading one file may take beyond ten times its size [bytes]
@@ -52,29 +54,39 @@ def use_limits(limits: Limits) -> Iterator[None]:
 
 
 def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
-    """Limits from ``limits`` of a configuration; raises a `ConfigurationError` where a name or a value is none."""
+    """Limits from ``limits`` of a configuration.
+
+    Raises a `ConfigurationError` where a name or a value is none.
+    """
     return validated(Limits, config or {}, "", error=ConfigurationError, group="limits")
 
 
 def check_limit(
-    name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError
+    name: str, value: float, subject: str, error: type[ConfigurationError | DataError] = DataError
 ) -> None:
     """Refuse a number above the limit ``name``, a field of `Limits`.
 
-    Raises `DataError`: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
+    Raises
+    ------
+    DataError
+        It is above (or ``error``); its message begins with ``subject``, ``"'lap.csv' would hold
+        4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:
         raise error(
-            f"{what}, more than the limit of {limit}; if that is meant, raise it: limits.{name}=NUMBER"
+            f"{subject}, more than the limit of {limit}; if that is meant, raise it: "
+            f"limits.{name}=NUMBER"
         )
 
 
 def check_unpacked(file: object, packed: float, unpacked: float) -> None:
-    """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times its packed size [bytes]."""
-    beyond = unpacked - 10.0 * packed
+    """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times
+    its packed size [bytes].
+    """
+    excess = unpacked - 10.0 * packed
     check_limit(
         "memory",
-        beyond,
-        f"'{file}' unpacks to {unpacked:.0f} bytes, {beyond:.0f} beyond ten times its size",
+        excess,
+        f"'{file}' unpacks to {unpacked:.0f} bytes, {excess:.0f} beyond ten times its size",
     )

@@ -1,4 +1,6 @@
-"""Reads columns of numbers from Parquet files, within limits that its metadata is checked against first."""
+"""Reads columns of numbers from Parquet files, within limits that its metadata is checked against
+first.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,10 @@ DAMAGE = (
     OverflowError,
     RecursionError,
 )
-"""What pyarrow and NumPy raise where a file is not what it says; an ArrowInvalid is a ValueError, too."""
+"""What pyarrow and NumPy raise where a file is not what it says.
+
+An ArrowInvalid is a ValueError, too.
+"""
 
 ROWS_AT_A_TIME = 1 << 15
 BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else reads all of it
@@ -36,7 +41,10 @@ BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else read
 
 @contextmanager
 def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file for reading; what it raises while it is read is a `MissingError` or a `DataError` of one line, too."""
+    """Open a Parquet file for reading.
+
+    What it raises while it is read is a `MissingError` or a `DataError` of one line, too.
+    """
     size = regular_file(path).stat().st_size
     try:
         with open(path, "rb") as stream:
@@ -59,7 +67,8 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
 def number_batches(
     path: Path, file: pq.ParquetFile, names: Sequence[str]
 ) -> Iterator[pa.RecordBatch]:
-    """Columns of numbers or dates that are there once each, some rows at a time; `DataError` for anything else.
+    """Columns of numbers or dates that are there once each, some rows at a time; `DataError` for
+    anything else.
 
     Dates with times count from 1970 in the file's unit, ``unit`` of their type.
     """
@@ -79,7 +88,8 @@ def number_batches(
         yield batch
     if done != n_rows:
         raise DataError(
-            f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again"
+            f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds "
+            f"{done}; make it again"
         )
 
 
@@ -124,8 +134,11 @@ def has_time_unit(kind: pa.DataType) -> bool:
 
 
 def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
-    """Numbers of a column, (T,), NaN where one is missing; not by ``to_numpy``, which imports pandas."""
-    found = [np.empty(0)]
+    """Numbers of a column, (T,), NaN where one is missing.
+
+    Not by ``to_numpy``, which imports pandas.
+    """
+    chunks = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
         counted = chunk.cast(pa.int64()) if has_time_unit(chunk.type) else chunk
         numbers = (
@@ -136,9 +149,9 @@ def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
             if len(numbers)
             else np.empty(0)
         )
-        found.append(
+        chunks.append(
             np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values)
             if numbers.null_count
             else values
         )
-    return np.concatenate(found)
+    return np.concatenate(chunks)

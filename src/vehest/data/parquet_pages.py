@@ -1,6 +1,7 @@
 """Sizes of the pages of a Parquet file, which stand in the pages' headers alone.
 
-pyarrow unpacks a page as a whole, of up to 2 GiB, whatever the metadata at the end of the file says.
+pyarrow unpacks a page as a whole, of up to 2 GiB, whatever the metadata at the end of the file
+says.
 """
 
 from __future__ import annotations
@@ -78,7 +79,10 @@ def _page_header(stream: BinaryIO, begin: int, end: int) -> tuple[dict[int, Any]
 
 
 def _struct(content: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
-    """Fields of a structure, number -> value, and where it ends; `IndexError` beyond the content."""
+    """Fields of a structure, number -> value, and where it ends.
+
+    `IndexError` beyond the content.
+    """
     if depth > MAX_DEPTH:
         raise ValueError("a page's header nests too deep")
     fields: dict[int, Any] = {}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,14 +16,9 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.time_series import TimeSeries
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from vehest.data.estimate import Estimate
-
 Kind = Literal["real", "simulated"]
 
-LONGEST_PART = 900.0  # s; a longer drive is checked and, from a large table, read in parts
+MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6
@@ -34,7 +29,11 @@ HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
 class Recording(TimeSeries):
     """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
-    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or a senseless rate, start or kind.
+    Raises
+    ------
+    DataError
+        No samples, unknown channel, unequal lengths, values that are not finite, or a senseless
+        rate, start or kind.
     """
 
     id: str  # name, unique within its data set
@@ -53,9 +52,10 @@ class Recording(TimeSeries):
 
     def __post_init__(self) -> None:
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
-            where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
+            bounds = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
             raise DataError(
-                f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz"
+                f"recording '{self.id}': the sampling rate must lie {bounds}, not at "
+                f"{self.rate_hz:g} Hz"
             )
         if not math.isfinite(self.start_time):
             raise DataError(
@@ -67,12 +67,15 @@ class Recording(TimeSeries):
             )
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
-        frozen = {channel(name).name: _own(samples) for name, samples in self.channels.items()}
+        frozen = {
+            channel(name).name: _immutable(samples) for name, samples in self.channels.items()
+        }
         n_samples = max((samples.size for samples in frozen.values()), default=0)
         if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
             shapes = {name: samples.shape for name, samples in frozen.items()}
             raise DataError(
-                f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}"
+                f"recording '{self.id}': channels must hold samples and have one common length, "
+                f"not the shapes {shapes}"
             )
         object.__setattr__(self, "channels", frozen)
         object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
@@ -81,12 +84,16 @@ class Recording(TimeSeries):
             bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
             if len(bad):
                 first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
-                what = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
+                problem = (
+                    f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} "
+                    f"between {first:.12g} s and {last:.12g} s"
+                )
                 fix = (
-                    "cut the range out (max_gap of the data set ends a recording there), or declare "
+                    "cut the range out (max_gap of the data set ends a recording there), or "
+                    "declare "
                     "the channel in 'gappy' if a gap means 'not measured'"
                 )
-                raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
+                raise DataError(f"recording '{self.id}': channel '{name}' holds {problem}; {fix}")
 
     @property
     def label(self) -> str:
@@ -99,7 +106,13 @@ class Recording(TimeSeries):
         return {name: CHANNELS[name].unit for name in self.channels}
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (T,). Raises `DataError`: the recording does not have it."""
+        """Samples of one channel, shape (T,).
+
+        Raises
+        ------
+        DataError
+            The recording does not have it.
+        """
         if name not in self.channels:
             raise DataError(
                 f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})"
@@ -110,7 +123,13 @@ class Recording(TimeSeries):
         return name in self.channels
 
     def stack(self, names: Iterable[str]) -> FloatArray:
-        """Channels as columns, shape (T, C). Raises `DataError`: one of them is missing."""
+        """Channels as columns, shape (T, C).
+
+        Raises
+        ------
+        DataError
+            One of them is missing.
+        """
         return np.stack([self[name] for name in names], axis=1)
 
     def select(self, names: Iterable[str]) -> Recording:
@@ -120,7 +139,11 @@ class Recording(TimeSeries):
     def with_channels(
         self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None
     ) -> Recording:
-        """The same drive with channels (T,) replaced or added: gappy where one that they were made of is; None: as they were."""
+        """The same drive with channels (T,) replaced or added: gappy where one that they were made
+        of is.
+
+        None: as they were.
+        """
         gappy = self.gappy
         if made_of is not None:
             gappy = gappy | set(changed) if gappy & set(made_of) else gappy - set(changed)
@@ -128,18 +151,25 @@ class Recording(TimeSeries):
 
     def without_references(self) -> Recording:
         """The same drive as an estimator may see it: no ``_ref`` channels."""
-        kept = [name for name in self.channels if not CHANNELS[name].is_reference]
-        if not kept:
+        measured = [name for name in self.channels if not CHANNELS[name].is_reference]
+        if not measured:
             raise DataError(f"recording '{self.id}' has reference channels only")
-        return self.select(kept)
+        return self.select(measured)
 
     def cut(self, start: float, stop: float) -> Recording:
-        """The samples taken in [start, stop) seconds. Raises `DataError`: the range holds no samples."""
+        """The samples taken in [start, stop) seconds.
+
+        Raises
+        ------
+        DataError
+            The range holds no samples.
+        """
         first, last = self.index_range(start, stop)
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
             raise DataError(
-                f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s"
+                f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and "
+                f"{stop:.12g} s"
             )
         return self.part(slice(first, last))
 
@@ -152,29 +182,10 @@ class Recording(TimeSeries):
             self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels
         )
 
-    def plot(
-        self, *estimates: Estimate, start: float | None = None, stop: float | None = None
-    ) -> Figure:
-        """Draw the drive with estimates of it; see `vehest.report.drive_figure.drive_figure`.
-
-        Parameters
-        ----------
-        *estimates : Estimate
-            Of this recording; band, health and course are those of the first.
-        start, stop : float, optional
-            Range that is drawn [s]; by default all of it.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            A notebook shows it; ``savefig`` writes PNG, PDF or SVG.
-        """
-        from vehest.report.drive_figure import drive_figure
-
-        return drive_figure(self, estimates, start, stop)
-
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
-        """First index and end index of the samples taken in [start, stop), clipped to the recording."""
+        """First index and end index of the samples taken in [start, stop), clipped to the
+        recording.
+        """
         tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
         return math.ceil(min(max(first, 0.0), len(self))), math.ceil(min(max(end, 0.0), len(self)))
@@ -194,13 +205,14 @@ def joined(parts: Sequence[Recording]) -> Recording:
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
     """How far from a sample a time may lie and still be that sample's, in samples.
 
-    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s (unix time) 0.24 µs.
+    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s
+    (unix time) 0.24 µs.
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)
 
 
-def _own(samples: FloatArray) -> FloatArray:
+def _immutable(samples: FloatArray) -> FloatArray:
     """Samples that nobody else can change: a copy, unless they are those of a recording."""
     shared = (
         isinstance(samples, np.ndarray)
@@ -212,9 +224,11 @@ def _own(samples: FloatArray) -> FloatArray:
 
 
 def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
-    """Ranges of indices that divide so many samples into parts of about one length, none longer than `LONGEST_PART`."""
+    """Ranges of indices that divide so many samples into parts of about one length, none longer
+    than `MAX_PART_SECONDS`.
+    """
     edges = (
-        np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1)
+        np.linspace(0, n_samples, max(math.ceil(n_samples / (MAX_PART_SECONDS * rate_hz)), 1) + 1)
         .astype(int)
         .tolist()
     )

@@ -1,4 +1,6 @@
-"""Summaries of recordings, without their samples: channels, those with gaps, and the sampling rate."""
+"""Summaries of recordings, without their samples: channels, those with gaps, and the sampling
+rate.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,10 @@ def summary_of(recording: Recording) -> RecordingSummary:
 
 
 def stored_summary(path: Path) -> RecordingSummary:
-    """Summary of a stored recording, from its file's description; ``gappy`` channels may have gaps; raises `MissingError`, `DataError`."""
+    """Summary of a stored recording, from its file's description.
+
+    ``gappy`` channels may have gaps; raises `MissingError`, `DataError`.
+    """
     with parquet_file(path) as file:
         schema = file.schema_arrow
     described = description_of(schema, path, RecordingDescription)
@@ -40,5 +45,5 @@ def stored_summary(path: Path) -> RecordingSummary:
 
 def common_channels(recordings: Iterable[RecordingSummary]) -> frozenset[str]:
     """Channels that all recordings have; none where there are no recordings."""
-    held = [recording.channels for recording in recordings]
-    return frozenset.intersection(*held) if held else frozenset()
+    channel_sets = [recording.channels for recording in recordings]
+    return frozenset.intersection(*channel_sets) if channel_sets else frozenset()

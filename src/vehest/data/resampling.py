@@ -24,12 +24,16 @@ def resampled(
 ) -> Recording:
     """A recording, after the transforms of a preparation and by its method, at another rate.
 
-    Raises `DataError` for a rate that is higher than the recording's, unless this is sampled at
-    ``slowest_hz`` or faster.
+    Raises
+    ------
+    DataError
+        A rate that is higher than the recording's, unless this is sampled at ``slowest_hz`` or
+        faster.
     """
     if recording.rate_hz < min(rate_hz * (1 - 1e-9), slowest_hz):
         raise DataError(
-            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed"
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the "
+            f"{rate_hz:g} Hz needed"
         )
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)
@@ -43,25 +47,28 @@ def resampled_parts(
     *,
     slowest_hz: float = math.inf,
 ) -> Iterator[Recording]:
-    """`resampled` for a recording that comes in parts, to the same bits; a preparation with other transforms needs it whole."""
+    """`resampled` for a recording that comes in parts, to the same bits.
+
+    A preparation with other transforms needs it whole.
+    """
     if preparation["transforms"]:
         parts = [joined(list(parts))]
-    kept: list[Recording] = []
+    pending: list[Recording] = []
     done = 0  # samples at the start of the outcome that are out already
     for part in parts:
-        whole = joined([*kept, part])
-        found = resampled(whole, rate_hz, preparation, slowest_hz=slowest_hz)
-        ratio = (Fraction(found.rate_hz) / Fraction(whole.rate_hz)).limit_denominator(1000)
+        segment = joined([*pending, part])
+        outcome = resampled(segment, rate_hz, preparation, slowest_hz=slowest_hz)
+        ratio = (Fraction(outcome.rate_hz) / Fraction(segment.rate_hz)).limit_denominator(1000)
         reach = Resample.reach(ratio)
-        begin = (len(whole) - 2 * reach) // ratio.denominator * ratio.denominator
+        begin = (len(segment) - 2 * reach) // ratio.denominator * ratio.denominator
         number, last = part.provenance.get(PART, (1, 1))
         if number == last:
-            yield found.part(slice(done, len(found)))
+            yield outcome.part(slice(done, len(outcome)))
         elif begin > 0:
-            yield found.part(slice(done, int((begin + reach) * ratio)))
-            whole = whole.part(slice(begin, len(whole)))
+            yield outcome.part(slice(done, int((begin + reach) * ratio)))
+            segment = segment.part(slice(begin, len(segment)))
             done = int(reach * ratio)
-        kept = [whole]
+        pending = [segment]
 
 
 def transforms_of(config: Mapping[str, Any]) -> list[Transform]:

@@ -15,7 +15,10 @@ def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def equal_runs(samples: NDArray[Any]) -> NDArray[np.int64]:
-    """First sample of each run of equal values (T,) and the one after it, (N, 2); every sample lies in one, NaN each in its own."""
+    """First sample of each run of equal values (T,) and the one after it, (N, 2).
+
+    Every sample lies in one, NaN each in its own.
+    """
     changes = np.flatnonzero(samples[1:] != samples[:-1]) + 1
     edges = np.concatenate([[0], changes, [len(samples)]])
     return np.stack([edges[:-1], edges[1:]], axis=1)[: len(samples)]

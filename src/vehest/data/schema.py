@@ -1,8 +1,9 @@
 """Validates plain values, as files hold them, against the dataclasses that describe them.
 
-Types are strict: a number is not taken from text, nor a truth value from a number, nor a whole number from one with a point.
-Keys that the dataclass does not have are refused; one that takes further keys has ``__pydantic_config__ = FURTHER_KEYS``. In
-``Annotated[float, "a number up to 5"]`` the text replaces what messages say of the type.
+Types are strict: a number is not taken from text, nor a truth value from a number, nor a whole
+number from one with a point. Keys that the dataclass does not have are refused; one that takes
+further keys has ``__pydantic_config__ = FURTHER_KEYS``. In ``Annotated[float, "a number up to 5"]``
+the text replaces what messages say of the type.
 """
 
 from __future__ import annotations
@@ -24,26 +25,34 @@ Schema = TypeVar("Schema")
 FURTHER_KEYS = ConfigDict(
     extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
 )
-DEEPEST = 60  # levels that plain values may nest
-LARGEST = 10**300  # whole number
+MAX_DEPTH = 60  # levels that plain values may nest
+MAX_INTEGER = 10**300  # whole number
 
 
 def validated(
     kind: type[Schema],
     content: Any,
-    where: str,
+    subject: str,
     *,
     error: type[VehestError] = DataError,
     group: str = "",
 ) -> Schema:
     """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
-    Args:
-        kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or ``ValueError``.
-        where: first words of a message, ``"'model.yaml'"``; may be empty.
-        group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
+    Parameters
+    ----------
+    kind : type[Schema]
+        Dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or
+        ``ValueError``.
+    subject : str
+        First words of a message, ``"'model.yaml'"``; may be empty.
+    group : str
+        That the keys belong to, ``training`` for ``training.patience``; may be empty.
 
-    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value makes no sense.
+    Raises
+    ------
+    DataError
+        Or ``error``: a key is missing, unknown or of the wrong type, or a value makes no sense.
     """
     above = [group] if group else []
     try:
@@ -53,11 +62,15 @@ def validated(
         message = _in_words(problem, kind, content, above)
     except ValueError as problem:  # of content that is not plain
         message = str(problem)
-    raise error(f"{where}: {message}" if where else message)
+    raise error(f"{subject}: {message}" if subject else message)
 
 
 def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
-    """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups in them; `ConfigurationError`."""
+    """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups
+    in them.
+
+    `ConfigurationError`.
+    """
     return validated(kind, _without_names(config, kind), "", error=ConfigurationError, group=group)
 
 
@@ -73,31 +86,41 @@ def _without_names(content: Any, kind: Any) -> Any:
     }
 
 
-def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int:
-    """The version of a file's layout, as the file states it; `DataError` unless it is between ``oldest`` and ``newest``."""
-    if isinstance(found, bool) or not isinstance(found, int) or found < 0:
-        raise DataError(f"{where}: format must be a whole number, not {str(found)[:40]!r}")
-    if found > newest:
+def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) -> int:
+    """The version of a file's layout, as the file states it.
+
+    `DataError` unless it is between ``oldest`` and ``newest``.
+    """
+    if isinstance(version, bool) or not isinstance(version, int) or version < 0:
+        raise DataError(f"{subject}: format must be a whole number, not {str(version)[:40]!r}")
+    if version > newest:
         raise DataError(
-            f"{where} was written by a newer vehest (format {str(found)[:20]}, this one knows {newest}); update vehest"
+            f"{subject} was written by a newer vehest (format {str(version)[:20]}, this one knows "
+            f"{newest}); update vehest"
         )
-    if found < oldest:
+    if version < oldest:
         raise DataError(
-            f"{where} was written by an older vehest (format {found}, this one reads {oldest} to {newest}); make it again"
+            f"{subject} was written by an older vehest (format {version}, this one reads {oldest} "
+            f"to {newest}); make it again"
         )
-    return found
+    return version
 
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Validates lists of a dataclass: pydantic takes a configuration for what holds a dataclass, not for the dataclass itself."""
+    """Validates lists of a dataclass: pydantic takes a configuration for what holds a dataclass,
+    not for the dataclass itself.
+    """
     return TypeAdapter(list[kind], config={**FURTHER_KEYS, "extra": "forbid"})
 
 
 def _plain(value: Any, path: list[str]) -> Any:
-    """Content with text as keys and lists for tuples; a ValueError where a value is not plain, such as a date, or it nests too deep."""
-    if len(path) > DEEPEST:
-        raise ValueError(f"{path[0]} nests deeper than {DEEPEST} levels")
+    """Content with text as keys and lists for tuples.
+
+    A ValueError where a value is not plain, such as a date, or it nests too deep.
+    """
+    if len(path) > MAX_DEPTH:
+        raise ValueError(f"{path[0]} nests deeper than {MAX_DEPTH} levels")
     if isinstance(value, dict):
         return {str(key): _plain(inner, [*path, str(key)]) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -105,20 +128,22 @@ def _plain(value: Any, path: list[str]) -> Any:
     if (
         value is None
         or isinstance(value, str | bool | float)
-        or (isinstance(value, int) and abs(value) < LARGEST)
+        or (isinstance(value, int) and abs(value) < MAX_INTEGER)
     ):
         return value
-    shown = (
+    problem = (
         "a whole number of more than 300 digits"
         if isinstance(value, int)
         else f"no plain value but a {type(value).__name__}"
     )
     raise ValueError(
-        f"{'.'.join(path) or 'it'} is {shown}, {_shown(value)}; put it in quotes if it is text"
+        f"{'.'.join(path) or 'it'} is {problem}, {_shortened(value)}; put it in quotes if it is "
+        "text"
     )
 
 
-# Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot hold: characters of plane 16,
+# Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot
+# hold: characters of plane 16,
 # which is for private use, replace them while content is validated.
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _REPLACED = {code: code + 0x100000 for code in range(0xD800, 0xE000)}
@@ -128,8 +153,8 @@ _RESTORED = {new: old for old, new in _REPLACED.items()}
 def _validated(kind: Any, content: Any) -> Any:
     text = json.dumps([content], ensure_ascii=False)
     replaced = text.translate(_REPLACED) if _SURROGATE.search(text) else text
-    (made,) = _adapter(kind).validate_json(replaced)
-    return made if replaced is text else _with_surrogates(made)
+    (instance,) = _adapter(kind).validate_json(replaced)
+    return instance if replaced is text else _with_surrogates(instance)
 
 
 def _with_surrogates(value: Any) -> Any:
@@ -141,12 +166,14 @@ def _with_surrogates(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return type(value)(_with_surrogates(inner) for inner in value)
     if is_dataclass(value):
-        for own in fields(value):
-            object.__setattr__(value, own.name, _with_surrogates(getattr(value, own.name)))
+        for attribute in fields(value):
+            object.__setattr__(
+                value, attribute.name, _with_surrogates(getattr(value, attribute.name))
+            )
     return value
 
 
-_WANTED = {
+_TYPE_WORDS = {
     "int_type": "a whole number",
     "float_type": "a number",
     "finite_number": "a number",
@@ -165,7 +192,7 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
     errors = problem.errors(include_url=False)
     error = errors[0]
     loc = errors[0]["loc"]
-    shown = _shown(errors[0]["input"])
+    value = _shortened(errors[0]["input"])
     path = [*_path(loc, [content])[1:], *(loc[-1:] if error["type"] == "missing" else ())]
     name = ".".join(str(part) for part in [*group, *path]) or "it"
     match error["type"]:
@@ -173,40 +200,42 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
             return f"{name} is missing"
         case "unexpected_keyword_argument":
             beside = name.rpartition(".")[0]
-            known = _keys_of(_type_at(kind, path[:-1]))
+            option_names = _keys_of(_type_at(kind, path[:-1]))
             *_, key = name.split(".")
-            meant = suggestion(key, known.split(", "), f"{beside}." if beside else "")
+            meant = suggestion(key, option_names.split(", "), f"{beside}." if beside else "")
             if beside:
-                return f"{name} is not an option of {beside}{meant or ';'} options: {known}"
-            return f"unknown key '{name}'{meant or ';'} there are: {known}"
+                return f"{name} is not an option of {beside}{meant or ';'} options: {option_names}"
+            return f"unknown key '{name}'{meant or ';'} there are: {option_names}"
         case "literal_error":
             choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
             return f"{name} '{error['input']}' is not one of: {choices}"
         case "value_error":
             return f"{name}: {error['ctx']['error']}"
-        case other if other not in _WANTED:
-            return f"{name}: {error['msg'][:1].lower()}{error['msg'][1:]}, not {shown}"
-    here = _type_at(kind, path)
+        case other if other not in _TYPE_WORDS:
+            return f"{name}: {error['msg'][:1].lower()}{error['msg'][1:]}, not {value}"
+    annotated = _type_at(kind, path)
     is_choice = len(loc) > len(path) + 1
     kinds = (
-        [own["type"] for own in errors if own["loc"][:-1] == loc[:-1]]
+        [entry["type"] for entry in errors if entry["loc"][:-1] == loc[:-1]]
         if is_choice
         else [error["type"]]
     )
-    wanted = _bare(here)[1] or " or ".join(
-        dict.fromkeys(_WANTED[own] for own in kinds if own in _WANTED)
+    expected = _bare(annotated)[1] or " or ".join(
+        dict.fromkeys(_TYPE_WORDS[entry] for entry in kinds if entry in _TYPE_WORDS)
     )
-    options = f"; options: {keys}" if (keys := _keys_of(here)) else ""
-    return f"{name} must be {wanted}, not {shown}{options}"
+    options = f"; options: {keys}" if (keys := _keys_of(annotated)) else ""
+    return f"{name} must be {expected}, not {value}{options}"
 
 
-def _shown(value: Any) -> str:
+def _shortened(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]} …"
 
 
 def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
-    """Keys and indices of one of pydantic's locations, which also name choices of unions, as far as the content has them."""
+    """Keys and indices of one of pydantic's locations, which also name choices of unions, as far as
+    the content has them.
+    """
     path: list[str | int] = []
     for part in loc:
         is_item = isinstance(content, list) and isinstance(part, int) and part < len(content)
@@ -238,7 +267,9 @@ def _type_at(kind: Any, path: Sequence[str | int]) -> Any:
 
 def _bare(kind: Any) -> tuple[Any, str]:
     """A type without annotations, of a union the first choice, and the text of the annotations."""
-    text = next((own for own in getattr(kind, "__metadata__", ()) if isinstance(own, str)), "")
+    text = next(
+        (entry for entry in getattr(kind, "__metadata__", ()) if isinstance(entry, str)), ""
+    )
     if get_origin(kind) not in (Annotated, Union, UnionType):
         return kind, ""
     bare, inner = _bare(get_args(kind)[0])

@@ -1,4 +1,6 @@
-"""Reads splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions, percentages, laps and folds."""
+"""Reads splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions,
+percentages, laps and folds.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,16 @@ Catalogue = Callable[
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
-LEAST_SECONDS = 3.0  # of a piece of limited minutes; shorter ones hold no window after the start that is not scored
+# of a piece of limited minutes; shorter ones hold no window after the start that is not scored
+MIN_PIECE_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
 class RangeFile:
-    """A range of conf/split/*.yaml: a recording or a pattern of several; start to stop [s or %] or some laps; else raises `ValueError`."""
+    """A range of conf/split/*.yaml: a recording or a pattern of several.
+
+    Start to stop [s or %] or some laps; else raises `ValueError`.
+    """
 
     dataset: str | None = None
     recording: str | None = None
@@ -53,8 +59,10 @@ class RangeFile:
 
 @dataclass(frozen=True)
 class SplitFile:
-    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in all, as if no more had been recorded with
-    a reference; ``minutes_at`` is the share of them after which these begin."""
+    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in
+    all, as if no more had been recorded with a reference; ``minutes_at`` is the share of them after
+    which these begin.
+    """
 
     name: str = "unnamed"
     title: str | None = None
@@ -79,13 +87,16 @@ class SplitFile:
 
 def _read(config: Any) -> SplitFile:
     name = config.get("name") if isinstance(config, Mapping) else None
-    where = f"split '{name}'" if isinstance(name, str) else ""
-    plain = _spelt_out(config, where) if isinstance(config, Mapping) else config
-    return validated(SplitFile, plain, where, error=ConfigurationError, group="split")
+    subject = f"split '{name}'" if isinstance(name, str) else ""
+    plain = _spelt_out(config, subject) if isinstance(config, Mapping) else config
+    return validated(SplitFile, plain, subject, error=ConfigurationError, group="split")
 
 
-def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Roles in short (``60 %``, ``last lap``) as ranges of all recordings; percentages follow one another, training first."""
+def _spelt_out(config: Mapping[str, Any], subject: str) -> dict[str, Any]:
+    """Roles in short (``60 %``, ``last lap``) as ranges of all recordings.
+
+    Percentages follow one another, training first.
+    """
     done = 0.0
 
     def ranges(role: str, entries: Any) -> Any:
@@ -97,35 +108,54 @@ def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
             done = done + float(share[1])
             if done > 100.0 + 1e-9:
                 raise ConfigurationError(
-                    f"{where}: the percentages come to {done:g} %, more than there is"
+                    f"{subject}: the percentages come to {done:g} %, more than there is"
                 )
             return [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
         if LAPS.fullmatch(entries) is not None:
             return [{"recordings": "*", "laps": entries}]
-        what = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
-        raise ConfigurationError(f"{where}: {role} must be {what}")
+        expected = (
+            'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not '
+            f"'{entries[:60]}'"
+        )
+        raise ConfigurationError(f"{subject}: {role} must be {expected}")
 
-    given = {key: value for key, value in config.items() if value is not None}
-    given |= {role: ranges(role, given[role]) for role in ("train", VALIDATION) if role in given}
-    if isinstance(tests := given.get("tests"), Mapping):
-        given["tests"] = {name: ranges(f"tests.{name}", entries) for name, entries in tests.items()}
-    return given
+    content = {key: value for key, value in config.items() if value is not None}
+    content |= {
+        role: ranges(role, content[role]) for role in ("train", VALIDATION) if role in content
+    }
+    if isinstance(tests := content.get("tests"), Mapping):
+        content["tests"] = {
+            name: ranges(f"tests.{name}", entries) for name, entries in tests.items()
+        }
+    return content
 
 
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
     """Build a split from plain values, as conf/split/*.yaml holds them.
 
-    The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps or folds name or cut them.
+    The recordings, ``catalogue``, are needed only where a pattern, a condition, percentages, laps
+    or folds name or cut them.
 
-    Raises `ConfigurationError`: a key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a condition that
-    none meets; or one of them without a catalogue. Raises `DataError`: a recording lacks a channel that a condition looks at.
+    Raises
+    ------
+    ConfigurationError
+        A key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a
+        condition that none meets; or one of them without a catalogue.
+    DataError
+        A recording lacks a channel that a condition looks at.
     """
     ranges = _Ranges(_read(config), catalogue)
     return ranges.limited(ranges.split())
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets that a split's plain values draw on, sorted; raises `ConfigurationError` where a range names none."""
+    """Names of the data sets that a split's plain values draw on, sorted.
+
+    Raises
+    ------
+    ConfigurationError
+        A range names none.
+    """
     file = _read(config)
     entries = [
         entry
@@ -138,12 +168,17 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on; it wraps around; ends of seconds are left out."""
+    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on.
+
+    It wraps around; ends of seconds are left out.
+    """
     total = _seconds_of(spans)
     begin = at * total
-    kept = _between(spans, begin, min(begin + seconds, total))
-    pieces = (*_between(spans, 0.0, begin + seconds - total), *kept)
-    return tuple(piece for piece in pieces if piece.stop - piece.start >= LEAST_SECONDS) or pieces
+    upper = _between(spans, begin, min(begin + seconds, total))
+    pieces = (*_between(spans, 0.0, begin + seconds - total), *upper)
+    return (
+        tuple(piece for piece in pieces if piece.stop - piece.start >= MIN_PIECE_SECONDS) or pieces
+    )
 
 
 def _seconds_of(spans: Iterable[Span]) -> float:
@@ -152,24 +187,24 @@ def _seconds_of(spans: Iterable[Span]) -> float:
 
 def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
     """Pieces of ranges laid end to end that lie between two times of that line [s]."""
-    found = []
+    pieces = []
     position = 0.0
     for span in spans:
         length = span.stop - span.start
         start = max(begin - position, 0.0)
         stop = min(end - position, length)
         if stop - start > 1e-9:
-            found.append(replace(span, start=span.start + start, stop=span.start + stop))
+            pieces.append(replace(span, start=span.start + start, stop=span.start + stop))
         position += length
-    return found
+    return pieces
 
 
 class _Ranges:
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file = file
         self._catalogue = catalogue
-        self._where = f"split '{file.name}'"
-        self._known: dict[str, Mapping[str, Reader]] = {}
+        self._subject = f"split '{file.name}'"
+        self._catalogues: dict[str, Mapping[str, Reader]] = {}
 
     def split(self) -> Split:
         """The split of the ranges, or of one fold of a cross-validation."""
@@ -182,7 +217,9 @@ class _Ranges:
             return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
             raise ConfigurationError(
-                f"{self._where}: folds make training, validation and test; leave train, validation and tests out"
+                f"{self._subject}: folds make training, validation and test; leave train, "
+                "validation "
+                "and tests out"
             )
         dataset = file.dataset_of()
         recordings = (
@@ -190,7 +227,7 @@ class _Ranges:
             for name in self._matching(dataset, folds.recordings)
         )
         train, validation, test = fold_of(
-            blocks_of(folds, recordings), folds, file.fold, self._where
+            blocks_of(folds, recordings), folds, file.fold, self._subject
         )
         return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
 
@@ -230,8 +267,8 @@ class _Ranges:
                 if entry.recording is not None
                 else self._matching(dataset, str(entry.recordings))
             )
-            whole = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
-            spans += whole if entry.keep is None else self._cut(role, whole, entry.keep)
+            ranges = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
+            spans += ranges if entry.keep is None else self._cut(role, ranges, entry.keep)
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
@@ -242,11 +279,11 @@ class _Ranges:
     def _time(self, dataset: str, name: str, bound: float | str) -> float:
         if not isinstance(bound, str):
             return bound
-        found = PERCENT.fullmatch(bound)
-        share = float(found[1]) if found else math.inf
+        match = PERCENT.fullmatch(bound)
+        share = float(match[1]) if match else math.inf
         if share > 100.0:
             raise ConfigurationError(
-                f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
+                f"{self._subject}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'"
             )
         if share in (0.0, 100.0):
             return -math.inf if share == 0.0 else math.inf
@@ -254,22 +291,24 @@ class _Ranges:
         return recording.start_time + round(share / 100.0 * len(recording)) / recording.rate_hz
 
     def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
-        found = LAPS.fullmatch(words)
-        if found is None:
+        match = LAPS.fullmatch(words)
+        if match is None:
             raise ConfigurationError(
-                f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'"
+                f"{self._subject}: laps are first, last, first 3, last 2, a number, or 2 to 4, not "
+                f"'{words[:60]}'"
             )
-        end, number, first, last = found.groups()
+        end, number, first, last = match.groups()
         laps = laps_of(self._recording(dataset, name))
         count = int(number or 1)
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
-            there = (
+            problem = (
                 f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
             )
             raise ConfigurationError(
-                f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead"
+                f"{self._subject}: recording '{name}' has no '{words.strip()}': {problem}; name "
+                "times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
 
@@ -279,7 +318,7 @@ class _Ranges:
         recordings = self._recordings(dataset)
         if name not in recordings:
             raise ConfigurationError(
-                f"{self._where}: data set '{dataset}' has no recording '{name}'"
+                f"{self._subject}: data set '{dataset}' has no recording '{name}'"
             )
         return recordings[name](channels)
 
@@ -288,25 +327,30 @@ class _Ranges:
         recordings = self._recordings(dataset)
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
-            known = ", ".join([*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])])
+            available = ", ".join(
+                [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
+            )
             raise ConfigurationError(
-                f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {known})"
+                f"{self._subject}: no recording of data set '{dataset}' matches '{pattern}' (it "
+                "has "
+                f"{available})"
             )
         return names
 
     def _recordings(self, dataset: str) -> Mapping[str, Reader]:
-        if dataset not in self._known:
+        if dataset not in self._catalogues:
             if self._catalogue is None:
                 raise ConfigurationError(
-                    f"{self._where}: its patterns and the like need the recordings of data set '{dataset}'"
+                    f"{self._subject}: its patterns and the like need the recordings of data set "
+                    f"'{dataset}'"
                 )
-            self._known[dataset] = self._catalogue(dataset)
-        return self._known[dataset]
+            self._catalogues[dataset] = self._catalogue(dataset)
+        return self._catalogues[dataset]
 
-    def _cut(self, role: str, whole: Sequence[Span], condition: Condition) -> list[Span]:
+    def _cut(self, role: str, ranges: Sequence[Span], condition: Condition) -> list[Span]:
         """Stretches of spans in which a condition holds."""
         spans: list[Span] = []
-        for span in whole:
+        for span in ranges:
             recording = self._recording(span.dataset, span.recording, condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
             for begin, after in stretches_where(recording, condition, first, end):
@@ -321,6 +365,6 @@ class _Ranges:
                 spans.append(replace(span, start=start, stop=stop))
         if not spans:
             raise ConfigurationError(
-                f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})"
+                f"{self._subject}: the condition of {role} keeps nothing ({condition.describe()})"
             )
         return spans

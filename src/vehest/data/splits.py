@@ -6,13 +6,13 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 
 from vehest.data.errors import ConfigurationError, printable
 
 VALIDATION = "validation"
 TRAINING = "training"
-LONGEST_NAME = 100  # characters, so that file names with a stage and a key stay below 255
+MAX_NAME_CHARACTERS = 100  # characters, so that file names with a stage and a key stay below 255
 YAML_WORDS = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n", "nan", "inf"])
 YAML_NUMBER = re.compile(
     r"0[xob][0-9a-f_]+|[0-9][0-9_]*(\.[0-9_]*)?(e-?[0-9]+)?|[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}",
@@ -21,29 +21,34 @@ YAML_NUMBER = re.compile(
 WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
-def check_name(name: str, what: str) -> None:
-    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or an override.
+def check_name(name: str, subject: str) -> None:
+    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or
+    an override.
 
     It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
-    with none of the last, and has `LONGEST_NAME` characters at most. It is no word or number of
-    YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
+    with none of the last, and has `MAX_NAME_CHARACTERS` characters at most. It is no word or number
+    of YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
-            f"{what}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' and "
-            "'.', begin with none of the last two and not end with '.'; it becomes part of file names"
+            f"{subject}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' "
+            "and "
+            "'.', begin with none of the last two and not end with '.'; it becomes part of file "
+            "names"
         )
-    if len(name) > LONGEST_NAME:
+    if len(name) > MAX_NAME_CHARACTERS:
         raise ConfigurationError(
-            f"{what}: '{name[:20]}…' has {len(name)} characters; take {LONGEST_NAME} at most"
+            f"{subject}: '{name[:20]}…' has {len(name)} characters; take {MAX_NAME_CHARACTERS} at "
+            "most"
         )
     if name.lower() in YAML_WORDS or YAML_NUMBER.fullmatch(name):
         raise ConfigurationError(
-            f"{what}: '{name}' is a word or number of YAML; add letters, such as car_{name}"
+            f"{subject}: '{name}' is a word or number of YAML; add letters, such as car_{name}"
         )
     if WINDOWS_DEVICE.fullmatch(name.partition(".")[0]):
         raise ConfigurationError(
-            f"{what}: '{name}' is a device of Windows, not a file; add letters, such as car_{name}"
+            f"{subject}: '{name}' is a device of Windows, not a file; add letters, such as "
+            f"car_{name}"
         )
 
 
@@ -59,13 +64,14 @@ class Span:
     def __post_init__(self) -> None:
         if not self.start < self.stop:
             raise ConfigurationError(
-                f"span of recording '{self.recording}': start {self.start} s is not before stop {self.stop} s"
+                f"span of recording '{self.recording}': start {self.start} s is not before stop "
+                f"{self.stop} s"
             )
 
     def overlaps(self, other: Span) -> bool:
         """Whether both stretches share samples."""
-        same = (self.dataset, self.recording) == (other.dataset, other.recording)
-        return same and self.start < other.stop and other.start < self.stop
+        is_same_recording = (self.dataset, self.recording) == (other.dataset, other.recording)
+        return is_same_recording and self.start < other.stop and other.start < self.stop
 
     def describe(self) -> str:
         """For messages and reports, for example ``lap3 [150, 450) s``."""
@@ -80,8 +86,11 @@ class Split:
 
     Without training and validation stretches it is for estimators that learn nothing.
 
-    Raises `ConfigurationError`: training without validation stretches or the other way round, no stretch at all, or a stretch that serves
-    two purposes.
+    Raises
+    ------
+    ConfigurationError
+        Training without validation stretches or the other way round, no stretch at all, or a
+        stretch that serves two purposes.
     """
 
     name: str
@@ -101,7 +110,8 @@ class Split:
             check_name(name, f"split '{self.name}': test set")
             if name in (VALIDATION, TRAINING):
                 raise ConfigurationError(
-                    f"split '{self.name}': a test set cannot be called '{name}', as the {name} range is in metrics"
+                    f"split '{self.name}': a test set cannot be called '{name}', as the {name} "
+                    "range is in metrics"
                 )
             if not spans:
                 raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
@@ -113,13 +123,21 @@ class Split:
         ]:
             for span, other in product(spans, other_spans):
                 if span.overlaps(other):
-                    what = f"{role} and {other_role} share samples of recording '{span.recording}'"
+                    problem = (
+                        f"{role} and {other_role} share samples of recording '{span.recording}'"
+                    )
                     raise ConfigurationError(
-                        f"split '{self.name}': {what} ({span.describe()} and {other.describe()}); separate the ranges"
+                        f"split '{self.name}': {problem} ({span.describe()} and "
+                        f"{other.describe()}); separate the ranges"
                     )
 
     @property
     def datasets(self) -> tuple[str, ...]:
         """Names of the data sets it draws on, sorted."""
-        spans = (self.train, self.validation, *self.tests.values())
-        return tuple(sorted({span.dataset for own in spans for span in own}))
+        spans = (*self.train, *self.validation, *self.test_spans)
+        return tuple(sorted({span.dataset for span in spans}))
+
+    @property
+    def test_spans(self) -> tuple[Span, ...]:
+        """The ranges of all test sets."""
+        return tuple(chain.from_iterable(self.tests.values()))

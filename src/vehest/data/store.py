@@ -51,7 +51,10 @@ class RecordingDescription:
 
 @dataclass(frozen=True)
 class EstimateDescription:
-    """Description of an estimate beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
+    """Description of an estimate beside its table.
+
+    See `Estimate`. ``n_states`` is the side of the covariance.
+    """
 
     format: int
     content: Literal["estimate"]
@@ -72,7 +75,15 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 
 
 def write_recording(recording: Recording, path: Path) -> None:
-    """Store one recording; the file appears complete or not at all. Raises `MissingError`: the file cannot be written."""
+    """Store one recording.
+
+    The file appears complete or not at all.
+
+    Raises
+    ------
+    MissingError
+        The file cannot be written.
+    """
     about = _attributes(recording, _OF_RECORDING) | {
         "gappy": sorted(recording.gappy),
         "provenance": dict(recording.provenance),
@@ -83,7 +94,12 @@ def write_recording(recording: Recording, path: Path) -> None:
 def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recording:
     """Read a recording back, all of it or the named channels.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged, not a recording, or lacks a channel.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        The file is damaged, not a recording, or lacks a channel.
     """
     columns, described = _read(
         path, RecordingDescription, None if channels is None else list(channels)
@@ -97,17 +113,32 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 
 
 def is_stored_recording(path: Path) -> bool:
-    """Whether ``path`` is a Parquet file that vehest wrote as a recording. Raises `DataError`: its description is damaged."""
+    """Whether ``path`` is a Parquet file that vehest wrote as a recording.
+
+    Raises
+    ------
+    DataError
+        Its description is damaged.
+    """
     return _content_of(path) == "recording"
 
 
 def is_stored_estimate(path: Path) -> bool:
-    """Whether ``path`` is a Parquet file that vehest wrote as an estimate. Raises `DataError`: its description is damaged."""
+    """Whether ``path`` is a Parquet file that vehest wrote as an estimate.
+
+    Raises
+    ------
+    DataError
+        Its description is damaged.
+    """
     return _content_of(path) == "estimate"
 
 
 def _content_of(path: Path) -> str:
-    """What vehest wrote into a Parquet file: ``recording`` or ``estimate``; empty for a file of another tool, whatever it is."""
+    """What vehest wrote into a Parquet file: ``recording`` or ``estimate``.
+
+    Empty for a file of another tool, whatever it is.
+    """
     try:
         with parquet_file(path) as file:
             schema = file.schema_arrow
@@ -118,13 +149,20 @@ def _content_of(path: Path) -> str:
     content = str(_metadata(schema, path).get("content"))
     if content not in ("recording", "estimate"):
         raise DataError(
-            f"'{path}': the description beside the table names neither a recording nor an estimate; make it again"
+            f"'{path}': the description beside the table names neither a recording nor an "
+            "estimate; make it again"
         )
     return content
 
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
-    """Store one estimate, with its time column, so that other tools can read it. Raises `MissingError`: the file cannot be written."""
+    """Store one estimate, with its time column, so that other tools can read it.
+
+    Raises
+    ------
+    MissingError
+        The file cannot be written.
+    """
     _write(path, estimate_columns([estimate]), "estimate", _about_estimate(estimate))
 
 
@@ -148,10 +186,10 @@ def write_estimate_parts(parts: Iterable[Estimate], path: Path, band: str = "") 
     MissingError
         The file cannot be written.
     """
-    rest = iter(parts)
-    first = next(rest)
+    remaining = iter(parts)
+    first = next(remaining)
     about = _about_estimate(first) | ({"band": band} if band else {})
-    columns = map(with_degrees, estimate_columns(chain([first], rest)))
+    columns = map(with_degrees, estimate_columns(chain([first], remaining)))
     units = [QUANTITIES[name] for name in first.covariance_of]
     of_covariance = {
         f"{_COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
@@ -196,7 +234,12 @@ def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray
 def read_estimate(path: Path) -> Estimate:
     """Read an estimate back.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged or not an estimate.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        The file is damaged or not an estimate.
     """
     columns, described = _read(path, EstimateDescription)
     covariance = None
@@ -206,10 +249,11 @@ def read_estimate(path: Path) -> Estimate:
         for name in IN_DEGREES:
             columns.pop(name, None)
         if n_states is not None:
-            here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
-            if n_states < 1 or n_states**2 != here:
+            n_entries = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
+            if n_states < 1 or n_states**2 != n_entries:
                 raise DataError(
-                    f"n_states is {n_states}, and there are {here} columns of the covariance; make it again"
+                    f"n_states is {n_states}, and there are {n_entries} columns of the covariance; "
+                    "make it again"
                 )
             entries = [
                 columns.pop(f"{_COVARIANCE}_{row}_{column}")
@@ -230,15 +274,19 @@ def read_estimate(path: Path) -> Estimate:
 
 
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
-    """The description of a recording or an estimate beside its table; `DataError` if it is damaged or of another kind or format."""
+    """The description of a recording or an estimate beside its table.
+
+    `DataError` if it is damaged or of another kind or format.
+    """
     content = "recording" if kind is RecordingDescription else "estimate"
-    found = _metadata(schema, path)
-    if found.get("content") != content:
+    description = _metadata(schema, path)
+    if description.get("content") != content:
         raise DataError(
-            f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} {content} that vehest wrote"
+            f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} "
+            f"{content} that vehest wrote"
         )
-    check_format(found.get("format", 0), _FORMAT, f"'{path}'")
-    return validated(kind, found, f"'{path}'")
+    check_format(description.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, description, f"'{path}'")
 
 
 def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
@@ -252,12 +300,16 @@ def _write(
     about: Mapping[str, Any],
     units: Mapping[str, str] | None = None,
 ) -> None:
-    """Write parts as one table with a description beside it; ``units``: column -> unit, for the schema."""
+    """Write parts as one table with a description beside it.
+
+    ``units``: column -> unit, for the schema.
+    """
     try:
         described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})"
+            f"'{path}' cannot be written: the provenance holds more than JSON values "
+            f"({first_line(error)})"
         ) from None
     tables = (
         _table(columns, units or {}).replace_schema_metadata({_METADATA_KEY: described})
@@ -282,7 +334,8 @@ def _table(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> pa.Ta
         for name, values in columns.items()
     }  # without pandas
     arrays = [
-        pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for own in buffers.values()
+        pa.Array.from_buffers(pa.float64(), buffer.size // 8, [None, buffer])
+        for buffer in buffers.values()
     ]
     fields = [
         pa.field(name, pa.float64(), metadata={"unit": units[name]} if name in units else None)
@@ -300,7 +353,8 @@ def _read(
         for name, column in zip(schema.names, schema.types, strict=True):
             if column != pa.float64() or schema.names.count(name) > 1:
                 raise DataError(
-                    f"'{path}': column '{name}' is there twice, or of type {column}, not double; make it again"
+                    f"'{path}': column '{name}' is there twice, or of type {column}, not double; "
+                    "make it again"
                 )
         missing = [name for name in names or [] if name not in schema.names]
         if missing:
@@ -318,6 +372,7 @@ def _metadata(schema: pa.Schema, path: Path) -> dict[str, Any]:
     )
     if not isinstance(described, dict):
         raise DataError(
-            f"'{path}': the description beside the table is damaged (it is no mapping); make it again"
+            f"'{path}': the description beside the table is damaged (it is no mapping); make it "
+            "again"
         )
     return described

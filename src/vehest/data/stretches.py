@@ -15,7 +15,13 @@ from vehest.data.runs import true_runs
 
 @dataclass(frozen=True)
 class Bounds:
-    """Smallest and largest magnitude of a channel, both included, in its unit. Raises `ValueError`: no magnitude lies between them."""
+    """Smallest and largest magnitude of a channel, both included, in its unit.
+
+    Raises
+    ------
+    ValueError
+        No magnitude lies between them.
+    """
 
     at_least: float = 0.0
     at_most: float = math.inf
@@ -27,7 +33,13 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Condition:
-    """What must hold at every sample of a stretch, and how long for. Raises `ValueError`: there is no channel, or an unknown one."""
+    """What must hold at every sample of a stretch, and how long for.
+
+    Raises
+    ------
+    ValueError
+        There is no channel, or an unknown one.
+    """
 
     magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
     at_least_seconds: NonNegativeFloat = 0.0  # shortest stretch [s]
@@ -50,7 +62,15 @@ class Condition:
 def stretches_where(
     recording: Recording, condition: Condition, first: int, end: int
 ) -> list[tuple[int, int]]:
-    """Longest runs [first, end) of sample indices that meet a condition; unmeasured ones do not; raises `DataError` without a channel."""
+    """Longest runs [first, end) of sample indices that meet a condition.
+
+    Unmeasured ones do not.
+
+    Raises
+    ------
+    DataError
+        A channel of the condition is missing.
+    """
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])

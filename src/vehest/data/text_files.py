@@ -1,4 +1,8 @@
-"""Reads YAML, JSON and CSV that describe something, within limits on length, nesting and repetition; damage is one line."""
+"""Reads YAML, JSON and CSV that describe something, within limits on length, nesting and
+repetition.
+
+Damage is one line.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,9 @@ import yaml
 from vehest.data.errors import DataError, VehestError
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
-from vehest.data.schema import DEEPEST
+from vehest.data.schema import MAX_DEPTH
 
-MOST_VALUES = 500_000  # of a YAML text, each counted as often as aliases repeat it
+MAX_YAML_VALUES = 500_000  # of a YAML text, each counted as often as aliases repeat it
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -39,24 +43,34 @@ def read_yaml(path: Path) -> Any:
     return parse_yaml(read_text(path), f"'{path}'")
 
 
-def parse_yaml(text: str, where: str) -> Any:
-    """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
-    check_yaml_size(text, where)
+def parse_yaml(text: str, subject: str) -> Any:
+    """Plain values of YAML.
+
+    Raises
+    ------
+    DataError
+        It is not YAML, nests too deep, or repeats itself into too many values.
+    """
+    check_yaml_size(text, subject)
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     except (
         AttributeError,
         LookupError,
     ):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
         raise DataError(
-            f"{where} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)"
+            f"{subject} cannot be read as YAML (a value is not what its tag, such as !!timestamp, "
+            "says)"
         ) from None
 
 
-def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> None:
-    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built; raises `DataError`."""
+def check_yaml_size(text: str, subject: str, max_values: int = MAX_YAML_VALUES) -> None:
+    """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built.
+
+    Raises `DataError`.
+    """
     try:
         try:
             is_larger = _is_larger(text, max_values, _Loader)
@@ -65,15 +79,19 @@ def check_yaml_size(text: str, where: str, max_values: int = MOST_VALUES) -> Non
         ):  # libyaml refuses names that are not UTF-8, which are written as surrogates
             is_larger = _is_larger(text, max_values, yaml.SafeLoader)
     except (yaml.YAMLError, ValueError) as error:
-        raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as YAML ({first_line(error)})") from None
     if is_larger:
         raise DataError(
-            f"{where} nests deeper than {DEEPEST} levels or holds more than {max_values} values, repeated ones included"
+            f"{subject} nests deeper than {MAX_DEPTH} levels or holds more than {max_values} "
+            "values, "
+            "repeated ones included"
         )
 
 
 def _is_larger(text: str, max_values: int, loader: Any) -> bool:
-    """Whether YAML nests deeper than `DEEPEST` or holds more values, each counted as often as aliases repeat it."""
+    """Whether YAML nests deeper than `MAX_DEPTH` or holds more values, each counted as often as
+    aliases repeat it.
+    """
     sizes: dict[str | None, int] = {}  # of anchored collections
     begun: list[tuple[str | None, int]] = []
     count = 0
@@ -86,7 +104,7 @@ def _is_larger(text: str, max_values: int, loader: Any) -> bool:
             if isinstance(event, yaml.CollectionStartEvent):
                 begun.append((event.anchor, count))
                 sizes[event.anchor] = max_values  # until its end: it cannot hold itself
-        if count > max_values or len(begun) > DEEPEST:
+        if count > max_values or len(begun) > MAX_DEPTH:
             return True
     return False
 
@@ -96,17 +114,32 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path), f"'{path}'")
 
 
-def parse_json(text: str | bytes, where: str) -> Any:
-    """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
-    check_limit("text_bytes", len(text), f"{where} holds a description of {len(text)} bytes")
+def parse_json(text: str | bytes, subject: str) -> Any:
+    """Plain values of JSON.
+
+    Raises
+    ------
+    DataError
+        It is not JSON, too long, or nests too deep.
+    """
+    check_limit("text_bytes", len(text), f"{subject} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # a UnicodeDecodeError is a ValueError
-        raise DataError(f"{where} cannot be read as JSON ({first_line(error)})") from None
+        raise DataError(f"{subject} cannot be read as JSON ({first_line(error)})") from None
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write plain values as JSON; bytes of names that are not UTF-8 become escapes."""
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
-    """Rows of a CSV file whose first line names its columns, such as vehest writes them; `DataError` if one is missing or short."""
+    """Rows of a CSV file whose first line names its columns, such as vehest writes them.
+
+    `DataError` if one is missing or short.
+    """
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
         rows = list(reader)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.errors import abbreviated
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,9 +58,7 @@ class TimeSeries(ABC):
 
     def __repr__(self) -> str:
         names = list(self.channels)
-        more = len(names) - MAX_REPR_CHANNELS
-        rest = f" and {more} more" if more > 0 else ""
-        return f"<{self._describe()}; {', '.join(names[:MAX_REPR_CHANNELS])}{rest}>"
+        return f"<{self._describe()}; {abbreviated(names, MAX_REPR_CHANNELS)}>"
 
     def _repr_html_(self) -> str:
         """Table of the channels for a notebook: unit, range, missing samples."""

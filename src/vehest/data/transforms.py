@@ -1,4 +1,6 @@
-"""Transforms of recordings before an estimator reads them: pure functions with settings, causal unless they say otherwise."""
+"""Transforms of recordings before an estimator reads them: pure functions with settings, causal
+unless they say otherwise.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = (
+MAX_DIRECT_TAPS = (
     8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 )
 OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
@@ -47,11 +49,13 @@ Transform = Callable[[Recording], Recording]
 class Resample:
     """Change the sampling rate by any rational ratio; the first sample keeps its time.
 
-    ``polyphase`` is offline: it applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so
-    nothing is shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th
-    sample as it is (integer ratios only), as a slower sensor or a naive logger would.
+    ``polyphase`` is offline: it applies a linear-phase FIR low-pass (Kaiser window) in polyphase
+    form whose delay is compensated, so nothing is shifted and frequencies above the new Nyquist
+    frequency are removed before they can alias. ``decimate`` keeps every n-th sample as it is
+    (integer ratios only), as a slower sensor or a naive logger would.
 
-    Source: Crochiere & Rabiner, Multirate Digital Signal Processing, 1983; `scipy.signal.resample_poly`.
+    Source: Crochiere & Rabiner, Multirate Digital Signal Processing, 1983;
+    `scipy.signal.resample_poly`.
     """
 
     rate_hz: float  # the new rate [Hz]
@@ -69,31 +73,41 @@ class Resample:
             )
 
     def __call__(self, recording: Recording) -> Recording:
-        """Resample every channel; errors where the outcome or the filter is more than the limits, or a gappy channel needs filtering."""
+        """Resample every channel.
+
+        Errors where the outcome or the filter is more than the limits, or a gappy channel needs
+        filtering.
+        """
         expected = len(recording) * (self.rate_hz / recording.rate_hz)
-        what = (
+        problem = (
             f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
         )
-        check_limit("samples", expected, what)
+        check_limit("samples", expected, problem)
         check_limit(
             "memory",
             8 * expected * len(recording.channels),
-            f"{what} in each of {len(recording.channels)} channels",
+            f"{problem} in each of {len(recording.channels)} channels",
         )
         exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
         ratio = exact.limit_denominator(1000)
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
-            what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
-            raise DataError(f"recording '{recording.id}': {what}")
+            problem = (
+                f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole "
+                "numbers up to 1000"
+            )
+            raise DataError(f"recording '{recording.id}': {problem}")
         up = ratio.numerator
         down = ratio.denominator
         if up == down:
             return recording
         if self.method == "decimate":
             if up != 1:
-                what = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
+                problem = (
+                    f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not "
+                    "a whole ratio"
+                )
                 raise ConfigurationError(
-                    f"recording '{recording.id}': {what}; use method=polyphase"
+                    f"recording '{recording.id}': {problem}; use method=polyphase"
                 )
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:
@@ -101,7 +115,8 @@ class Resample:
             check_limit(
                 "filter_samples",
                 length,
-                f"recording '{recording.id}': resampling by {up}/{down} needs a filter of {length} samples",
+                f"recording '{recording.id}': resampling by {up}/{down} needs a filter of "
+                f"{length} samples",
             )
             names = _without_gaps(recording, tuple(recording.channels))
             taps = self._taps(up, down)
@@ -111,7 +126,9 @@ class Resample:
 
     @classmethod
     def reach(cls, ratio: Fraction) -> int:
-        """How many samples before or after it a sample depends on at most, in whole steps of the new clock."""
+        """How many samples before or after it a sample depends on at most, in whole steps of the
+        new clock.
+        """
         up = ratio.numerator
         down = ratio.denominator
         return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
@@ -121,9 +138,9 @@ class Resample:
         half = self.zero_crossings * slower
         taps, window = windowed_sinc(half, self.cutoff / slower, self.kaiser_beta)
         lag = np.arange(-half, half + 1) / half
-        for phase in range(
-            up
-        ):  # every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line that line
+        # Every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line
+        # that line.
+        for phase in range(up):
             branch = slice(phase, None, up)
             taps[branch] /= up * taps[branch].sum()
             shapes = window[branch] * lag[branch] ** np.array([[0], [1]])
@@ -137,8 +154,9 @@ class Resample:
 class LowPass:
     """Remove frequencies above a cut-off.
 
-    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways, offline. A ``fir`` is
-    symmetric (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
+    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs
+    it both ways, offline. A ``fir`` is symmetric (a sinc under a Hamming window), so that it has no
+    phase, and cannot be causal.
 
     Source: of the ``fir``, Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.5.
     """
@@ -154,20 +172,28 @@ class LowPass:
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError(
-                "a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one"
+                "a low-pass of design fir sees as far ahead as back; use design=butterworth for a "
+                "causal one"
             )
 
     def __call__(self, recording: Recording) -> Recording:
-        """Filter the channels; errors where one is missing or has gaps, or the cut-off does not suit the rate or the limits."""
-        where = f"recording '{recording.id}'"
+        """Filter the channels.
+
+        Errors where one is missing or has gaps, or the cut-off does not suit the rate or the
+        limits.
+        """
+        subject = f"recording '{recording.id}'"
         rate_hz = recording.rate_hz
         if not 0 < self.cutoff_hz < rate_hz / 2:
             raise ConfigurationError(
-                f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz"
+                f"{subject}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and "
+                f"{rate_hz / 2:g} Hz"
             )
         length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
-        what = f"{where}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
-        check_limit("filter_samples", length, what, ConfigurationError)
+        problem = (
+            f"{subject}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
+        )
+        check_limit("filter_samples", length, problem, ConfigurationError)
         sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos")
 
         def filtered(samples: FloatArray) -> FloatArray:
@@ -186,10 +212,13 @@ class LowPass:
         )
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
-        """By the ``fir``, on samples extended at both ends by odd reflection; a constant stays that constant, a line that line."""
+        """By the ``fir``, on samples extended at both ends by odd reflection.
+
+        A constant stays that constant, a line that line.
+        """
         half = max(1, round(self.reach * rate_hz))
         taps = scipy.signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
-        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else scipy.signal.oaconvolve
+        convolve = np.convolve if len(taps) <= MAX_DIRECT_TAPS else scipy.signal.oaconvolve
         return convolve(_extended(samples, half), taps, mode="valid")
 
 
@@ -205,14 +234,17 @@ class RemoveOutliers:
     channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
 
     def __call__(self, recording: Recording) -> Recording:
-        """Clean the channels; errors where one is missing or has gaps, or the windows are more than the limits."""
+        """Clean the channels.
+
+        Errors where one is missing or has gaps, or the windows are more than the limits.
+        """
         width = 2 * self.half_window + 1
-        what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
-        check_limit("filter_samples", width, what, ConfigurationError)
+        problem = f"recording '{recording.id}': outlier removal over windows of {width} samples"
+        check_limit("filter_samples", width, problem, ConfigurationError)
         check_limit(
             "memory",
             8 * width * len(recording),
-            f"{what} compares {width * len(recording)} values a channel",
+            f"{problem} compares {width * len(recording)} values a channel",
             ConfigurationError,
         )
         at_once = max(VALUES_AT_ONCE // width, 1)
@@ -240,7 +272,11 @@ class RemoveOutliers:
 
 @dataclass(frozen=True)
 class BridgeImpossible:
-    """Replace samples beyond what a vehicle can do by straight lines, in channels with a few of them; offline."""
+    """Replace samples beyond what a vehicle can do by straight lines, in channels with a few of
+    them.
+
+    offline.
+    """
 
     beside: Annotated[float, Field(ge=0.0)] = (
         0.0  # reach of a line to either side, where a slower signal was interpolated [s]
@@ -252,11 +288,14 @@ class BridgeImpossible:
         places = np.arange(len(recording))
         changed = {}
         for name, samples in recording.channels.items():
-            beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
+            is_impossible = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
             if (
-                beyond.any()
+                is_impossible.any()
                 and (
-                    near := np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5
+                    near := np.convolve(is_impossible, around)[len(around) // 2 :][
+                        : len(is_impossible)
+                    ]
+                    > 0.5
                 ).mean()
                 <= MOST_BRIDGED
             ):
@@ -268,12 +307,15 @@ class BridgeImpossible:
 
 @dataclass(frozen=True)
 class MountingCorrection:
-    """Bring the accelerometer's readings to the centre of gravity and the vehicle's axes, in the plane.
+    """Bring the accelerometer's readings to the centre of gravity and the vehicle's axes, in the
+    plane.
 
-    The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw`` about the vertical axis:
-    a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l). With a lever arm it is offline: dω/dt is taken by central differences.
+    The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw``
+    about the vertical axis: a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l). With a lever arm it
+    is offline: dω/dt is taken by central differences.
 
-    Source: Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section 3.2.
+    Source: Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section
+    3.2.
     """
 
     lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
@@ -281,7 +323,13 @@ class MountingCorrection:
     yaw: float = 0.0  # rotation of the sensor's axes against the vehicle's, counter-clockwise [rad]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct ax and ay. Raises `DataError`: ax, ay or yaw_rate is missing or has gaps."""
+        """Correct ax and ay.
+
+        Raises
+        ------
+        DataError
+            One of ax, ay and yaw_rate is missing or has gaps.
+        """
         ax, ay, yaw_rate = (
             recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate"))
         )
@@ -298,16 +346,20 @@ class MountingCorrection:
 
 @dataclass(frozen=True)
 class ReferenceLever:
-    """Move reference velocities from where their sensor sits to the centre of gravity: v_cg = v_sensor - ω × l.
+    """Move reference velocities from where their sensor sits to the centre of gravity: v_cg =
+    v_sensor - ω × l.
 
-    Source: Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C moves an optical sensor on the bumper so.
+    Source: Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C
+    moves an optical sensor on the bumper so.
     """
 
     lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
     lever_y: float = 0.0  # leftward offset [m]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate."""
+        """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or,
+        without one, yaw_rate.
+        """
         turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
         moved = (
             {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y}
@@ -325,13 +377,16 @@ class ReferenceLever:
 
 @dataclass(frozen=True)
 class DelayCorrection:
-    """Bring channels that are late onto the clock of the others: each sample becomes the sensor's value ``delay`` later; offline.
+    """Bring channels that are late onto the clock of the others: each sample becomes the sensor's
+    value ``delay`` later; offline.
 
-    Between samples a band-limited interpolation (sinc under a Kaiser window) is used; it is within 0.1 % up to 0.8 of the Nyquist
-    frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
-    interpolation, 16 samples, and by the delay at one of them.
+    Between samples a band-limited interpolation (sinc under a Kaiser window) is used; it is within
+    0.1 % up to 0.8 of the Nyquist frequency. Where it would need samples that the recording does
+    not have, the recording is cut: at either end by the reach of the interpolation, 16 samples, and
+    by the delay at one of them.
 
-    Source: Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing Magazine 13 (1), 1996.
+    Source: Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing
+    Magazine 13 (1), 1996.
     """
 
     delay: float  # by how much the channels are late, negative if they are early [s]
@@ -343,14 +398,15 @@ class DelayCorrection:
         """Shift the channels, and cut the recording to the samples that then exist."""
         length = len(recording)
         position = self.delay * recording.rate_hz
-        whole = round(min(max(position, -length), length))
-        fraction = position - whole
+        n_samples = round(min(max(position, -length), length))
+        fraction = position - n_samples
         reach = 0 if abs(fraction) < 1e-9 else self.reach
-        first = max(reach - whole, 0)
-        last = length - max(reach + whole, 0)
+        first = max(reach - n_samples, 0)
+        last = length - max(reach + n_samples, 0)
         if first >= last:
             raise DataError(
-                f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s"
+                f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be "
+                f"shifted by {self.delay:g} s"
             )
         taps = self._taps(fraction) if reach else np.ones(1)
         channels = {name: samples[first:last] for name, samples in recording.channels.items()}
@@ -358,7 +414,7 @@ class DelayCorrection:
             recording, self.channels
         ):  # output sample k is the sum of taps over the samples around k + whole
             neighbours = np.lib.stride_tricks.sliding_window_view(recording[name], len(taps))
-            channels[name] = neighbours[first + whole - reach : last + whole - reach] @ taps
+            channels[name] = neighbours[first + n_samples - reach : last + n_samples - reach] @ taps
         return replace(
             recording,
             start_time=recording.start_time + first / recording.rate_hz,
@@ -383,7 +439,13 @@ class OffsetCorrection:
     )  # by channel, in its unit
 
     def __call__(self, recording: Recording) -> Recording:
-        """Subtract the offsets. Raises `DataError`: a channel is missing."""
+        """Subtract the offsets.
+
+        Raises
+        ------
+        DataError
+            A channel is missing.
+        """
         return recording.with_channels(
             {name: recording[name] - value for name, value in self.offsets.items()}
         )
@@ -409,12 +471,16 @@ TRANSFORMS: dict[str, type[Any]] = {
 
 
 OF_REFERENCES = frozenset({"reference_lever", "velocity_from_sideslip", "sideslip_from_velocity"})
-"""Transforms that read and change reference channels alone: a drive without a reference goes without them."""
+"""Transforms that read and change reference channels alone: a drive without a reference goes
+without them.
+"""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a model."""
+    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a
+    model.
+    """
 
     method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
     transforms: tuple[
@@ -431,10 +497,17 @@ class Preparation:
 
 
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
-    """Build a transform from plain values: its ``name`` and its arguments. Raises `ConfigurationError`: an unknown name or argument."""
+    """Build a transform from plain values: its ``name`` and its arguments.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name or argument.
+    """
     if not isinstance(config, Mapping):
         raise ConfigurationError(
-            f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}"
+            f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not "
+            f"{config!r}"
         )
     arguments = {str(key): value for key, value in config.items() if key != "name"}
     if isinstance(arguments.get("channels"), str):
@@ -446,7 +519,8 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
 
 
 def windowed_sinc(half: int, cutoff: float, beta: float) -> tuple[FloatArray, FloatArray]:
-    """Taps of a low-pass of unit gain at 0 Hz, and their Kaiser window, (2 half + 1,); ``cutoff`` in Nyquist frequencies.
+    """Taps of a low-pass of unit gain at 0 Hz, and their Kaiser window, (2 half + 1,); ``cutoff``
+    in Nyquist frequencies.
 
     As by `scipy.signal.firwin` to the bit, which takes a second to import.
     """
@@ -457,9 +531,11 @@ def windowed_sinc(half: int, cutoff: float, beta: float) -> tuple[FloatArray, Fl
 
 
 def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray, n_out: int) -> FloatArray:
-    """Polyphase filtering of samples that are extended at both ends, so that the ends do not ring; (T,) -> (n_out,).
+    """Polyphase filtering of samples that are extended at both ends, so that the ends do not ring;
+    (T,) -> (n_out,).
 
-    Sums run over the samples in their order, as in `scipy.signal.resample_poly`, for many outputs at once.
+    Sums run over the samples in their order, as in `scipy.signal.resample_poly`, for many outputs
+    at once.
     """
     half = len(taps) // 2
     margin = -(-(half // up + 1) // down) * down  # whole steps of the output grid
@@ -477,11 +553,15 @@ def _compiled_sums() -> Callable[..., None]:
     """`_sums` compiled, for which importing this module is not worth importing numba."""
     import numba
 
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(_sums)  # type: ignore[no-any-return]
+    compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+    return compiled(_sums)  # type: ignore[no-any-return]
 
 
 def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
-    """Add what each sample gives to the outputs; ``newest``: place of the first output's last tap on the grid of up times the rate."""
+    """Add what each sample gives to the outputs.
+
+    ``newest``: place of the first output's last tap on the grid of up times the rate.
+    """
     down = len(rows)
     sums = np.empty(OUTPUTS_AT_ONCE)
     for begin in range(0, len(filtered), OUTPUTS_AT_ONCE * up):
@@ -509,12 +589,16 @@ def _extended(samples: FloatArray, margin: int) -> FloatArray:
 
 
 def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, of none those of all measured channels; refused where one of the channels has gaps."""
+    """The names, of none those of all measured channels.
+
+    Refused where one of the channels has gaps.
+    """
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
     for name in chosen:
         if name in recording.gappy:
-            what = f"channel '{name}' has gaps and cannot be filtered"
+            problem = f"channel '{name}' has gaps and cannot be filtered"
             raise DataError(
-                f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate"
+                f"recording '{recording.id}': {problem}; leave it out, or resample with "
+                "method=decimate"
             )
     return chosen

@@ -33,7 +33,16 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "Pa": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": 6894.757293168361},
     "A": {"A": 1.0},
     "m": {"m": 1.0, "mm": 1e-3},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0},
+    "s": {
+        "s": 1.0,
+        "ms": 1e-3,
+        "us": 1e-6,
+        "ns": 1e-9,
+        "cs": 0.01,
+        "min": 60.0,
+        "h": 3600.0,
+        "d": 86_400.0,
+    },
     "1": {"1": 1.0},
 }
 _UNITS = {
@@ -42,7 +51,13 @@ _UNITS = {
 
 
 def factor_to_si(unit: str, si_unit: str) -> float:
-    """Factor that brings a value in ``unit`` to ``si_unit``. Raises `DataError`: the unit is not known, or measures something else."""
+    """Factor that brings a value in ``unit`` to ``si_unit``.
+
+    Raises
+    ------
+    DataError
+        The unit is not known, or measures something else.
+    """
     if unit not in _UNITS:
         raise DataError(f"unit '{unit}' is not known; known units: {', '.join(sorted(_UNITS))}")
     target, factor = _UNITS[unit]

@@ -18,7 +18,8 @@ from vehest.data.recording import Recording
 class WindowSet:
     """All windows of N samples of some recordings, each with the target one step after it.
 
-    Window i is ``series[starts[i] : starts[i] + n_window]``; it never crosses from one recording into the next.
+    Window i is ``series[starts[i] : starts[i] + n_window]``; it never crosses from one recording
+    into the next.
     """
 
     series: FloatArray  # channels as columns, recordings one after another, shape (T, C)
@@ -33,7 +34,13 @@ class WindowSet:
 def windows_of(
     recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int
 ) -> WindowSet:
-    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1); raises `DataError` for gaps or no windows."""
+    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1).
+
+    Raises
+    ------
+    DataError
+        Gaps or no windows.
+    """
     check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
     series = []
     targets = []
@@ -43,7 +50,8 @@ def windows_of(
         for name in (*channels, target):
             if name in recording.gappy and np.isnan(recording[name]).any():
                 raise DataError(
-                    f"recording '{recording.id}': channel '{name}' has gaps; windows need a value at every sample"
+                    f"recording '{recording.id}': channel '{name}' has gaps; windows need a value "
+                    "at every sample"
                 )
         first = window_starts(len(recording), n_window)
         series.append(recording.stack(channels))

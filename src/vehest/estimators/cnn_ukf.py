@@ -29,6 +29,7 @@ from vehest.estimators.networks.sample_network import (
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import DivergenceError, FitContext
 from vehest.training.noise_tuning import IdentificationSettings
+from vehest.training.robust import robust_squares
 from vehest.training.samples import Draw, Samples, sample_phase
 from vehest.training.sequences import (
     Phase,
@@ -70,6 +71,13 @@ class EndToEndSettings(Group):
         "rad",
         "of the angles in the loss of Eq. 7; the optimum is the same, but gradients in rad² are about as small as the number that AdamW "
         "adds to their size, 1e-8, so that it takes steps far below its rate",
+    )
+    loss_limit: float = setting(
+        0.0,
+        "error of either angle beyond which its square in the loss of Eq. 7 is continued by its tangent (Huber's loss), so that skids do not "
+        "decide the training; 0: none, as in the paper",
+        unit="deg",
+        least=0.0,
     )
     identification: IdentificationSettings = setting(IdentificationSettings(), "of the filter")
     dtype: Literal["float32", "float64"] = setting(
@@ -212,6 +220,7 @@ class CnnUkf(NetworkUkf):
                     data.validation,
                     over=training.identification.error,
                     pseudo=self.pseudo_measurements(data.validation),
+                    limit=training.identification.error_limit,
                 ),
             ),
         ]
@@ -352,6 +361,8 @@ class EndToEnd:
     def loss(self, batch: Cuts) -> Tensor:
         """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad², or deg² if the settings say so].
 
+        Beyond ``training.loss_limit`` squares are continued by their tangents (`robust_squares`).
+
         Cuts whose covariance or gradient is not finite are left out and counted.
 
         Raises `DivergenceError`: that is more than half of the batch.
@@ -378,8 +389,10 @@ class EndToEnd:
             filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1)
         )
         lost |= self._account(~finite, batch, "covariance")
+        limit = math.radians(self.training.loss_limit)
         errors = [
-            (batch.sideslip - angle)[~lost].square().mean() for angle in (found.sideslip, sideslip)
+            robust_squares((batch.sideslip - angle)[~lost], limit).mean()
+            for angle in (found.sideslip, sideslip)
         ]
         return (errors[0] + errors[1]) * (
             math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0

@@ -287,7 +287,10 @@ class DugoffUkf(DugoffFilter):
             interrupted = search.interrupted
         if data.validation and all("vy_ref" in recording for recording in data.validation):
             metrics["best_validation_loss"] = self.mean_squared_error(
-                data.validation, training.skip_seconds, over=training.error
+                data.validation,
+                training.skip_seconds,
+                over=training.error,
+                limit=training.error_limit,
             )
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started

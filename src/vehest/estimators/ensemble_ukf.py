@@ -53,6 +53,10 @@ class EnsembleSettings(SampleSettings):
             raise ConfigurationError(
                 f"training.scaling_trials must be at least training.identification.stages, not {self.scaling_trials}"
             )
+        if self.loss_limit:
+            raise ConfigurationError(
+                "training.loss_limit is of squared errors, and the ensemble learns by a likelihood; set training.identification.error_limit"
+            )
 
 
 class EnsembleUkf(NetworkUkf):
@@ -143,7 +147,11 @@ class EnsembleUkf(NetworkUkf):
                 for sideslip, variance in found
             ]
             return self.mean_squared_error(
-                recordings, how.skip_seconds, over=how.error, pseudo=pseudo
+                recordings,
+                how.skip_seconds,
+                over=how.error,
+                pseudo=pseudo,
+                limit=how.error_limit,
             )
 
         return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)

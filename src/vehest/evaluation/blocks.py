@@ -43,6 +43,11 @@ class Segments:
         return len(self.piece)
 
     @property
+    def is_finite(self) -> bool:
+        """Whether every scored sideslip has a finite error."""
+        return math.isfinite(float(self.squared_error_sideslip.sum()))
+
+    @property
     def with_sideslip(self) -> Segments:
         """Those in which sideslip is scored."""
         chosen = self.sideslip_samples > 0
@@ -101,8 +106,14 @@ def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
 
 
 def read_segments(path: Path) -> dict[str, Segments]:
-    """Segments of every test set; raises `MissingError` where there is no such file, `DataError`
-    where it is damaged.
+    """Segments of every test set.
+
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It is damaged.
     """
     rows: dict[str, list[list[float]]] = {}
     for row in read_rows(path, ("test_set", *COLUMNS)):

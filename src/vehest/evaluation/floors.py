@@ -20,11 +20,13 @@ states and noise are drawn at random and whose parameters are known. For a linea
 Gaussian noise its recursion is that of the Kalman filter's covariance. The model, with yaw rate ω
 and speed u as measured:
 
-    v is a Gauss-Markov process with the spread and correlation time of the drive's v           (always)
-    dv/dt = a_y - u ω - b - n          b slow (bank, roll, offset), n white                     (where a_y is read)
-    du/dt = a_x + v ω + c + m          c slow, m white; u is measured with white noise          (where a_x is read)
-    v = l_r ω - (1 + s_r) u α_r + e_r,         α = k₁ a + k₂ dω/dt + k₃ a³                      (rear axle, if the car is known)
-    v = (δ - δ₀) u - l_f ω - (1 + s_f) u α_f + e_f                                              (front axle, where steer is read too)
+    v is a Gauss-Markov process with the spread and correlation time of the drive's v
+    (always) dv/dt = a_y - u ω - b - n          b slow (bank, roll, offset), n white
+    (where a_y is read) du/dt = a_x + v ω + c + m          c slow, m white; u is measured with white
+    noise          (where a_x is read) v = l_r ω - (1 + s_r) u α_r + e_r,         α = k₁ a + k₂
+    dω/dt + k₃ a³                      (rear axle, if the car is known) v = (δ - δ₀) u - l_f ω - (1
+    + s_f) u α_f + e_f                                              (front axle, where steer is read
+    too)
 
 The axles are the balances of forces of the single track, each with the load and inertia that belong
 to it (J = m l_f l_r) and a tyre that gives way with the third power; a is a_y where it is read,
@@ -326,7 +328,8 @@ def cramer_rao_floor(
     """
     if not {"vx", "yaw_rate"} <= set(inputs) <= set(INPUTS):
         raise ValueError(
-            f"inputs of a bound are vx, yaw_rate and some of {', '.join(INPUTS[2:])}, not {', '.join(sorted(inputs))}"
+            f"inputs of a bound are vx, yaw_rate and some of {', '.join(INPUTS[2:])}, not "
+            f"{', '.join(sorted(inputs))}"
         )
     if (
         not all(set(inputs) <= set(drive.inputs) for drive in drives)

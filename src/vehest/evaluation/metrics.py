@@ -1,7 +1,8 @@
 """Scored samples, and metrics: errors of lateral velocity, sideslip angle and further states,
 consistency of filters.
 
-    spans --sequences, pieces_of--> ranges or sequences --score--> `Scored` --accuracy--> metric -> value
+    spans --sequences, pieces_of--> ranges or sequences --score--> `Scored` --accuracy--> metric ->
+    value
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ COVERAGE = {
 }  # number of standard deviations -> fraction of Gaussian errors within them
 
 POLYPHASE: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
-"""Preparation by which recordings come to another rate unless a model's training had another one."""
+"""Preparation by which recordings come to another rate unless a model's training had another one.
+"""
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public
@@ -108,21 +110,24 @@ UNITS |= {
 class Protocol:
     """What is scored, and when."""
 
-    rate_hz: float = 20.0  # at which every estimate is read, whatever rate it was made at [Hz]; held, never interpolated
+    rate_hz: float = 20.0  # at which every estimate is read [Hz]; held, never interpolated
     warm_up_seconds: float = (
         10.0  # how long before a range, or before each sequence, an estimator may start [s]
     )
     skip_seconds: float = 1.5  # start of each range, or of each sequence, that is not scored [s]
-    # ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate starts anew; a
+    # ranges are cut, from their starts, into sequences of this length without overlap, in each of
+    # which an estimate starts anew; a
     # remainder is left out [s]; None leaves ranges whole
     sequence_seconds: float | None = None
     initial_state: bool = (
         False  # whether estimates start at the reference state of the first sample
     )
-    # test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by their
+    # test sets, with commas between them, of another car or tyre than the training's that the
+    # recordings do not tell apart by their
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
-    # speed of the car by its reference, from which on sideslip is scored [m/s]: on every data set, or by data set; None, and data sets
+    # speed of the car by its reference, from which on sideslip is scored [m/s]: on every data set,
+    # or by data set; None, and data sets
     # without one, by the wheelbase (`with_wheelbases`)
     min_sideslip_speed: float | dict[str, float] | None = None
 
@@ -156,9 +161,12 @@ class Protocol:
         return ", ".join(f"{speed} ({', '.join(names)})" for speed, names in speeds.items())
 
     def describe_sideslip(self, datasets: Iterable[str]) -> str:
-        """A sentence, after a space, on the samples of these data sets at which sideslip is scored."""
+        """A sentence, after a space, on the samples of these data sets at which sideslip is
+        scored.
+        """
         return (
-            f" Sideslip is scored where the car moves at {self.describe_min_sideslip_speed(datasets)} or more by its reference, "
+            " Sideslip is scored where the car moves at "
+            f"{self.describe_min_sideslip_speed(datasets)} or more by its reference, "
             "lateral velocity at all samples."
         )
 
@@ -180,12 +188,14 @@ class Protocol:
         words = ""
         if self.sequence_seconds is not None:
             words += (
-                f" Ranges are cut from their starts into sequences of {self.sequence_seconds:g} s without overlap, in each of which every "
+                f" Ranges are cut from their starts into sequences of {self.sequence_seconds:g} s "
+                "without overlap, in each of which every "
                 f"estimate starts anew; a remainder is left out."
             )
         if self.initial_state:
             words += (
-                f" Estimates start at the reference state (forward and lateral velocity, yaw rate) of the first sample of each "
+                " Estimates start at the reference state (forward and lateral velocity, yaw rate) "
+                "of the first sample of each "
                 f"{self.piece}, as far as the method has these states."
             )
         return words
@@ -223,7 +233,8 @@ class Scored:
         None  # normalised innovation squared of the filter's update, where the method gives it
     )
     nis_dof: FloatArray | None = None  # numbers measured at each update
-    # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one
+    # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is
+    # one
     bands: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
@@ -269,7 +280,8 @@ def sequences(
             pieces.append(Span(span.dataset, span.recording, start, stop))
     if not pieces:
         raise DataError(
-            f"none of {', '.join(span.describe() for span in spans)} lasts as long as a sequence of {protocol.sequence_seconds:g} s; "
+            f"none of {', '.join(span.describe() for span in spans)} lasts as long as a sequence "
+            f"of {protocol.sequence_seconds:g} s; "
             f"set evaluation.sequence_seconds lower"
         )
     return pieces
@@ -284,7 +296,8 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
     for name, channel in REFERENCES.items():
         if channel not in reference or np.isnan(reference[channel][first]):
             raise DataError(
-                f"recording '{reference.id}' has no '{channel}' at {reference.time[first]:.12g} s to start estimates from; "
+                f"recording '{reference.id}' has no '{channel}' at {reference.time[first]:.12g} s "
+                "to start estimates from; "
                 f"set evaluation.initial_state=false"
             )
         state[name] = float(reference[channel][first])
@@ -353,14 +366,16 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     for name in ("vx", "vy_ref", *(["ay"] if "ay" in scored else [])):
         if np.isnan(scored[name]).any():
             raise DataError(
-                f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without"
+                f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; "
+                "test on a range without"
             )
 
     def estimate_at(name: str) -> FloatArray:
         values = estimate.held_at(scored.time, name)
         _require_all(
             values,
-            f"estimator '{estimate.estimator}' has no estimate{'' if name == 'vy' else f' of {name}'}",
+            f"estimator '{estimate.estimator}' has no "
+            f"estimate{'' if name == 'vy' else f' of {name}'}",
             span,
         )
         return values
@@ -414,7 +429,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
 def score_whole(
     estimate: Estimate, recording: Recording, preparation: Mapping[str, Any] = POLYPHASE
 ) -> Scored:
-    """Score an estimate where it has values, after the first `Protocol.skip_seconds` of its recording.
+    """Score an estimate where it has values, after the first `Protocol.skip_seconds` of its
+    recording.
 
     Parameters
     ----------
@@ -530,7 +546,8 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
     missing = [name for name in WEIGHTS if name not in errors]
     if missing:
         raise DataError(
-            f"weighted errors need estimate and reference of {', '.join(WEIGHTS)}; there is none of {', '.join(missing)}"
+            f"weighted errors need estimate and reference of {', '.join(WEIGHTS)}; there is none "
+            f"of {', '.join(missing)}"
         )
     total: FloatArray = np.sum(
         [weight * size(errors[name]) for name, weight in WEIGHTS.items()], axis=0
@@ -650,5 +667,7 @@ def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
 
 
 def _turned(angle: FloatArray) -> FloatArray:
-    """The same angle within a half turn [rad]: a car that slides backwards is not a full turn off."""
+    """The same angle within a half turn [rad]: a car that slides backwards is not a full turn
+    off.
+    """
     return np.where(np.abs(angle) > np.pi, np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi, angle)

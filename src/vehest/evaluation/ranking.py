@@ -1,7 +1,8 @@
 """Which of several estimators may be called best: paired intervals of their differences, corrected
 for their number.
 
-    segments of each seed --rank--> blocks -> RMSE, paired differences -> Holm's correction -> `Ranking`
+    segments of each seed --rank--> blocks -> RMSE, paired differences -> Holm's correction ->
+    `Ranking`
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Ranking:
     pairs: Mapping[
         tuple[Name, Name], Comparison
     ]  # (first, second) -> comparison, of every pair that was compared, either way round
-    n_blocks: int  # blocks that were resampled; below `MIN_BLOCKS` there are no intervals and no comparisons
+    n_blocks: int  # resampled blocks; no intervals and comparisons below `MIN_BLOCKS`
     block_seconds: float  # mean time in a block at which sideslip is scored [s]
     effective_blocks: float  # how many equal blocks the best one's squared error is spread over
 

@@ -19,6 +19,7 @@ from vehest.data.errors import DataError
 Pair = tuple[FloatArray, FloatArray]
 
 CONFIDENCE = 0.95
+N_RESAMPLES_OF_RATIOS = 4000
 MAX_BLOCKS = 100_000  # that a needed number of blocks is sought up to
 DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
@@ -30,7 +31,7 @@ class Interval:
     value: float  # the figure; of a difference, negative where the first has the lower loss
     low: float  # lower end of the 95 % interval
     high: float  # its upper end
-    p_value: float  # two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out
+    p_value: float  # two-sided, of no difference; below 0.05 where the interval excludes 0
     error: float = 0.0  # standard error
     dof: float = np.inf  # degrees of freedom of Student's t
 
@@ -46,7 +47,7 @@ class Difference:
 
     mean: Interval  # of their mean losses over all seeds and samples
     median: Interval  # of the medians over seeds of their mean losses over samples
-    root: Interval  # of the square roots of their mean losses, RMSEs where losses are squared errors; NaN where a loss is negative
+    root: Interval  # of the roots of their mean losses (RMSE); NaN where a loss is negative
 
 
 def difference_of_blocks(
@@ -317,7 +318,6 @@ def log_ratio_of_pooled(
     second: FloatArray,
     *,
     has_paired_seeds: bool = False,
-    n_resamples: int = 4000,
 ) -> Contrast:
     """Logarithm of the ratio of two sums over blocks, each the mean over its seeds.
 
@@ -335,12 +335,14 @@ def log_ratio_of_pooled(
     Source: Künsch 1989, Rao & Wu 1988, as in `differences_of_blocks`.
     """
     generator = np.random.default_rng(1)
-    counts = _counts_of_ratios(first.shape[1], n_resamples)
-    drawn = np.zeros(n_resamples)
+    counts = _counts_of_ratios(first.shape[1])
+    drawn = np.zeros(N_RESAMPLES_OF_RATIOS)
     rows: NDArray[np.int64] | None = None
     for sign, side in ((1.0, first), (-1.0, second)):
         if rows is None or not has_paired_seeds:
-            rows = generator.integers(len(side), size=(n_resamples, max(len(side) - 1, 1)))
+            rows = generator.integers(
+                len(side), size=(N_RESAMPLES_OF_RATIOS, max(len(side) - 1, 1))
+            )
         with np.errstate(divide="ignore"):
             drawn += sign * np.log(np.take_along_axis(counts @ side.T, rows, axis=1).mean(axis=1))
     variance = float(np.var(drawn[np.isfinite(drawn)]))
@@ -358,11 +360,11 @@ def log_ratio_of_pooled(
 
 
 @lru_cache(maxsize=4)
-def _counts_of_ratios(n_blocks: int, n: int) -> FloatArray:
+def _counts_of_ratios(n_blocks: int) -> FloatArray:
     """`_counts`, which are the same for all ratios over as many blocks and take longer than the
     rest.
     """
-    return _counts(n_blocks, n, np.random.default_rng(0))
+    return _counts(n_blocks, N_RESAMPLES_OF_RATIOS, np.random.default_rng(0))
 
 
 def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:

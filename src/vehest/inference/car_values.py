@@ -149,18 +149,26 @@ def adapted(
 def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[str, Any]:
     """The configuration of a training in which a wheelbase of null is that of its recordings' one car, as is the centre of gravity.
 
-    Settings with values stay, and so do all where the cars have no wheelbase or different ones.
+    So is the default wheelbase of the self-calibrating filter. Other settings with values stay, and so do all where the cars have no
+    wheelbase or different ones.
     """
     settings = config["estimator"]
-    if settings.get("wheelbase", 0.0) is not None:
+    unstated: set[float | None] = {None}
+    if settings["name"] == SelfCalibrating.name:
+        unstated.add(SelfCalibrating.settings_type().wheelbase)
+    if settings.get("wheelbase", 0.0) not in unstated:
         return config
     different_cars = set(cars)
     if len({car.wheelbase for car in different_cars}) != 1:
         return config
     car = different_cars.pop()
+    if car.wheelbase is None:
+        return config
     if different_cars:  # of one wheelbase, with different centres of gravity
         car = CarValues(car.wheelbase)
-    values = {name: getattr(car, name) for name in CAR_SETTINGS if settings.get(name, 0.0) is None}
+    values = {
+        name: getattr(car, name) for name in CAR_SETTINGS if settings.get(name, 0.0) in unstated
+    }
     return {**config, "estimator": {**settings, **values}}
 
 

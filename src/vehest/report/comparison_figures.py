@@ -1,4 +1,6 @@
-"""Figures that compare estimators with each other and with the reference: forest plot, agreement, β over ay, g-g diagram."""
+"""Figures that compare estimators with each other and with the reference: forest plot, agreement, β
+over ay, g-g diagram.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,10 @@ class ForestRow:
 
 
 def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
-    """RMSE(β) with its interval, one row an estimator, the first on top; logarithmic where the errors differ much."""
+    """RMSE(β) with its interval, one row an estimator, the first on top.
+
+    Logarithmic where the errors differ much.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     sizes = [row.rmse for row in rows]
@@ -122,7 +127,9 @@ class Cloud:
 def clouds_figure(
     panels: Sequence[tuple[Sequence[Cloud], str, str, bool]],
 ) -> MatplotlibFigure:
-    """Panels side by side, each of clouds, label of x, label of y, and whether both axes have one scale."""
+    """Panels side by side, each of clouds, label of x, label of y, and whether both axes have one
+    scale.
+    """
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for axes, (clouds, x_label, y_label, has_equal_scales) in zip(
@@ -139,7 +146,9 @@ def clouds_figure(
 
 
 def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> MatplotlibFigure:
-    """Estimated over measured sideslip, (K,) [deg], one panel an estimator, with the line on which both are equal."""
+    """Estimated over measured sideslip, (K,) [deg], one panel an estimator, with the line on which
+    both are equal.
+    """
     columns = min(len(estimates), AGREEMENT_COLUMNS)
     n_rows = math.ceil(len(estimates) / columns)
     limit = 1.05 * float(np.nanmax(np.abs(reference))) or 1.0  # of a reference that is zero
@@ -159,7 +168,9 @@ def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> Matpl
 
 
 def _wrapped(label: str) -> str:
-    """A label on lines of at most `TITLE_CHARACTERS`, an equation such as ``P = 2`` on one of them."""
+    """A label on lines of at most `TITLE_CHARACTERS`, an equation such as ``P = 2`` on one of
+    them.
+    """
     return textwrap.fill(
         label.replace(" = ", "\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}"), TITLE_CHARACTERS
     )

@@ -1,4 +1,6 @@
-"""A report as data, and its two forms: a Markdown file with tables and figures beside it, and one self-contained page."""
+"""A report as data, and its two forms: a Markdown file with tables and figures beside it, and one
+self-contained page.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
 PATENT_NOTE = (
-    "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
+    "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product "
+    "may need their licence; "
     "the licence of this software grants none."
 )
 """What every report with a KS-NN ends with."""
 
 REPORT = "report"  # document of a study that one starts with
 
-LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
+MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
 PNG_COLOURS = 256
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
@@ -57,7 +60,8 @@ class Column:
     )
     decimals: int | None = None  # decimals of every value, instead of ``digits``
     each: bool = False  # every value has its own decimals, as in a column of different units
-    # columns of the frame with a value and the ends of its interval; the page draws them into the cells, and sorts by the value
+    # columns of the frame with a value and the ends of its interval; the page draws them into the
+    # cells, and sorts by the value
     bar: tuple[str, str, str] | None = None
 
 
@@ -76,7 +80,8 @@ class Table:
     name: str  # file name without ending: small letters, digits, ``_``, ``-`` and ``.``
     caption: str  # Markdown
     frame: pd.DataFrame  # the values, with short names as columns
-    # column of the frame -> how it is shown, in this order; all of them, by their own names, if empty
+    # column of the frame -> how it is shown, in this order; all of them, by their own names, if
+    # empty
     columns: Mapping[str, Column] = field(default_factory=dict)
     links: Sequence[ModelLink] = ()  # a model a row, for the page alone; none if empty
 
@@ -88,7 +93,7 @@ class Figure:
     name: str  # file name without ending, as in `Table`
     caption: str  # Markdown; its first sentence is the alternative text
     static: MatplotlibFigure  # matplotlib figure, for PNG, SVG and print
-    interactive: str = ""  # `explorer_json` of what the page draws in its place, to zoom and filter, where that helps
+    interactive: str = ""  # `explorer_json` of what the page draws in its place
 
 
 Block: TypeAlias = "str | Table | Figure"
@@ -96,15 +101,23 @@ Block: TypeAlias = "str | Table | Figure"
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """A report; raises `ValueError` where two tables or two figures share a name, or a name is no file name."""
+    """A report.
+
+    Raises
+    ------
+    ValueError
+        Two tables or two figures share a name, or a name is no file name.
+    """
 
     title: str  # plain text
     blocks: Sequence[
         Block
     ]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
-    # name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``
+    # name -> table that is written beside the others without being shown; text may link to
+    # ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # how many of the first blocks the page shows, the sections after them being folded appendices; None: all
+    # how many of the first blocks the page shows, the sections after them being folded appendices;
+    # None: all
     # up to the first heading that begins with "Appendix"
     open_blocks: int | None = None
 
@@ -118,20 +131,26 @@ class Document:
                     raise ValueError(f"'{name}' cannot name a file of a report")
                 if names.count(name) > 1:
                     raise ValueError(
-                        f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'"
+                        f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s "
+                        f"called '{name}'"
                     )
 
 
 def write_documents(
     documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()
 ) -> None:
-    """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
+    """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by
+    side.
 
-    Args:
-        on_page: text and tables that the page of ``report`` alone ends with, and no other file contains.
+    Parameters
+    ----------
+    on_page : Sequence[str or Table]
+        Text and tables that the page of ``report`` alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: tables or figures of two documents share a name, or a name is no file name.
+    Raises
+    ------
+    ValueError
+        Tables or figures of two documents share a name, or a name is no file name.
     """
     blocks = [block for document in documents.values() for block in document.blocks]
     Document(
@@ -153,16 +172,22 @@ def write_document(
     name: str = "report",
     on_page: Sequence[str | Table] = (),
 ) -> None:
-    """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html`` where ``page`` is set.
+    """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html``
+    where ``page`` is set.
 
     The same document gives the same bytes.
 
-    Args:
-        name: of both files, without ending.
-        on_page: text and tables that the page alone ends with, and no other file contains.
+    Parameters
+    ----------
+    name : str
+        Of both files, without ending.
+    on_page : Sequence[str or Table]
+        Text and tables that the page alone ends with, and no other file contains.
 
-    Raises:
-        ValueError: a table of ``on_page`` has the name of another.
+    Raises
+    ------
+    ValueError
+        A table of ``on_page`` has the name of another.
     """
     numbers = _numbers(document)
     images: dict[str, bytes] = {}
@@ -180,12 +205,15 @@ def write_document(
         _markdown(document, numbers).encode("utf-8", "backslashreplace")
     )
     if page:
-        whole = replace(document, blocks=[*document.blocks, *on_page])
-        (folder / f"{name}.html").write_bytes(page_of(whole, images))
+        page_document = replace(document, blocks=[*document.blocks, *on_page])
+        (folder / f"{name}.html").write_bytes(page_of(page_document, images))
 
 
 def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
-    """The self-contained HTML page of a document; ``images``: its figures as SVG by name, if they are drawn already."""
+    """The self-contained HTML page of a document.
+
+    ``images``: its figures as SVG by name, if they are drawn already.
+    """
     drawn = images or {
         block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
     }
@@ -193,7 +221,9 @@ def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> by
 
 
 def as_text(name: str) -> str:
-    """A name or title from a file as Markdown that shows it as it is, on one line: nothing in it is a link, markup or HTML."""
+    """A name or title from a file as Markdown that shows it as it is, on one line: nothing in it is
+    a link, markup or HTML.
+    """
     line = printable(" ".join(name.split()))
     line = re.sub(r"[\\`*\[\]]", r"\\\g<0>", line)
     line = re.sub(r"(?<![^\W_])_|_(?![^\W_])", r"\_", line)
@@ -211,10 +241,10 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
     """Headers of a table, rows of cells, and for each column whether it contains numbers."""
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
-    shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
+    visible = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
     columns = []
     numeric = []
-    for name, column in shown.items():
+    for name, column in visible.items():
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
@@ -224,7 +254,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         )
         columns.append(_number_cells(values.tolist(), column) if is_number else list(texts))
     return (
-        [printable(column.header) for column in shown.values()],
+        [printable(column.header) for column in visible.values()],
         [list(row) for row in zip(*columns, strict=True)],
         numeric,
     )
@@ -266,10 +296,10 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
     with paper_style():
         figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
-        few = image.convert("RGB").quantize(
+        quantized = image.convert("RGB").quantize(
             PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(small, format="png", optimize=True, dpi=(dpi, dpi))
+        quantized.save(small, format="png", optimize=True, dpi=(dpi, dpi))
     return small.getvalue()
 
 
@@ -282,7 +312,9 @@ def pdf_of(figure: MatplotlibFigure) -> bytes:
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:
-    """A figure as SVG, with places to a hundredth of a point, finer than any page: half the size."""
+    """A figure as SVG, with places to a hundredth of a point, finer than any page: half the
+    size.
+    """
 
     def in_hundredths(path: re.Match[str]) -> str:
         return _LONG_NUMBER.sub(
@@ -305,7 +337,10 @@ def _for_both_schemes(svg: bytes) -> bytes:
         for kind in ("fill", "stroke")
         if f"{kind}: {colour}" in text
     ]
-    style = f"<style>@media (prefers-color-scheme: dark){{svg{{fill:{on_dark(REFERENCE_COLOUR)}}}{''.join(rules)}}}</style>"
+    style = (
+        "<style>@media (prefers-color-scheme: "
+        f"dark){{svg{{fill:{on_dark(REFERENCE_COLOUR)}}}{''.join(rules)}}}</style>"
+    )
     return re.sub(r"(<svg\b[^>]*>)", lambda opening: opening[0] + style, text, count=1).encode(
         "utf-8"
     )
@@ -329,7 +364,8 @@ def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
             parts.append(_harmless(block.strip()))
         elif isinstance(block, Table):
             parts.append(
-                f"**{numbers[position]}.** {_harmless(block.caption)} ([CSV](tables/{block.name}.csv))"
+                f"**{numbers[position]}.** {_harmless(block.caption)} "
+                f"([CSV](tables/{block.name}.csv))"
             )
             headers, rows, numeric = formatted(block)
             lines = [headers, ["--:" if is_number else ":--" for is_number in numeric], *rows]
@@ -341,7 +377,8 @@ def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
         else:
             parts.append(f"![{_spoken(block.caption)}](figures/{block.name}.png)")
             parts.append(
-                f"**{numbers[position]}.** {_harmless(block.caption)} ([SVG](figures/{block.name}.svg))"
+                f"**{numbers[position]}.** {_harmless(block.caption)} "
+                f"([SVG](figures/{block.name}.svg))"
             )
     return "\n\n".join(parts) + "\n"
 
@@ -354,7 +391,10 @@ def _in_pipes(cell: str) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files; what it contains of them is shown as text."""
+    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files.
+
+    What it contains of them is shown as text.
+    """
     from markdown_it import MarkdownIt
 
     text = printable(text, keep="\n\t")
@@ -432,7 +472,10 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
 
 
 def _open_blocks(document: Document) -> int | None:
-    """How many blocks the page shows before its appendices; those of `Document.open_blocks`, else all up to the first appendix."""
+    """How many blocks the page shows before its appendices.
+
+    Those of `Document.open_blocks`, else all up to the first appendix.
+    """
     if document.open_blocks is not None:
         return document.open_blocks
     appendices = (
@@ -444,7 +487,9 @@ def _open_blocks(document: Document) -> int | None:
 
 
 def _no_formula(cell: Any) -> Any:
-    """A cell that spreadsheets show as text: an apostrophe before what they would read as a formula."""
+    """A cell that spreadsheets show as text: an apostrophe before what they would read as a
+    formula.
+    """
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
@@ -475,19 +520,21 @@ def _page_table(table: Table) -> dict[str, Any]:
 def bars_of(
     values: Sequence[float], lows: Sequence[float], highs: Sequence[float]
 ) -> list[dict[str, Any] | None]:
-    """Where values and the ends of their intervals lie on one axis from zero, in per cent of its length; none where a value is missing.
+    """Where values and the ends of their intervals lie on one axis from zero, in per cent of its
+    length; none where a value is missing.
 
-    The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far beyond; what is longer is ``cut``.
+    The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
+    beyond; what is longer is ``cut``.
     """
-    known = [value for value in values if math.isfinite(value)]
+    finite = [value for value in values if math.isfinite(value)]
     ends = [
         high if math.isfinite(high) else value
         for value, high in zip(values, highs, strict=True)
         if math.isfinite(value)
     ]
-    if not known or max(ends) <= 0:
+    if not finite or max(ends) <= 0:
         return [None] * len(values)
-    axis = min(max(ends), LONGEST_AXIS * sorted(known)[len(known) // 2] or max(ends))
+    axis = min(max(ends), MAX_AXIS_RATIO * sorted(finite)[len(finite) // 2] or max(ends))
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)

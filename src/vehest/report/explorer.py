@@ -1,8 +1,9 @@
-"""All signals of a test set as data for the page: traces to zoom, the course, and errors over the rows that pass a filter.
+"""All signals of a test set as data for the page: traces to zoom, the course, and errors over the
+rows that pass a filter.
 
-Values are kept in 16 bits over their range, as differences between neighbours, compressed: an hour at 20 Hz of eight estimates with their
-bands and ten channels takes some 4 MB of the page. The page unpacks them by itself; sideslip is computed there as everywhere,
-atan2(v, u) with the measured u.
+Values are kept in 16 bits over their range, as differences between neighbours, compressed: an hour
+at 20 Hz of eight estimates with their bands and ten channels takes some 4 MB of the page. The page
+unpacks them by itself; sideslip is computed there as everywhere, atan2(v, u) with the measured u.
 """
 
 from __future__ import annotations
@@ -24,35 +25,42 @@ GAP = 65_535  # code of a value that is not there
 
 
 def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray | None]) -> str:
-    """What the page reads of ``columns``, (K,) each or None, and of how they are called and drawn; it cannot end a script element.
+    """What the page reads of ``columns``, (K,) each or None, and of how they are called and drawn;
+    it cannot end a script element.
 
-    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; of each candidate ``vy0`` [m/s], half widths of its
-    90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg], ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
+    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; of each
+    candidate ``vy0`` [m/s], half widths of its 90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg],
+    ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
     """
     described, data = packed(
         {name: values for name, values in columns.items() if values is not None}
     )
-    whole = {**content, "columns": described, "data": data}
-    return json.dumps(whole, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    payload = {**content, "columns": described, "data": data}
+    return json.dumps(payload, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
 
 
 def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:
     """Columns in 16 bits.
 
-    Returns:
-        Name -> lowest value and the step between two codes, in the order of the data; and the data, base64 of zlib: of each column the low
-        bytes, then the high bytes, of differences between neighbouring codes.
+    Returns
+    -------
+    tuple[dict[str, list[float]], str]
+        Name -> lowest value and the step between two codes, in the order of the data; and the data,
+        base64 of zlib: of each column the low bytes, then the high bytes, of differences between
+        neighbouring codes.
     """
     described = {}
     parts = []
     for name, values in columns.items():
-        known = np.isfinite(values)
+        finite = np.isfinite(values)
         low, high = (
-            (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+            (float(values[finite].min()), float(values[finite].max()))
+            if finite.any()
+            else (0.0, 0.0)
         )
         scale = (high - low) / LEVELS or 1.0
         codes = np.full(len(values), GAP, np.uint16)
-        codes[known] = np.round((values[known] - low) / scale).astype(np.uint16)
+        codes[finite] = np.round((values[finite] - low) / scale).astype(np.uint16)
         differences = np.diff(codes, prepend=np.uint16(0))  # modulo 2¹⁶
         parts += [(differences & 0xFF).astype(np.uint8), (differences >> 8).astype(np.uint8)]
         described[name] = [low, scale]
@@ -72,22 +80,24 @@ def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
 def reckoned_course(
     vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading along x; after NaN it starts anew.
+    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading
+    along x; after NaN it starts anew.
 
-    ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two samples.
+    ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two
+    samples.
     """
     x = np.full(len(vx), np.nan)
     y = np.full(len(vx), np.nan)
-    known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
-    for first, end in true_runs(known).tolist():
-        own = slice(first, end)
-        heading = _integral(yaw_rate[own], step)
-        x[own] = _integral(vx[own] * np.cos(heading) - vy[own] * np.sin(heading), step)
-        y[own] = _integral(vx[own] * np.sin(heading) + vy[own] * np.cos(heading), step)
+    finite = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
+    for first, end in true_runs(finite).tolist():
+        run = slice(first, end)
+        heading = _integral(yaw_rate[run], step)
+        x[run] = _integral(vx[run] * np.cos(heading) - vy[run] * np.sin(heading), step)
+        y[run] = _integral(vx[run] * np.sin(heading) + vy[run] * np.cos(heading), step)
     return x, y
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:
     steps = 0.5 * step * (values[1:] + values[:-1])
-    whole: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
-    return whole
+    integral: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
+    return integral

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 STATIC_POINTS = 500
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 MAX_POINTS = 2000  # of a line over a whole drive on one page
-LEAST_SAMPLES = 20
+MIN_SAMPLES_IN_BIN = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other
 # the reference under the estimates: wide enough to show on both sides of a line
@@ -52,7 +52,9 @@ class Traces:
 def traces_figure(
     time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str
 ) -> MatplotlibFigure:
-    """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator: lateral velocity left, sideslip right."""
+    """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator:
+    lateral velocity left, sideslip right.
+    """
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
@@ -103,7 +105,9 @@ def zoom_figure(
     time_label: str,
     band: Band | None = None,
 ) -> MatplotlibFigure:
-    """Reference and estimates over a short time, (K,) [s]: sideslip with a band, its error, v and, if given, ``ay`` (K,) [m/s²]."""
+    """Reference and estimates over a short time, (K,) [s]: sideslip with a band, its error, v and,
+    if given, ``ay`` (K,) [m/s²].
+    """
     from matplotlib.ticker import MaxNLocator
 
     heights = (2.0, 1.2, 1.3, 0.6) if ay is not None else (2.0, 1.2, 1.3)
@@ -141,10 +145,12 @@ def draw_quantity(
     estimates: Sequence[Traces],
     band: Band | None,
 ) -> None:
-    """Draw a quantity of estimates, the first one above the others, with a band, over a wide line of the reference."""
+    """Draw a quantity of estimates, the first one above the others, with a band, over a wide line
+    of the reference.
+    """
     for estimate in reversed(estimates):
-        shown = decimated(time, getattr(estimate, quantity), MAX_POINTS)
-        axes.plot(*shown, label=estimate.label, **_looks(estimate.line))
+        points = decimated(time, getattr(estimate, quantity), MAX_POINTS)
+        axes.plot(*points, label=estimate.label, **_looks(estimate.line))
     if band is not None:
         centre = getattr(band.estimate, quantity)
         half_width = getattr(band, quantity)
@@ -156,12 +162,15 @@ def draw_quantity(
             label=f"90 % band of {band.estimate.label}",
         )
     if reference is not None:
-        shown = decimated(time, getattr(reference, quantity), MAX_POINTS)
-        axes.plot(*shown, label=reference.label, zorder=1, **BELOW_ESTIMATES)
+        points = decimated(time, getattr(reference, quantity), MAX_POINTS)
+        axes.plot(*points, label=reference.label, zorder=1, **BELOW_ESTIMATES)
 
 
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
-    """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
+    """Density of the sideslip error of each estimator on common bins.
+
+    Those beyond the axis count in the outermost bins.
+    """
     with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.add_subplot()
         limit = max(float(np.quantile(np.abs(error), 0.995)) for _, _, error in estimates)
@@ -192,7 +201,11 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
 
 
 def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of 1 m/s² of |a_y|, (K,) [m/s²], and how many samples each contains; bins of fewer than 20 show none."""
+    """RMSE of the sideslip in bins of 1 m/s² of |a_y|, (K,) [m/s²], and how many samples each
+    contains.
+
+    Bins of fewer than 20 show none.
+    """
     n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
     edges = np.arange(n_bins + 1)
     centres = edges[:-1] + 0.5
@@ -204,7 +217,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
             squares = np.bincount(index, weights=np.square(error), minlength=n_bins)
             rmse = np.sqrt(
                 np.divide(
-                    squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES
+                    squares, counts, out=np.full(n_bins, np.nan), where=counts >= MIN_SAMPLES_IN_BIN
                 )
             )
             axes.plot(
@@ -227,7 +240,10 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
 
 
 def learning_curves(runs: Sequence[tuple[str, Line, pd.DataFrame]]) -> MatplotlibFigure:
-    """Losses over the epochs, logarithmic, of runs with name, line and history; a marker where the validation loss is lowest."""
+    """Losses over the epochs, logarithmic, of runs with name, line and history.
+
+    A marker where the validation loss is lowest.
+    """
     with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         for name, line, history in reversed(runs):
@@ -267,7 +283,10 @@ class Reliability:
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
-    """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal, coverage is as stated."""
+    """Coverage over nominal level, one line an estimator with its name at the end.
+
+    On the diagonal, coverage is as stated.
+    """
     nominal = np.array(levels)
     aside = SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
     with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
@@ -296,7 +315,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         )
         axes.set_xlabel("nominal level [%]")
         axes.set_ylabel("errors of β inside [%]")
-        heights = _apart(
+        heights = _spread_heights(
             [float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0
         )
         for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
@@ -320,7 +339,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
     return figure
 
 
-def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
+def _spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
     """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
     placed = [0.0] * len(heights)
     last = top + step
@@ -331,7 +350,9 @@ def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
 
 
 def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each segment, in their order."""
+    """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each
+    segment, in their order.
+    """
     if len(values) <= n_points:
         return time, values
     indices: list[int] = []
@@ -349,7 +370,11 @@ def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[Floa
 def envelope(
     time: FloatArray, low: FloatArray, high: FloatArray, n_points: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fewer points of the ends of a band, (K,), that contain it: lowest and highest of each segment; NaN where either end is."""
+    """Fewer points of the ends of a band, (K,), that contain it: lowest and highest of each
+    segment.
+
+    NaN where either end is.
+    """
     if len(time) <= n_points:
         return time, low, high
     starts = np.linspace(0, len(time), n_points, endpoint=False).astype(int)

@@ -81,7 +81,9 @@ REFERENCE = Line(REFERENCE_COLOUR)
 
 
 def line_of(estimator: str, variant: str = "") -> Line:
-    """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour that depends on the name only."""
+    """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour
+    that depends on the name only.
+    """
     drawn = (
         estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
     )
@@ -97,21 +99,31 @@ def line_of(estimator: str, variant: str = "") -> Line:
 def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
     """Lines of several (estimator, variant), all different as long as dashes and markers last.
 
-    The first of those that would look alike keeps its own line; the later ones change dash, then marker.
+    The first of those that would look alike keeps its own line; the later ones change dash, then
+    marker.
     """
     lines: dict[tuple[str, str], Line] = {}
     for name in names:
-        own = line_of(*name)
-        dashes = (own.dash, *(dash for dash in _DASHES if dash != own.dash))
-        markers = (own.marker, *(marker for marker in _MARKERS if marker != own.marker))
-        taken = set(lines.values())
-        options = (replace(own, dash=dash, marker=marker) for marker in markers for dash in dashes)
-        lines[name] = next((line for line in options if line not in taken), own)
+        line_of_family = line_of(*name)
+        dashes = (line_of_family.dash, *(dash for dash in _DASHES if dash != line_of_family.dash))
+        markers = (
+            line_of_family.marker,
+            *(marker for marker in _MARKERS if marker != line_of_family.marker),
+        )
+        used_lines = set(lines.values())
+        options = (
+            replace(line_of_family, dash=dash, marker=marker)
+            for marker in markers
+            for dash in dashes
+        )
+        lines[name] = next((line for line in options if line not in used_lines), line_of_family)
     return lines
 
 
 def on_dark(colour: str) -> str:
-    """The colour that replaces ``colour`` on a dark page: greys change places with their opposites, hues get lighter."""
+    """The colour that replaces ``colour`` on a dark page: greys change places with their opposites,
+    hues get lighter.
+    """
     red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
     if max(red, green, blue) - min(red, green, blue) <= 12:
         level = _DARK_INK + (_DARK_PAPER - _DARK_INK) * (red + green + blue) / (3 * 255)
@@ -132,7 +144,9 @@ def paper_style() -> Iterator[None]:
 
 @contextmanager
 def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
-    """An empty figure of a width and height [in] without global state, drawn inside the ``with`` block in `paper_style`."""
+    """An empty figure of a width and height [in] without global state, drawn inside the ``with``
+    block in `paper_style`.
+    """
     from matplotlib.figure import Figure
 
     with paper_style():
@@ -140,7 +154,10 @@ def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[Ma
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """A number to some significant digits, never in exponents between 1e-4 and 1e6; `MISSING` if it is not finite."""
+    """A number to some significant digits, never in exponents between 1e-4 and 1e6.
+
+    `MISSING` if it is not finite.
+    """
     if not math.isfinite(value):
         return MISSING
     return (
@@ -151,7 +168,9 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def decimals_for(values: Sequence[float], digits: int = 3) -> int:
-    """Decimals that show the typical of some numbers with so many significant digits, so that a column lines up."""
+    """Decimals that show the typical of some numbers with so many significant digits, so that a
+    column lines up.
+    """
     sizes = sorted(abs(value) for value in values if math.isfinite(value) and value != 0)
     if not sizes:
         return 0
@@ -160,7 +179,10 @@ def decimals_for(values: Sequence[float], digits: int = 3) -> int:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """A number with a fixed count of decimals, thousands set apart; `MISSING` if it is not finite."""
+    """A number with a fixed count of decimals, thousands set apart.
+
+    `MISSING` if it is not finite.
+    """
     return _grouped(value, decimals) if math.isfinite(value) else MISSING
 
 

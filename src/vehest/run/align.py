@@ -1,4 +1,7 @@
-"""Output of `vehest data align`: recording -> alignment -> lines, JSON, and a folder of files. Nothing is applied."""
+"""Output of `vehest data align`: recording -> alignment -> lines, JSON, and a folder of files.
+
+Nothing is applied.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,13 @@ FILES = ("alignment.md", "alignment.csv", "alignment.yaml")
 def align_recording(
     source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings
 ) -> Alignment:
-    """Estimate quantities from one recording; raises `VehestError` where it is not there, cannot be read or does not determine them."""
+    """Estimate quantities from one recording.
+
+    Raises
+    ------
+    VehestError
+        It is not there, cannot be read or does not determine them.
+    """
     with reading(source, overrides) as config:
         recording = _recording_of(source, config, recording_id)
         refuse_errors(
@@ -42,7 +51,10 @@ def align_recording(
 def in_words(alignment: Alignment, out: Path | None) -> Lines:
     """An alignment for a terminal; ``out`` is where it was written."""
     drive = alignment.recording
-    first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; no correction is applied"
+    first = (
+        f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; no "
+        "correction is applied"
+    )
     lines: Lines = [first, _parameters(alignment)]
     rows = [
         [
@@ -69,7 +81,8 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
 def override_of(alignment: Alignment) -> str:
     """The transforms as an override that Hydra reads."""
     transforms = [dict(transform) for transform in alignment.transforms]
-    return f"downsample.transforms={yaml.safe_dump(transforms, default_flow_style=True, width=math.inf, sort_keys=False).strip()}"
+    text = yaml.safe_dump(transforms, default_flow_style=True, width=math.inf, sort_keys=False)
+    return f"downsample.transforms={text.strip()}"
 
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
@@ -103,7 +116,10 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
 
 
 def write_alignment(alignment: Alignment, folder: Path) -> None:
-    """Write report, table and transforms into a folder of its own, all or nothing; raises `ConfigurationError`, `MissingError`."""
+    """Write report, table and transforms into a folder of its own, all or nothing.
+
+    Raises `ConfigurationError`, `MissingError`.
+    """
     import pandas as pd
 
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
@@ -150,7 +166,9 @@ def _recording_of(source: str, config: Config, recording_id: str | None) -> Reco
 
 
 def _parameters(alignment: Alignment) -> TerminalTable:
-    """Parameters for people: degrees and milliseconds, as many digits as the uncertainty warrants."""
+    """Parameters for people: degrees and milliseconds, as many digits as the uncertainty
+    warrants.
+    """
     rows = []
     for parameter in alignment.parameters:
         factor, unit = READ_AS.get(parameter.unit, (1.0, parameter.unit))
@@ -174,7 +192,8 @@ def _report(alignment: Alignment) -> str:
     cutoff_hz = alignment.settings.cutoff_at(alignment.recording.rate_hz)
     parts = [
         f"# Alignment of {as_text(alignment.recording.id)}",
-        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {cutoff_hz:.3g} Hz.",
+        f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at "
+        f"{cutoff_hz:.3g} Hz.",
         *(as_text(line) if isinstance(line, str) else _markdown(line) for line in printed),
         "Transforms that apply the corrections, in this order, for `downsample`:",
         f"```yaml\n{_transforms(alignment).rstrip()}\n```",

@@ -1,6 +1,8 @@
-"""Calibrates a model between training and evaluation: bands, limits of samples and health, from its training and validation ranges.
+"""Calibrates a model between training and evaluation: bands, limits of samples and health, from its
+training and validation ranges.
 
-model, ranges -> estimates through whole ranges from a start of their own, as on a new drive -> `Trust` -> trust.yaml
+model, ranges -> estimates through whole ranges from a start of their own, as on a new drive ->
+`Trust` -> trust.yaml
 
 A calibration knows no evaluation's protocol, and no test range.
 """
@@ -20,7 +22,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.model_files import load_model, read_description
 from vehest.inference.models import CALIBRATION_STAGE as STAGE
 from vehest.inference.models import calibration_label
-from vehest.run.train import file_digest, recording_file
+from vehest.run.train import digests_of_spans, stored_recording
 from vehest.run.versions import code_of
 from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import read_trust, write_trust
@@ -35,20 +37,21 @@ def plan_calibrate(
     output: Path,
     cars: Mapping[str, CarValues],
 ) -> tuple[StagePlan, Callable[[Path], None]] | None:
-    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it; none where a split has no validation range.
+    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it; none where a split
+    has no validation range.
 
     ``cars`` are values of the cars of data sets.
     """
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
-    inputs = {"model": model.digest}
-    inputs |= {
-        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
-        for own in spans.values()
-        for span in own
+    inputs = {
+        "model": model.digest,
+        **digests_of_spans(data, (*split.train, *split.validation)),
     }
-    config: dict[str, Any] = {role: [str(span) for span in own] for role, own in spans.items()}
+    config: dict[str, Any] = {
+        role: [str(span) for span in of_role] for role, of_role in spans.items()
+    }
     calibrated_cars = {
         name: asdict(cars[name])
         for name in sorted({span.dataset for span in split.validation})
@@ -68,10 +71,13 @@ def _write(
     cars: Mapping[str, CarValues],
     folder: Path,
 ) -> None:
-    """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
+    """Calibrate a model.
+
+    Write trust.yaml into ``folder``, with the reason where bands or health are missing.
+    """
 
     def stretch(span: Span) -> Stretch:
-        recording = read_recording(recording_file(data[span.dataset], span)).cut(
+        recording = read_recording(stored_recording(data, span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
         recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))

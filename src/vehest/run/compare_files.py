@@ -1,6 +1,8 @@
-"""Scores estimates of any tool, and of vehest's models, beside each other on one recording with a reference.
+"""Scores estimates of any tool, and of vehest's models, beside each other on one recording with a
+reference.
 
-tables, models -> `Estimate` each -> scored where all of them have values, beside v = 0 and a static map -> ranking and verdict
+tables, models -> `Estimate` each -> scored where all of them have values, beside v = 0 and a static
+map -> ranking and verdict
 """
 
 from __future__ import annotations
@@ -52,8 +54,8 @@ from vehest.sources.base import read_single
 from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
-LEAST_SECONDS = 5.0
-LOWEST_RATE = 1.0  # Hz
+MIN_COMMON_SECONDS = 5.0
+MIN_RATE_HZ = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -121,23 +123,27 @@ def compare_files(
             wheelbase = validated(
                 CarValues, of_command, "", error=ConfigurationError, group="estimator"
             ).wheelbase
-        found = compare_estimates(drive, estimates, wheelbase, trained_here)
+        comparison = compare_estimates(drive, estimates, wheelbase, trained_here)
     for text in notes:
         note(text)
     cells = [
         (row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}")
-        for row in found["rows"]
+        for row in comparison["rows"]
     ]
-    scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
+    scored = (
+        f"scored from {comparison['start']:.6g} to {comparison['stop']:.6g} s at "
+        f"{comparison['rate_hz']:g} Hz"
+    )
     of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
-        f", sideslip from {found['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car is slower at "
-        f"{100 * found['share_below_min_speed']:.1f} % of the samples"
+        f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car "
+        "is slower at "
+        f"{100 * comparison['share_below_min_speed']:.1f} % of the samples"
     )
-    return found | {"findings": findings}, [
+    return comparison | {"findings": findings}, [
         TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
         scored,
-        found["verdict"],
+        comparison["verdict"],
     ]
 
 
@@ -146,7 +152,8 @@ def _check_rows(names: Sequence[str]) -> None:
     for name, count in Counter(names).items():
         if count > 1:
             raise ConfigurationError(
-                f"{count} estimates are called '{name}'; rename a file or leave one out, since the name stands for the row"
+                f"{count} estimates are called '{name}'; rename a file or leave one out, since the "
+                "name stands for the row"
             )
 
 
@@ -170,24 +177,33 @@ def compare_estimates(
     wheelbase: float | None = None,
     trained_here: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
+    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a
+    static map.
 
-    Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m] (`min_sideslip_speed`). The map is fitted on one half
-    of the scored range and scored on the other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by models
-    that were trained on this recording, have rows, the last ones, and are left out of the verdict.
-    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start`` and ``stop`` [s] and ``rate_hz`` of what is
-    scored, ``min_sideslip_speed`` [m/s] and ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
-    Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
+    Sideslip is scored from a speed on that follows from the car's ``wheelbase`` [m]
+    (`min_sideslip_speed`). The map is fitted on one half of the scored range and scored on the
+    other, and vice versa, so that its samples are held out. Estimates of ``trained_here``, by
+    models that were trained on this recording, have rows, the last ones, and are left out of the
+    verdict. Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start``
+    and ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
+    ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
+
+    Raises
+    ------
+    DataError
+        There is no reference, or too little in common, or gaps.
+    ConfigurationError
+        There is no estimate, or one has the name of a baseline.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
-    if taken := {"zero", "static_map"} & set(estimates):
+    if reserved := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(
-            f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file"
+            f"an estimate cannot be called '{min(reserved)}', which is a baseline; rename its file"
         )
-    further = [name for name in ("ay", "yaw_rate") if name in drive]
+    optional = [name for name in ("ay", "yaw_rate") if name in drive]
     reference = resampled(
-        drive.select(["vx", "vy_ref", *further]),
+        drive.select(["vx", "vy_ref", *optional]),
         min(RATE_HZ, drive.rate_hz),
         {"method": "polyphase", "transforms": []},
     )
@@ -207,8 +223,8 @@ def compare_estimates(
     }
     ranking = rank(
         {
-            name: [segments_of([own], reference.rate_hz)]
-            for name, own in scored.items()
+            name: [segments_of([part], reference.rate_hz)]
+            for name, part in scored.items()
             if name[0] not in trained_here
         },
         reference.rate_hz,
@@ -219,7 +235,7 @@ def compare_estimates(
         )
         for name in ranking.order
     }
-    errors = {name: accuracy([own]) for name, own in scored.items()}
+    errors = {name: accuracy([part]) for name, part in scored.items()}
     verdict = (
         verdict_sentences(ranking, titles, "this recording")
         if ranking.order
@@ -240,11 +256,11 @@ def compare_estimates(
             key: errors[name][key]
             for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")
         }
-        standing = standing_columns(ranking, name)
+        columns = standing_columns(ranking, name)
         if name in excluded:
-            standing |= dict.fromkeys(("beats_zero", "beats_static_map"), MISSING)
-            standing["against_best"] = "trained on it"
-        rows.append({"estimate": name[0], **figures, **standing})
+            columns |= dict.fromkeys(("beats_zero", "beats_static_map"), MISSING)
+            columns["against_best"] = "trained on it"
+        rows.append({"estimate": name[0], **figures, **columns})
     return {
         "rows": rows,
         "verdict": verdict,
@@ -267,57 +283,63 @@ def _with_exclusions(verdict: str, trained_here: Collection[str], *, has_others:
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
     """Start and end [s] of the part in which every estimate and the reference have values."""
-    known = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
-    times = {"the reference": reference.time[known]}
+    finite = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
+    times = {"the reference": reference.time[finite]}
     times |= {
         f"'{name}'": estimate.time[np.isfinite(estimate["vy"])]
         for name, estimate in estimates.items()
     }
-    if empty := [name for name, own in times.items() if not len(own)]:
+    if empty := [name for name, clock in times.items() if not len(clock)]:
         raise DataError(f"{empty[0]} has no value at all")
-    start = max(float(own[0]) for own in times.values())
-    stop = min(float(own[-1]) for own in times.values())
-    if stop - start < LEAST_SECONDS:
+    start = max(float(clock[0]) for clock in times.values())
+    stop = min(float(clock[-1]) for clock in times.values())
+    if stop - start < MIN_COMMON_SECONDS:
         ranges = ", ".join(
-            f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items()
+            f"{name} goes from {clock[0]:.6g} to {clock[-1]:.6g} s" for name, clock in times.items()
         )
         raise DataError(
-            f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same? (--shift SECONDS or auto moves tables of other tools)"
+            f"{ranges}: less than {MIN_COMMON_SECONDS:g} s in common; are the clocks the same? "
+            "(--shift "
+            "SECONDS or auto moves tables of other tools)"
         )
-    if reference.rate_hz < LOWEST_RATE:
+    if reference.rate_hz < MIN_RATE_HZ:
         raise DataError(
-            f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need {LOWEST_RATE:g} Hz or more"
+            f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need "
+            f"{MIN_RATE_HZ:g} Hz or more"
         )
     return start, stop
 
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
     """v = 0, and the static map where the car turns enough to fit one."""
-    found = {"zero": np.zeros(len(reference))}
+    velocities = {"zero": np.zeros(len(reference))}
     if "yaw_rate" in reference:
         with suppress(DataError):
-            found["static_map"] = _held_out_map(reference, start, stop)
+            velocities["static_map"] = _cross_validated_map(reference, start, stop)
     clock = (reference.rate_hz, reference.start_time)
     return {
         name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)})
-        for name, vy in found.items()
+        for name, vy in velocities.items()
     }
 
 
-def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
-    """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
+def _cross_validated_map(reference: Recording, start: float, stop: float) -> FloatArray:
+    """Lateral velocity of a static map of the other half of the range [m/s].
+
+    Raises `DataError` where the car turns too little.
+    """
     middle = 0.5 * (start + stop)
     vy = np.zeros(len(reference))
-    for fitted, held_out in (
+    for fitted, is_tested in (
         ((start, middle), reference.time >= middle),
         ((middle, stop), reference.time < middle),
     ):
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
-        kept = {name: values[clean] for name, values in part.channels.items()}
+        channels = {name: values[clean] for name, values in part.channels.items()}
         model = StaticMap(StaticMap.settings_type(reference.rate_hz))
         model.values = model.closed_form(
-            [Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)]
+            [Recording(part.id, part.vehicle, part.rate_hz, 0.0, channels)]
         )
-        vy[held_out] = model.run(reference.stack(model.channels)[held_out], None)[0]["vy"]
+        vy[is_tested] = model.run(reference.stack(model.channels)[is_tested], None)[0]["vy"]
     return vy

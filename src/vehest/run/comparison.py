@@ -1,6 +1,7 @@
 """A comparison of estimators on one split, from its jobs to what a report draws.
 
-jobs -> `plan` (rates, required channels, trainings in groups that fit one batch) -> `Runner.run` -> `collect`
+jobs -> `plan` (rates, required channels, trainings in groups that fit one batch) -> `Runner.run` ->
+`collect`
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from vehest.estimators.registry import new_estimator
 from vehest.inference.car_values import with_car_values
 from vehest.inference.models import find_model
 from vehest.run.evaluate import Evaluation, protocol_from_config
-from vehest.run.evaluate_faults import all_of, check_channels, faults_of
+from vehest.run.evaluate_faults import check_channels, faults_of, union_of_faults
 from vehest.run.failures import Failure, failure_of
 from vehest.run.group import Group, Member
 from vehest.run.next_commands import command_line, location_of_config
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
-from vehest.run.study import Job
+from vehest.run.study import Job, failure_messages
 from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
 from vehest.run.training_differences import Differences, difference_text, differences_of
 from vehest.run.usable import lack
@@ -34,30 +35,27 @@ from vehest.studies.reference_minutes import start_in_words
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
 NOT_TRAINED = "not trained yet"
-TOLERANCE = 1e-9  # relative, between two rates that are the same
+RATE_TOLERANCE = 1e-9  # relative, between two rates that are the same
 
-Note = tuple[
-    str, str
-]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
+Note = tuple[str, str]
+"""Estimator, or ``evaluation``, whose rate was lowered, and how its sentence continues."""
 
 
 @dataclass
 class Comparison:
     """Jobs on one split, and what becomes of them.
 
-    Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of a study are all evaluated under the
-    faults of all.
+    Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of
+    a study are all evaluated under the faults of all.
     """
 
     jobs: Sequence[Job]
     groups: Sequence[Group] = ()  # trainings that fit one batch
-    facts: Sequence[
-        str
-    ] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
+    facts: Sequence[str] = ()  # budgets of trainings, preparation of recordings, lowered rates
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
-    found: Mapping[str, Member] = field(
+    finished: Mapping[str, Member] = field(
         default_factory=dict
     )  # key of a training -> its trained and evaluated member
     differences: Mapping[str, Differences] = field(
@@ -74,17 +72,17 @@ class Comparison:
     def members(self) -> list[Member]:
         """Trained and evaluated members in the order of the jobs."""
         keys = dict.fromkeys(job.training.plan.key for job in self.jobs if job.training is not None)
-        return [self.found[key] for key in keys if key in self.found]
+        return [self.finished[key] for key in keys if key in self.finished]
 
     @property
     def unfinished(self) -> list[str]:
         """Trainings for which no time was left, by name."""
         trainings = [job.training for job in self.usable if job.training is not None]
-        remaining = [own for own in trainings if own.plan.key not in self.found]
+        remaining = [training for training in trainings if training.plan.key not in self.finished]
         return list(
             dict.fromkeys(
-                label_of(own) + difference_text(self.differences.get(own.plan.key, {}))
-                for own in remaining
+                label_of(training) + difference_text(self.differences.get(training.plan.key, {}))
+                for training in remaining
             )
         )
 
@@ -96,9 +94,17 @@ class Comparison:
         } | dict.fromkeys(self.unfinished, self.reason_unfinished)
 
     def plan(self, runner: Runner) -> Sequence[Group]:
-        """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.
+        """Fit jobs to the recordings of their split, find those that lack something, and plan
+        groups of trainings; makes data on the way.
 
-        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
+        Raises
+        ------
+        ConfigurationError
+            A wrong setting.
+        DataError
+            No job can be done.
+        DryRunStop
+            A dry run would make data.
         """
         usable = self.usable
         labels = dict[Any, str]()
@@ -138,16 +144,14 @@ class Comparison:
                 runner.messages.line("plan", "train", name)
             raise
         if not self.usable:
-            reasons = "; ".join(
-                dict.fromkeys(job.failure.message for job in usable if job.failure is not None)
-            )
             location = location_of_config(usable[0].config)
-            known = ", ".join(
+            commands = ", ".join(
                 f"'{command_line('data usable', [name, *location])}'" for name in split.datasets
             )
             raise DataError(
-                f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
-                f"{known} shows what each estimator needs"
+                "none of these estimators can be used with the recordings of split "
+                f"'{split.name}'; {failure_messages(usable)}; "
+                f"{commands} shows what each estimator needs"
             )
         self._print_failures(checked, runner)
         self.groups = self._groups(split, runner.force, evaluated=evaluated)
@@ -156,7 +160,7 @@ class Comparison:
             self.facts = [
                 *training_facts(configs),
                 resampling_fact(configs),
-                *(f"{what} {text}" for what, text in notes),
+                *(f"{subject} {text}" for subject, text in notes),
             ]
             datasets = {
                 name: runner.dataset_config(name, usable[0].config)["dataset"]
@@ -175,25 +179,27 @@ class Comparison:
                 of_training.setdefault(job.training.plan.key, (job.training, []))[1].append(job)
         groups: dict[Any, list[TrainJob]] = {}
         for training, jobs in of_training.values():
-            faults = all_of(
+            faults = union_of_faults(
                 faults_of(job.config) for job in (jobs if jobs[0].label else self.usable)
             )
             groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
         return [
             Group(
-                own,
+                trainings,
                 split,
-                replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None,
+                replace(self.evaluation, data=trainings[0].data, faults=faults)
+                if evaluated
+                else None,
                 force,
                 label,
                 self.cars,
             )
-            for (_, faults, label), own in groups.items()
+            for (_, faults, label), trainings in groups.items()
         ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
         """Take what became of the trainings: key of each -> its member, or why it failed."""
-        self.found = {
+        self.finished = {
             key: member for key, member in members.items() if member.evaluation is not None
         }
         for job in self.usable:
@@ -230,19 +236,23 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
-    """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
+    """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was.
+
+    Raises `DataError`, `ConfigurationError`.
+    """
     if group not in config:
         return config, []
     is_estimator = group == "estimator"
     rate = estimator_rate(config) if is_estimator else protocol_from_config(config[group]).rate_hz
     key = f"{group}.rate_hz"
     lowest = limit.rate_hz
-    if not rate > lowest * (1.0 + TOLERANCE):
+    if not rate > lowest * (1.0 + RATE_TOLERANCE):
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):
         raise DataError(
-            f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out for that"
+            f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave "
+            "it out for that"
         )
     lowered = {**config, group: {**config[group], "rate_hz": lowest}}
     if group == "evaluation":
@@ -263,7 +273,8 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
         if key == "steps" or key.endswith("_steps")
     }
     lengths = [
-        f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} s "
+        f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} "
+        "s "
         f"({key}={max(1, round(number * lowest / rate))} keeps that)"
         for key, number in samples.items()
         if isinstance(number, int) and number > 0
@@ -278,9 +289,9 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
 
 def print_notes(notes: Iterable[Note], runner: Runner) -> None:
     """Print rates that were lowered, each once."""
-    for what, text in notes:
-        key = "evaluation.rate_hz" if what == "evaluation" else "estimator.rate_hz"
-        line = ("note", "rate", what, f"{text}; {key}=… chooses a lower rate")
+    for subject, text in notes:
+        key = "evaluation.rate_hz" if subject == "evaluation" else "estimator.rate_hz"
+        line = ("note", "rate", subject, f"{text}; {key}=… chooses a lower rate")
         if line not in runner.messages.printed:
             runner.messages.line(*line)
 
@@ -288,7 +299,8 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
 def plan_training(
     config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]
 ) -> TrainJob:
-    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
+    """A training, be it from scratch or from another model's weights, whose digest is then one of
+    its inputs; see `plan_train`.
 
     Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
     """
@@ -312,22 +324,28 @@ def _check_label(job: Job, training: TrainJob, labels: dict[Any, str]) -> None:
 
 
 def name_in_part(part: str, name: str, parts: Collection[str]) -> str:
-    """Name of a training in messages on a study: parts of one study often train the same estimator and seed."""
+    """Name of a training in messages on a study: parts of one study often train the same estimator
+    and seed.
+    """
     return f"{name} in part '{part}'" if len(parts) > 1 else name
 
 
 def label_of(training: TrainJob) -> str:
-    """Name of a training in messages, with the model that it starts from, which its folder's name does not say."""
+    """Name of a training in messages, with the model that it starts from, which its folder's name
+    does not say.
+    """
     return training.plan.label + start_in_words(training.training)
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
     """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
-    alike: dict[Failure, list[Job]] = {}
+    jobs_of_failure: dict[Failure, list[Job]] = {}
     for job in jobs:
         if job.failure is not None:
-            alike.setdefault(job.failure, []).append(job)
-    return [(name, failure) for failure, own in alike.items() for name in _names(own)]
+            jobs_of_failure.setdefault(job.failure, []).append(job)
+    return [
+        (name, failure) for failure, failed in jobs_of_failure.items() for name in _names(failed)
+    ]
 
 
 def _names(jobs: Iterable[Job]) -> list[str]:
@@ -340,7 +358,8 @@ def _names(jobs: Iterable[Job]) -> list[str]:
             stem = f"{estimator.name}-{estimator.variant}"
         seeds.setdefault(stem, []).append(str(job.config["seed"]))
     return [
-        f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()
+        f"{stem} seed{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
+        for stem, numbers in seeds.items()
     ]
 
 
@@ -351,14 +370,20 @@ def resampling_fact(configs: Sequence[Config]) -> str:
         | {protocol_from_config(configs[0]["evaluation"]).rate_hz}
     )
     options = configs[0]["downsample"]
-    how = {
-        "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
+    method = {
+        "polyphase": (
+            "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the "
+            "estimators themselves are causal)"
+        ),
         "decimate": "by plain decimation",
     }[options["method"]]
     first = (
         f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
     )
-    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
+    return (
+        f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the "
+        f"native rate {method}{first}"
+    )
 
 
 def training_facts(configs: Sequence[Config]) -> list[str]:

@@ -40,7 +40,7 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-MOST_BARS = 16
+MAX_BARS = 16
 
 
 class _Console(Console):
@@ -51,9 +51,11 @@ class _Console(Console):
 class Messages:
     """Lines and bars on standard error; warnings alone if ``quiet``.
 
-    Attributes:
-        printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
-            Lines of reused artefacts are printed as one, by `print_reused`.
+    Attributes
+    ----------
+    printed : list[tuple[str, str, str, str]]
+        (status, stage, label, detail) of every line, a warning's text in the last; also where
+        nothing is shown. Lines of reused artefacts are printed as one, by `print_reused`.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
@@ -76,8 +78,8 @@ class Messages:
         if status == WARNING:
             text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
         else:
-            shown = (f" {printable(detail)}" if detail else "", "dim")
-            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown)
+            suffix = (f" {printable(detail)}" if detail else "", "dim")
+            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)
         self._print(text, always=status == WARNING)
 
     def print_reused(self) -> None:
@@ -125,7 +127,7 @@ class Bars(Progress):
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar, which appears when it is first moved."""
-        if name not in self._named and len(self._named) < MOST_BARS:
+        if name not in self._named and len(self._named) < MAX_BARS:
             self._named[name] = self.add_task(printable(name), total=total, note="")
         if name in self._named:
             self.update(self._named[name], completed=done, total=total, note=printable(note))

@@ -38,10 +38,6 @@ class Item:
 
 def examine() -> Iterator[Item]:
     """Check everything that vehest relies on."""
-    import torch
-
-    from vehest.run.launchers.local import default_jobs
-
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
     yield Item(
@@ -50,17 +46,17 @@ def examine() -> Iterator[Item]:
         f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}",
     )
     yield _kernels()
-    absent = [
+    missing = [
         f"{use} need 'vehest[{extra}]'"
         for extra, (package, use) in EXTRAS.items()
         if importlib.util.find_spec(package) is None
     ]
     extras = (
-        f"{'; '.join(absent)}: pip install it where you need it"
-        if absent
+        f"{'; '.join(missing)}: pip install it where you need it"
+        if missing
         else f"{', '.join(EXTRAS)} are there"
     )
-    yield Item("warning" if absent else "ok", "extras", extras)
+    yield Item("warning" if missing else "ok", "extras", extras)
     root = os.environ.get("VEHEST_DATA")
     if not root:
         yield Item(
@@ -79,12 +75,6 @@ def examine() -> Iterator[Item]:
     yield Item("ok" if writable else "error", "output", str(folder) if writable else refused)
     free = shutil.disk_usage(".").free / 1e9
     yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
-    yield Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")
-    yield Item(
-        "ok",
-        "GPU",
-        f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run on the processor",
-    )
 
 
 def _kernels() -> Item:

@@ -17,7 +17,13 @@ STAGE = "downsample"
 def plan_downsample(
     ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path
 ) -> StagePlan:
-    """The artefact of a downsampling; raises `ConfigurationError` for a rate, method or transform that makes no sense."""
+    """The artefact of a downsampling.
+
+    Raises
+    ------
+    ConfigurationError
+        A rate, method or transform that makes no sense.
+    """
     config = {
         "rate_hz": float(rate_hz),
         "method": options["method"],

@@ -1,6 +1,7 @@
 """Runs a trained model on a new recording that has no reference channels.
 
-model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
+model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures
+and a verdict
 """
 
 from __future__ import annotations
@@ -45,34 +46,44 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
-SLOWEST_LOG_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
-SHARPEST_TURN = (
+MIN_LOG_RATE_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
+MAX_WHEELBASE_OVER_RADIUS = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
-LARGEST_FROUDE = 400.0  # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
+# vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
+MAX_FROUDE_NUMBER = 400.0
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 
 
 def estimate_file(
     words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None
 ) -> dict[str, Any]:
-    """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
+    """Run a model on a recording and write the estimate to ``out``; returns its figures and a
+    verdict.
 
-    Args:
-        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
-        out: table to write, or the log with further channels (`estimate_log`).
-        strict: whether findings in the channels are an error; else they are printed as warnings.
-        car: record of `vehest identify` to start from.
+    Parameters
+    ----------
+    words : Sequence[str]
+        A model, which may be left out, a recording and overrides of conf/estimate.yaml.
+    out : Path
+        Table to write, or the log with further channels (`estimate_log`).
+    strict : bool
+        Whether findings in the channels are an error; else they are printed as warnings.
+    car : Path or None
+        Record of `vehest identify` to start from.
 
-    Raises:
-        VehestError: model, recording or table cannot be used.
+    Raises
+    ------
+    VehestError
+        Model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
     name = words[0] if n_names == 2 else SELF_CALIBRATING
     file = Path(words[n_names - 1])
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(
-            f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv"
+            f"'{file}' is a folder; a recording is a file, and comes after the model: vehest "
+            "estimate MODEL lap.csv"
         )
     writes_log = out.suffix.lower() in LOG_SUFFIXES
     _check_output(out, file)
@@ -86,7 +97,7 @@ def estimate_file(
         parts = (
             (part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file)
         )
-        first, known = next(parts)
+        first, first_findings = next(parts)
         remarks: list[str] = []
         if name == SELF_CALIBRATING and "ax" not in first and "measured_ax" not in settings:
             settings["measured_ax"] = False
@@ -104,24 +115,25 @@ def estimate_file(
             model.preparation = options.preparation
         band = describe_band(trust, first.vehicle, options.same_vehicle, first.car)
         elsewhere = is_other_vehicle(trust, first.vehicle, options.same_vehicle, first.car)
-        if SLOWEST_LOG_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
+        if MIN_LOG_RATE_HZ <= first.rate_hz < (1.0 - 1e-9) * model.settings.rate_hz:
             remarks.append(
                 f"the recording is sampled at {first.rate_hz:g} Hz and brought to the "
-                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the estimate"
+                f"{model.settings.rate_hz:g} Hz of '{name}'; nothing faster than it is in the "
+                "estimate"
             )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
-        drive = report.checked(chain([(first, known)], parts))
+        drive = report.checked(chain([(first, first_findings)], parts))
         if writes_log or not run.takes_parts:
             first = joined(list(drive))
             drive = iter([first])
-        needed = resampled_parts(
+        resampled_drive = resampled_parts(
             (part.select(model.channels) for part in drive),
             model.settings.rate_hz,
             model.preparation,
-            slowest_hz=SLOWEST_LOG_HZ,
+            slowest_hz=MIN_LOG_RATE_HZ,
         )
-        estimates = report.counted(estimate_parts(run, needed))
+        estimates = report.counted(estimate_parts(run, resampled_drive))
         if writes_log:
             (estimate,) = estimates
             write_log(estimate, first, file, out)
@@ -147,7 +159,9 @@ def estimate_file(
 
 
 def _check_output(out: Path, recording: Path) -> None:
-    """Raise `ConfigurationError` where an estimate cannot be written to a path, before anything is computed."""
+    """Raise `ConfigurationError` where an estimate cannot be written to a path, before anything is
+    computed.
+    """
     if out.suffix.lower() in LOG_SUFFIXES:
         check_log_name(recording, out)
     else:
@@ -166,7 +180,8 @@ def model_for_car(
     Returns
     -------
     tuple
-        Folder, model, calibration, and whether bands are for another car: by the answer ``same_vehicle``,
+        Folder, model, calibration, and whether bands are for another car: by the answer
+            ``same_vehicle``,
         by values of the car, and by its name where a data set is named.
     """
     folder, model, trust = open_model(name, options.output, say)
@@ -187,28 +202,39 @@ def findings_of(
     recording: Recording,
     model: Estimator,
     accepted: Sequence[str],
-    known: Sequence[Finding] | None = None,
+    of_all_channels: Sequence[Finding] | None = None,
 ) -> list[Finding]:
-    """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
+    """Findings in the channels that a model reads, given those of all channels, if they are known.
+
+    Raises
+    ------
+    DataError
+        Channels contradict each other.
+    """
     read = [name for name in model.channels if name in recording]
-    if known is not None and (
-        set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)
+    if of_all_channels is not None and (
+        set(read) == set(recording.channels)
+        or all(finding.level == "note" for finding in of_all_channels)
     ):
-        findings = list(known)
+        findings = list(of_all_channels)
     else:
         findings = checks_of_recording(recording.select(read)) if read else []
     findings = [finding for finding in findings if finding.level != "note"]
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            what = f"channels contradict each other: {finding.message}"
+            problem = f"channels contradict each other: {finding.message}"
             raise DataError(
-                f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])"
+                f"recording '{recording.id}': {problem} (or dataset.accept=[{finding.check}])"
             )
     return findings + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
 def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Finding]:
-    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
+    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a
+    wheelbase [m].
+
+    None: not known.
+    """
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
     speed = recording["vx"]
@@ -217,21 +243,23 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    problem = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
     remedy = "give estimator.wheelbase"
-    if wheelbase * turn > SHARPEST_TURN:
+    if wheelbase * turn > MAX_WHEELBASE_OVER_RADIUS:
         return [
             Finding(
                 "warning",
                 "wheelbase",
                 "",
-                f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}",
+                f"{problem} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}",
             )
         ]
     fast = float(np.quantile(speed, 0.99))
-    if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
+    if fast**2 > MAX_FROUDE_NUMBER * GRAVITY * wheelbase:
         return [
-            Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")
+            Finding(
+                "warning", "wheelbase", "", f"{problem} does not reach {fast:.0f} m/s; {remedy}"
+            )
         ]
     return []
 
@@ -239,10 +267,14 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
 class _Report:
     """Findings, figures and verdict of a drive that is checked and estimated in parts.
 
-    Args:
-        model, trust: that estimate it.
-        accepted: checks whose contradictions do not count.
-        strict: name of the file if findings are an error.
+    Parameters
+    ----------
+    model, trust : Estimator, Trust or None
+        That estimate it.
+    accepted : Sequence[str]
+        Checks whose contradictions do not count.
+    strict : str or None
+        Name of the file if findings are an error.
     """
 
     def __init__(
@@ -261,12 +293,15 @@ class _Report:
         self.reasons: Counter[float] = Counter()
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
-        """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
-        for part, known in parts:
-            found = findings_of(part, self.model, self.accepted, known)
-            if self.strict and found:
-                raise DataError(f"{self.strict}: {finding_in_words(found[0])}")
-            self.findings.append(found)
+        """The parts, once they are checked.
+
+        Raises `DataError` as `findings_of` does, and where it is strict.
+        """
+        for part, of_all_channels in parts:
+            findings = findings_of(part, self.model, self.accepted, of_all_channels)
+            if self.strict and findings:
+                raise DataError(f"{self.strict}: {finding_in_words(findings[0])}")
+            self.findings.append(findings)
             self.seconds += part.duration
             if self.health is not None:
                 self.outside = self.outside + outside_domain(
@@ -278,12 +313,12 @@ class _Report:
         """The parts of the estimate, once they count; raises `DataError` where all are empty."""
         for part in parts:
             self.last = part
-            known = ~np.isnan(part["vy"])
+            is_estimated = ~np.isnan(part["vy"])
             degrees = np.degrees(part["sideslip"])
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
             self.samples, self.estimated = (
                 self.samples + len(part),
-                self.estimated + int(known.sum()),
+                self.estimated + int(is_estimated.sum()),
             )
             if "band_sideslip" in part.channels:
                 self.half.frombytes(
@@ -291,11 +326,11 @@ class _Report:
                     .astype(np.float32)
                     .tobytes()
                 )
-            status = part["health"][known]
-            reasons = part["health_reason"][known]
+            status = part["health"][is_estimated]
+            reasons = part["health_reason"][is_estimated]
             self.invalid += int((status > 0).sum())
-            found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
-            self.reasons.update(dict(zip(found.tolist(), counts.tolist(), strict=True)))
+            codes, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
+            self.reasons.update(dict(zip(codes.tolist(), counts.tolist(), strict=True)))
             yield part
         if not self.estimated:
             raise too_short_error(self.model, self.last.recording_id, self.seconds)
@@ -345,7 +380,10 @@ class _Report:
 
     @property
     def outside_training(self) -> str:
-        """Share of the drive outside the range of the training, and its channels; empty if there is none."""
+        """Share of the drive outside the range of the training, and its channels.
+
+        Empty if there is none.
+        """
         return domain_verdict(self.health, self.outside) if self.health is not None else ""
 
     def verdict(self) -> str:

@@ -1,4 +1,6 @@
-"""Writes an estimate back into the log that it was made of, as channels of their own, for the viewer that the log came from."""
+"""Writes an estimate back into the log that it was made of, as channels of their own, for the
+viewer that the log came from.
+"""
 
 from __future__ import annotations
 
@@ -20,39 +22,51 @@ HEALTH = ("valid", "degraded", "invalid")
 
 
 def check_log_name(log: Path, out: Path) -> None:
-    """Raises `ConfigurationError` where a log cannot be written in the format that a name asks for."""
+    """Raises `ConfigurationError` where a log cannot be written in the format that a name asks
+    for.
+    """
     if out.suffix.lower() == ".mf4" != log.suffix.lower():
         raise ConfigurationError(
-            f"'{out}' would be '{log}' with further channels, which is no .mf4; name a .mat, .csv or .parquet file"
+            f"'{out}' would be '{log}' with further channels, which is no .mf4; name a .mat, .csv "
+            "or .parquet file"
         )
 
 
 def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) -> None:
-    """Write a log with the estimate in it: ``vehest_vy`` [m/s], ``vehest_sideslip`` [rad], their bands, health and its reason.
+    """Write a log with the estimate in it: ``vehest_vy`` [m/s], ``vehest_sideslip`` [rad], their
+    bands, health and its reason.
 
-    As MDF 4, the log as it is with one group more, on the estimate's clock. As MAT 5, the channels of the recording in SI units and the
-    estimate, held, on the clock ``time`` of the recording.
+    As MDF 4, the log as it is with one group more, on the estimate's clock. As MAT 5, the channels
+    of the recording in SI units and the estimate, held, on the clock ``time`` of the recording.
 
-    Args:
-        estimate: of the recording.
-        recording: as it was read from the log.
-        log: its file.
-        out: `LOG_SUFFIXES`; see `check_log_name`.
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the recording.
+    recording : Recording
+        As it was read from the log.
+    log : Path
+        Its file.
+    out : Path
+        `LOG_SUFFIXES`; see `check_log_name`.
 
-    Raises:
-        DataError: the log is of an older version of MDF.
-        MissingError: there is no room, or a folder cannot be written to.
+    Raises
+    ------
+    DataError
+        The log is of an older version of MDF.
+    MissingError
+        There is no room, or a folder cannot be written to.
     """
     if out.suffix.lower() == ".mat":
         from scipy.io import savemat
 
-        own = {
+        quantities = {
             f"{PREFIX}{name}": estimate.held_at(recording.time, name) for name in estimate.channels
         }
         with written_aside(out) as aside, open(aside, "wb") as stream:
             savemat(
                 stream,
-                {"time": recording.time, **recording.channels, **own},
+                {"time": recording.time, **recording.channels, **quantities},
                 oned_as="column",
                 do_compression=True,
             )

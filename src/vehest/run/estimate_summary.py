@@ -1,4 +1,6 @@
-"""Summary that `vehest estimate` prints for people: what was estimated, how reliably, where in the car, and in which file."""
+"""Summary that `vehest estimate` prints for people: what was estimated, how reliably, where in the
+car, and in which file.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
     ]
     if unknown:
         return (
-            f"reference sensor of data set {' and '.join(unknown)}, whose place in the car is not known "
+            f"reference sensor of data set {' and '.join(unknown)}, whose place in the car is not "
+            "known "
             "(reference_point in conf/dataset)"
         )
     return "centre of gravity"
@@ -103,7 +106,9 @@ def _valid(outcome: Mapping[str, Any]) -> str:
 
 
 def _grouped(reasons: Sequence[str]) -> list[str]:
-    """Reasons that differ in the channel alone as one: ``outside the range of the training: |vx|, |ay|``."""
+    """Reasons that differ in the channel alone as one: ``outside the range of the training: |vx|,
+    |ay|``.
+    """
     channels: dict[str, list[str]] = {}
     for reason in reasons:
         cause, _, channel = reason.partition(": ")

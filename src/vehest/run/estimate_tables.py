@@ -45,7 +45,9 @@ SPELLINGS = {
         "betahat",
     ),
 }
-"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and units aside."""
+"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and
+units aside.
+"""
 OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
 """Columns that estimates of vehest have, and those of other tools do not."""
 DEFAULT_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
@@ -54,15 +56,23 @@ AUTO = "auto"
 
 
 def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
-    """Columns from ``QUANTITY=COLUMN`` words; raises `ConfigurationError` for an unknown quantity or no column."""
+    """Columns from ``QUANTITY=COLUMN`` words.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown quantity or no column.
+    """
     columns = []
     for word in words:
         quantity, _, text = word.partition("=")
         if quantity not in CHANNELS_OF_QUANTITIES:
             meant = suggestion(quantity, CHANNELS_OF_QUANTITIES) or ";"
             raise ConfigurationError(
-                f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an estimate{meant} "
-                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column sideslip=Beta:deg"
+                f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an "
+                f"estimate{meant} "
+                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column "
+                "sideslip=Beta:deg"
             )
         if not text.strip("-"):
             raise ConfigurationError(f"--column {printable(word)} names no column")
@@ -71,7 +81,13 @@ def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
 
 
 def parse_shift(text: str) -> float | None:
-    """Seconds of ``--shift``, None for ``auto``; raises `ConfigurationError` for anything else."""
+    """Seconds of ``--shift``, None for ``auto``.
+
+    Raises
+    ------
+    ConfigurationError
+        Anything else.
+    """
     if text == AUTO:
         return None
     with suppress(ValueError):
@@ -91,8 +107,8 @@ def read_estimate_table(
     """Read v or β from a table of any tool, or of ``vehest estimate``.
 
     Columns are found by name, whatever their case; a unit in brackets or at the end of a name
-    counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's u.
-    Prints a warning where unit or sign contradict the recording.
+    counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's
+    u. Prints a warning where unit or sign contradict the recording.
 
     Parameters
     ----------
@@ -116,12 +132,13 @@ def read_estimate_table(
     names = column_names(file, layout)
     if is_parquet(file) and OF_VEHEST.intersection(names):
         complain(
-            f"warning: '{file}' has columns of 'vehest estimate' ({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
+            f"warning: '{file}' has columns of 'vehest estimate' "
+            f"({counted(sorted(OF_VEHEST.intersection(names)))}), but not its "
             "description: another program has written it anew; it is read like another tool's table"
         )
-    found = _columns_of(file, names, columns)
-    time = found.pop("time", None)
-    channel = next((name for name in ("vy_ref", "sideslip_ref") if name in found), None)
+    declared = _columns_of(file, names, columns)
+    time = declared.pop("time", None)
+    channel = next((name for name in ("vy_ref", "sideslip_ref") if name in declared), None)
     if time is None or channel is None:
         raise DataError(_missing_columns(file, names, time is None))
     options = {
@@ -131,13 +148,13 @@ def read_estimate_table(
         "clock": "interpolate",
         "gappy": [channel],
         "time": {key: time[key] for key in ("column", "unit")},
-        "channels": {channel: found[channel]},
+        "channels": {channel: declared[channel]},
     }
     plain = asdict(TextLayout())
     options |= {name: value for name, value in asdict(layout).items() if value != plain[name]}
     table = read_single(options, file)
     table = replace(table, start_time=table.start_time + _seconds(file, table, drive, shift))
-    _warn_of_estimate(file, str(found[channel]["column"]), table, drive)
+    _warn_of_estimate(file, str(declared[channel]["column"]), table, drive)
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, drive.time, drive["vx"])
@@ -151,7 +168,13 @@ def read_estimate_table(
 
 
 def names_of_table(file: Path) -> list[str]:
-    """Names of a table's columns; raises `DataError` where it cannot be read."""
+    """Names of a table's columns.
+
+    Raises
+    ------
+    DataError
+        It cannot be read.
+    """
     return column_names(file, _layout(file))
 
 
@@ -164,23 +187,25 @@ def _columns_of(
     file: Path, names: Sequence[str], columns: Sequence[NamedColumn]
 ) -> dict[str, dict[str, str | int]]:
     """Time and channels of a table with column, unit and sign, as a data set declares them."""
-    found: dict[str, dict[str, str | int]] = {}
+    declared: dict[str, dict[str, str | int]] = {}
     for named in columns:
         place = named.find(names)
         if place is not None:
             name, stated, sign = place
             unit = unit_of(named.channel, name, file, stated)
-            found[named.channel] = {"column": name, "unit": unit, "sign": sign}
-    is_chosen = not {"vy_ref", "sideslip_ref"}.isdisjoint(found)
+            declared[named.channel] = {"column": name, "unit": unit, "sign": sign}
+    is_chosen = not {"vy_ref", "sideslip_ref"}.isdisjoint(declared)
     for quantity, accepted in SPELLINGS.items():
         for name in names if quantity == "time" or not is_chosen else ():
-            if quantity not in found and _plain_names(name) & set(accepted):
-                found[quantity] = {"column": name, "unit": unit_of(quantity, name, file)}
-    return found
+            if quantity not in declared and _plain_names(name) & set(accepted):
+                declared[quantity] = {"column": name, "unit": unit_of(quantity, name, file)}
+    return declared
 
 
 def _plain_names(name: str) -> set[str]:
-    """A column's name without case, blanks, underscores and what is in brackets, with and without the unit that it ends in."""
+    """A column's name without case, blanks, underscores and what is in brackets, with and without
+    the unit that it ends in.
+    """
     bare = re.sub(r"[\[(].*?[\])]", "", name).strip()
     forms = {bare, re.sub(r"[_\s]+[^_\s]+$", "", bare) if unit_in_name(bare) else bare}
     if bare.lower().rpartition("_")[2] in TIME_UNITS:
@@ -201,7 +226,13 @@ def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
 
 
 def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
-    """The unit that is stated or in a column's name, or the default; raises `DataError` for an unknown one."""
+    """The unit that is stated or in a column's name, or the default.
+
+    Raises
+    ------
+    DataError
+        An unknown one.
+    """
     text = stated or written_unit(name)
     if quantity == "time" and not text and (last := name.lower().rpartition("_")[2]) in TIME_UNITS:
         text = last if "_" in name else ""
@@ -209,16 +240,18 @@ def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
         return DEFAULT_UNITS[quantity]
     unit = TIME_UNITS.get(text) if quantity == "time" else plain_unit(text)
     if unit is None:
-        known = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
+        accepted = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
         raise DataError(
-            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known are {known}); "
+            f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known "
+            f"are {accepted}); "
             "convert it, or rename the column"
         )
     try:
         factor_to_si(unit, DEFAULT_UNITS[quantity])
     except DataError:
         raise DataError(
-            f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of {quantity.removesuffix('_ref')}; "
+            f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of "
+            f"{quantity.removesuffix('_ref')}; "
             "name its unit, as in --column sideslip=NAME:deg"
         ) from None
     return unit
@@ -239,14 +272,17 @@ def _seconds(file: Path, table: Recording, drive: Recording, shift: float | None
     except DataError as error:
         raise DataError(f"'{file}': {error}") from None
     note(
-        f"'{file}': shifted by {estimated.seconds:.3f} s, where it correlates best with the reference "
+        f"'{file}': shifted by {estimated.seconds:.3f} s, where it correlates best with the "
+        "reference "
         f"({estimated.correlation:.3f}); this compensates for a delay of the estimate as well"
     )
     return estimated.seconds
 
 
 def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recording) -> None:
-    """Print a warning where an estimate has another unit or sign than its column says, by the channels of the recording."""
+    """Print a warning where an estimate has another unit or sign than its column says, by the
+    channels of the recording.
+    """
     (channel,) = table.channels
     measured = drive.without_references()
     values = np.interp(measured.time, table.time, table[channel], left=np.nan, right=np.nan)
@@ -261,5 +297,6 @@ def _warn_of_estimate(file: Path, column: str, table: Recording, drive: Recordin
         )
         if concerns and finding.check in CHECKS_OF_SIGNS_AND_UNITS:
             complain(
-                f"warning: '{file}': column '{printable(column)}', read as {channel}: {finding.message}"
+                f"warning: '{file}': column '{printable(column)}', read as {channel}: "
+                f"{finding.message}"
             )

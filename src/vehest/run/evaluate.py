@@ -1,8 +1,10 @@
 """Evaluates fitted estimators: estimates and metrics, all read on one grid of times.
 
-model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate -> metrics.csv, timings.csv, blocks.csv
+model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate ->
+metrics.csv, timings.csv, blocks.csv
 
-Every fault adds rows under a condition of its own; without faults, key and files are those of an evaluation that knows none.
+Every fault adds rows under a condition of its own; without faults, key and files are those of an
+evaluation that knows none.
 """
 
 from __future__ import annotations
@@ -49,13 +51,13 @@ from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.evaluate_faults import FaultSettings, errors_under
 from vehest.run.train import (
     FIT_METRICS,
-    file_digest,
+    digests_of_spans,
     learnt_spans,
     read_fit_metrics,
-    recording_file,
+    stored_recording,
 )
 from vehest.run.versions import code_of
-from vehest.studies.artefacts import HEAD, METRIC_COLUMNS, read_frame
+from vehest.studies.artefacts import HEAD, METRIC_COLUMNS, nominal_rows, read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.faults import is_fault
 from vehest.trust.record import Trust, read_trust
@@ -73,11 +75,18 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
-    """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
+    """How estimates are scored.
+
+    Raises
+    ------
+    ConfigurationError
+        A value that makes no sense.
+    """
     if "least_speed" in config:
         raise ConfigurationError(
-            "evaluation.least_speed is now evaluation.min_sideslip_speed: slower samples are left out of errors of sideslip, instead of "
-            "counting as 0; leave it out for 1 m/s · sqrt(wheelbase / 2.7 m)"
+            "evaluation.least_speed is now evaluation.min_sideslip_speed: slower samples are left "
+            "out of errors of sideslip, instead of counting as 0; leave it out for "
+            "1 m/s · sqrt(wheelbase / 2.7 m)"
         )
     protocol = settings_from_config(Protocol, config, "evaluation")
     speeds = protocol.min_sideslip_speed
@@ -87,7 +96,8 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
         or min(speeds.values() if isinstance(speeds, dict) else [speeds or 0.0], default=0.0) < 0
     ):
         raise ConfigurationError(
-            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and min_sideslip_speed must not be negative"
+            "evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and "
+            "min_sideslip_speed must not be negative"
         )
     if protocol.sequence_seconds is not None:
         samples = protocol.sequence_seconds * protocol.rate_hz
@@ -96,19 +106,24 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
             or abs(samples - round(samples)) > 1e-6
         ):
             raise ConfigurationError(
-                f"evaluation.sequence_seconds must be longer than skip_seconds ({protocol.skip_seconds:g} s) and a whole number of "
+                "evaluation.sequence_seconds must be longer than skip_seconds "
+                f"({protocol.skip_seconds:g} s) and a whole number of "
                 f"samples at {protocol.rate_hz:g} Hz, not {protocol.sequence_seconds:g} s"
             )
     if protocol.initial_state and protocol.warm_up_seconds > 0:
         raise ConfigurationError(
-            f"evaluation.initial_state gives the state at the first sample of a {protocol.piece}, so estimates cannot start "
+            f"evaluation.initial_state gives the state at the first sample of a {protocol.piece}, "
+            "so estimates cannot start "
             f"{protocol.warm_up_seconds:g} s earlier; set evaluation.warm_up_seconds=0"
         )
     return protocol
 
 
 def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> dict[str, Any]:
-    """Options of an evaluation that enter its key: those that differ from their defaults; without faults none of theirs."""
+    """Options of an evaluation that enter its key: those that differ from their defaults.
+
+    Without faults none of theirs.
+    """
     options: dict[str, Any] = {"protocol": changed_options(protocol)}
     return options | ({"faults": [changed_options(fault) for fault in faults]} if faults else {})
 
@@ -129,31 +144,33 @@ class Evaluation:
     def of(
         self, model: Artefact, calibration: Artefact | None
     ) -> tuple[StagePlan, Callable[[Path], None]]:
-        """The evaluation of a model, as `artefacts.make` takes it; raises `ConfigurationError` where it was trained on a test range."""
+        """The evaluation of a model, as `artefacts.make` takes it.
+
+        Raises
+        ------
+        ConfigurationError
+            It was trained on a test range.
+        """
         for name, spans in self.split.tests.items():
             for learnt in learnt_spans(model):
                 if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
-                        f"test set '{name}' shares samples with the ranges that {model.label} was trained or chosen on "
+                        f"test set '{name}' shares samples with the ranges that {model.label} was "
+                        "trained or chosen on "
                         f"({learnt.describe()}); test it on something else"
                     )
         inputs = {"model": model.digest} | (
             {} if calibration is None else {"calibration": calibration.digest}
         )
         scored = scored_spans(self.split)
-        inputs |= {
-            f"{span.dataset}/{span.recording}": file_digest(self.data[span.dataset], span)
-            for span in scored
-        }
+        inputs |= digests_of_spans(self.data, scored)
         compared = [
             *scored,
             *(span for span in learnt_spans(model, "train") if span.dataset in self.references),
         ]
         inputs |= {
-            f"reference of {span.dataset}/{span.recording}": file_digest(
-                self.references[span.dataset], span
-            )
-            for span in compared
+            f"reference of {name}": digest
+            for name, digest in digests_of_spans(self.references, compared).items()
         }
         config: dict[str, Any] = {
             "sets": {
@@ -182,11 +199,11 @@ class Evaluation:
 
     def reference(self, span: Span) -> Recording:
         """The recording of a range at the evaluation rate, references included."""
-        return read_recording(recording_file(self.references[span.dataset], span))
+        return read_recording(stored_recording(self.references, span))
 
     def measured(self, span: Span) -> Recording:
         """A range as the estimator sees it: no references, and a warm-up before it."""
-        recording = read_recording(recording_file(self.data[span.dataset], span))
+        recording = read_recording(stored_recording(self.data, span))
         recording = replace(recording, car=self.cars.get(span.dataset, UNKNOWN_CAR))
         return recording.cut(
             span.start - self.protocol.warm_up_seconds, span.stop
@@ -213,10 +230,15 @@ def scored_spans(split: Split) -> list[Span]:
     return [span for spans in test_sets(split).values() for span in spans]
 
 
-def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path) -> None:
-    """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
+def _write(
+    evaluation: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path
+) -> None:
+    """Estimate and score every range, under faults too.
+
+    Write estimates, metrics and, in a file of their own, times into ``folder``.
+    """
     estimator = load_model(model.folder)
-    protocol = how.protocol
+    protocol = evaluation.protocol
     without_fit = (
         model.outputs and FIT_METRICS not in model.outputs
     )  # such as a model that was saved from Python
@@ -227,15 +249,15 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
     rows: list[dict[str, Any]] = []
     under_faults: list[dict[str, Any]] = []
     blocks = {}
-    for name, spans in test_sets(how.split).items():
-        head = _head(how, model, estimator, name, spans)
-        pieces = sequences(spans, how.reference, protocol)
-        estimates = _estimates(estimator, how, pieces)
+    for name, spans in test_sets(evaluation.split).items():
+        head = _head(evaluation, model, estimator, name, spans)
+        pieces = sequences(spans, evaluation.reference, protocol)
+        estimates = _estimates(estimator, evaluation, pieces)
         for position, piece in enumerate(pieces):
             if (
                 bands is not None
             ):  # wider on vehicles without calibration and on test sets that the protocol names
-                measured = how.measured(piece)
+                measured = evaluation.measured(piece)
                 other_vehicle = (
                     not bands.are_of(measured.vehicle, measured.car)
                     or name in protocol.sets_elsewhere
@@ -244,19 +266,21 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
                     estimates[position], measured, bands, elsewhere=other_vehicle
                 )
             write_estimate(estimates[position], folder / name / f"{position}.parquet")
-        scored = how.score(spans, estimates)
+        scored = evaluation.score(spans, estimates)
         blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
         if protocol.sequence_seconds is not None:
             figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
-            figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, how, spans)
+            figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(
+                estimator, evaluation, spans
+            )
             if estimator.causal:
-                figures["step_seconds"] = _step_seconds(estimator, how.measured(pieces[0]))
+                figures["step_seconds"] = _step_seconds(estimator, evaluation.measured(pieces[0]))
         rows += _rows(head, figures, figure_intervals(blocks[name]))
-        rows += _rows_of_parts(how, head, spans, scored, bands)
-        under_faults += _rows_under_faults(estimator, how, head, spans, scored, trust)
-    rows += _training_rows(how, model, estimator)
+        rows += _rows_of_parts(evaluation, head, spans, scored, bands)
+        under_faults += _rows_under_faults(estimator, evaluation, head, spans, scored, trust)
+    rows += _training_rows(evaluation, model, estimator)
     write_segments(folder / BLOCKS, blocks)
     for file, timed in ((METRICS, False), (TIMINGS, True)):
         with open(folder / file, "w", newline="", encoding="utf-8") as stream:
@@ -268,17 +292,19 @@ def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folde
 
 
 def _rows_of_parts(
-    how: Evaluation,
+    evaluation: Evaluation,
     head: Mapping[str, Any],
     spans: Sequence[Span],
     scored: Sequence[Scored],
     bands: Bands | None,
 ) -> list[dict[str, Any]]:
-    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
-    protocol = how.protocol
+    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of
+    bands, over all samples and by regime.
+    """
+    protocol = evaluation.protocol
     masks = []
     turns = []
-    for reference, piece in pieces_of(spans, how.reference, protocol):
+    for reference, piece in pieces_of(spans, evaluation.reference, protocol):
         masks.append(regimes_of(reference, piece, protocol))
         turns.append(
             reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))]
@@ -287,53 +313,53 @@ def _rows_of_parts(
         )
     rows = _rows(
         head,
-        lever_arm_figures(scored, pieces_of(spans, how.reference, protocol), protocol),
+        lever_arm_figures(scored, pieces_of(spans, evaluation.reference, protocol), protocol),
         condition=CONDITION,
     )
     if head["test_set"] != VALIDATION:
-        for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
-            rows += _rows(head, own, subset=regime)
+        for regime, figures in errors_by_regime(scored, masks, protocol.rate_hz).items():
+            rows += _rows(head, figures, subset=regime)
     if bands is not None:
         within = banded(scored, bands)
         intervals = coverage_intervals(within, scored, protocol.rate_hz)
         rows += _rows(head, band_figures(within, scored, turns, protocol.rate_hz), intervals)
-        for regime, own in figures_by_regime(within, masks, protocol.rate_hz).items():
-            rows += _rows(head, own, subset=regime)
+        for regime, figures in figures_by_regime(within, masks, protocol.rate_hz).items():
+            rows += _rows(head, figures, subset=regime)
     return rows
 
 
 def _rows_under_faults(
     estimator: Estimator,
-    how: Evaluation,
+    evaluation: Evaluation,
     head: Mapping[str, Any],
     spans: Sequence[Span],
     nominal: Sequence[Scored],
     trust: Trust | None,
 ) -> list[dict[str, Any]]:
-    if not how.faults:
+    if not evaluation.faults:
         return []
     rows: list[dict[str, Any]] = []
     pieces = [
-        (piece, how.measured(piece), how.state(piece))
-        for piece in sequences(spans, how.reference, how.protocol)
+        (piece, evaluation.measured(piece), evaluation.state(piece))
+        for piece in sequences(spans, evaluation.reference, evaluation.protocol)
     ]
-    other_vehicle = head["test_set"] in how.protocol.sets_elsewhere
-    score = partial(how.score, spans)
-    rate_hz = how.protocol.rate_hz
-    for fault in how.faults:
-        for subset, own in errors_under(
+    other_vehicle = head["test_set"] in evaluation.protocol.sets_elsewhere
+    score = partial(evaluation.score, spans)
+    rate_hz = evaluation.protocol.rate_hz
+    for fault in evaluation.faults:
+        for subset, figures in errors_under(
             fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle
         ).items():
-            rows += _rows(head, own, subset=subset, condition=fault.condition)
+            rows += _rows(head, figures, subset=subset, condition=fault.condition)
     return rows
 
 
 def _head(
-    how: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]
+    evaluation: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]
 ) -> dict[str, Any]:
     about = read_description(model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
-    kinds = dict.fromkeys(how.kinds[name] for name in datasets)
+    kinds = dict.fromkeys(evaluation.kinds[name] for name in datasets)
     mode = "causal" if estimator.causal else "offline"
     learnt = (estimator.name, estimator.variant, "+".join(about.datasets))
     test = (
@@ -342,7 +368,7 @@ def _head(
         name,
         "all",
         "nominal",
-        how.protocol.rate_hz,
+        evaluation.protocol.rate_hz,
         mode,
         about.seed,
     )
@@ -374,30 +400,40 @@ def _rows(
     return rows
 
 
-def _estimates(estimator: Estimator, how: Evaluation, pieces: Sequence[Span]) -> list[Estimate]:
+def _estimates(
+    estimator: Estimator, evaluation: Evaluation, pieces: Sequence[Span]
+) -> list[Estimate]:
     """An estimate each; sequences in one go, since a method may then take them all at once."""
     batches = (
-        [pieces] if how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
+        [pieces]
+        if evaluation.protocol.sequence_seconds is not None
+        else [[piece] for piece in pieces]
     )
     estimates: list[Estimate] = []
     for batch in batches:
-        states = [state for piece in batch if (state := how.state(piece)) is not None]
-        estimates += estimator.estimate([how.measured(piece) for piece in batch], states or None)
+        states = [state for piece in batch if (state := evaluation.state(piece)) is not None]
+        estimates += estimator.estimate(
+            [evaluation.measured(piece) for piece in batch], states or None
+        )
     return estimates
 
 
-def _floors(estimator: Estimator, how: Evaluation, spans: Sequence[Span]) -> dict[str, float]:
-    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
-    drives = drives_of(spans, how.reference, how.protocol)
+def _floors(
+    estimator: Estimator, evaluation: Evaluation, spans: Sequence[Span]
+) -> dict[str, float]:
+    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as
+    they are known.
+    """
+    drives = drives_of(spans, evaluation.reference, evaluation.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
     floors = {"floor_reference": reference_floor(drives)} | (
         {"floor_cramer_rao": cramer_rao_floor(drives, inputs)} if inputs else {}
     )
-    known = {name: floor for name, floor in floors.items() if floor is not None}
+    finite_floors = {name: floor for name, floor in floors.items() if floor is not None}
     return {
         name + suffix: value
-        for name, own in known.items()
-        for suffix, value in (("", own.sideslip), ("_vy", own.vy))
+        for name, floor in finite_floors.items()
+        for suffix, value in (("", floor.sideslip), ("_vy", floor.vy))
     }
 
 
@@ -414,46 +450,61 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
     return float(np.median(times))
 
 
-def _training_rows(how: Evaluation, model: Artefact, estimator: Estimator) -> list[dict[str, Any]]:
-    """Errors on the training ranges; none where the reference has gaps there or nothing was learnt."""
-    spans = [span for span in learnt_spans(model, "train") if span.dataset in how.data]
+def _training_rows(
+    evaluation: Evaluation, model: Artefact, estimator: Estimator
+) -> list[dict[str, Any]]:
+    """Errors on the training ranges.
+
+    None where the reference has gaps there or nothing was learnt.
+    """
+    spans = [span for span in learnt_spans(model, "train") if span.dataset in evaluation.data]
     if not spans:
         return []
     try:
-        estimates = _estimates(estimator, how, sequences(spans, how.reference, how.protocol))
-        figures = accuracy(how.score(spans, estimates))
+        estimates = _estimates(
+            estimator, evaluation, sequences(spans, evaluation.reference, evaluation.protocol)
+        )
+        figures = accuracy(evaluation.score(spans, estimates))
     except DataError:
         for span in spans:  # what cannot be read is an error, a gap in it is not
-            how.reference(span)
-            how.measured(span)
+            evaluation.reference(span)
+            evaluation.measured(span)
         return []
     return _rows(
-        _head(how, model, estimator, TRAINING, spans),
+        _head(evaluation, model, estimator, TRAINING, spans),
         {name: figures[name] for name in TRAINING_METRICS},
     )
 
 
+def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
+    """Metrics of an evaluation, or its times, with `COLUMNS`.
+
+    Raises
+    ------
+    DataError
+        The file is damaged.
+    """
+    return read_frame(folder / file, COLUMNS, numbers=("value",))
+
+
 def test_figures(folder: Path) -> dict[str, float]:
-    """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
-    tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
-    table = pd.concat([own for own in tables if len(own)], ignore_index=True)
-    tested = table[
-        ~table["test_set"].isin((VALIDATION, TRAINING))
-        & (table["subset"] == "all")
-        & (table["condition"] == "nominal")
-    ]
+    """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` ->
+    value.
+    """
+    tables = [read_metrics(folder, file) for file in (METRICS, TIMINGS)]
+    table = nominal_rows(pd.concat([part for part in tables if len(part)], ignore_index=True))
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING))]
     return dict(
         zip(tested["metric"] + "." + tested["test_set"], map(float, tested["value"]), strict=True)
     )
 
 
 def fault_figures(folder: Path) -> dict[str, float]:
-    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` -> value."""
-    rows = read_frame(folder / METRICS, COLUMNS, numbers=("value",)).to_dict("records")
-    shown = [row for row in rows if is_fault(row["condition"]) and row["test_set"] != VALIDATION]
+    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` ->
+    value.
+    """
     return {
-        ".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): float(
-            row["value"]
-        )
-        for row in shown
+        ".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): row["value"]
+        for row in read_metrics(folder).to_dict("records")
+        if is_fault(row["condition"]) and row["test_set"] != VALIDATION
     }

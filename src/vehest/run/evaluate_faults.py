@@ -1,4 +1,5 @@
-"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them, and errors of estimates under them.
+"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them,
+and errors of estimates under them.
 
 each range with the fault injected -> guarded estimate, as online -> errors and flags
 """
@@ -25,7 +26,7 @@ from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.under_fault import FAULTED, Window, errors_under_fault, flags_under_fault
-from vehest.run.train import recording_file
+from vehest.run.train import stored_recording
 from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
@@ -61,34 +62,48 @@ class FaultSettings:
         return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
 
     def within(self, start: float, length: float, position: int) -> Fault:
-        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length`` [s] long; each draws anew."""
+        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length``
+        [s] long.
+
+        Each draws anew.
+        """
         drawn = np.random.default_rng([self.seed, position])
-        own_start = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
+        delay = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
         duration = math.inf if self.duration is None else self.duration
         return replace(
-            self._fault, onset=start + own_start, duration=duration, seed=int(drawn.integers(2**32))
+            self._fault, onset=start + delay, duration=duration, seed=int(drawn.integers(2**32))
         )
 
 
 def faults_of(config: Config) -> tuple[FaultSettings, ...]:
-    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
+    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of
+    ``fault``.
+
+    Raises as `union_of_faults` does.
+    """
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
     if not isinstance(listed, list) or not all(
         isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed
     ):
         raise ConfigurationError(
-            "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]; "
+            "faults must be a list of faults, each with its kind, for example [{kind: bias, "
+            "channel: ay, severity: mild}]; "
             f"kinds: {', '.join(kinds)}"
         )
     named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
     bases = {
         kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(named)
     }
-    own = [{key: value for key, value in entry.items() if key != "kind"} for entry in listed]
-    found = [_settings(bases[kind] | changes) for kind, changes in zip(named, own, strict=True)]
+    changes_of_entries = [
+        {key: value for key, value in entry.items() if key != "kind"} for entry in listed
+    ]
+    settings = [
+        _settings(bases[kind] | changes)
+        for kind, changes in zip(named, changes_of_entries, strict=True)
+    ]
     chosen = chosen_fault(config)
-    return all_of([found, [] if chosen is None else [chosen]])
+    return union_of_faults([settings, [] if chosen is None else [chosen]])
 
 
 def chosen_fault(config: Config) -> FaultSettings | None:
@@ -101,35 +116,41 @@ def _settings(content: Mapping[str, Any]) -> FaultSettings:
     return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")
 
 
-def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
-    """Faults of several configurations together, each once; raises `ConfigurationError` where two different ones have one name."""
-    found: dict[str, FaultSettings] = {}
-    for fault in (fault for some in faults for fault in some):
-        if found.setdefault(fault.condition, fault) != fault:
+def union_of_faults(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
+    """Faults of several configurations together, each once.
+
+    Raises
+    ------
+    ConfigurationError
+        Two different ones have one name.
+    """
+    by_condition: dict[str, FaultSettings] = {}
+    for fault in (fault for group in faults for fault in group):
+        if by_condition.setdefault(fault.condition, fault) != fault:
             raise ConfigurationError(
-                f"two faults are both called {fault.condition}: they differ in start or duration; give them different seeds too, "
+                f"two faults are both called {fault.condition}: they differ in start or duration; "
+                "give them different seeds too, "
                 f"or evaluate them one after the other"
             )
-    return tuple(found.values())
+    return tuple(by_condition.values())
 
 
 def check_channels(
     faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]
 ) -> None:
-    """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
-    spans = (
-        [span for spans in (split.validation, *split.tests.values()) for span in spans]
-        if faults
-        else []
-    )
+    """Raise `ConfigurationError` where a scored recording lacks a faulty channel.
+
+    No samples are read.
+    """
+    spans = (*split.validation, *split.test_spans) if faults else ()
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
-        held = stored_summary(recording_file(data[dataset], Span(dataset, recording))).channels
+        channels = stored_summary(stored_recording(data, Span(dataset, recording))).channels
         for fault in faults:
-            if fault.channel not in held:
-                known = ", ".join(sorted(name for name in held if not CHANNELS[name].is_reference))
+            if fault.channel not in channels:
+                measured = sorted(name for name in channels if not CHANNELS[name].is_reference)
                 raise ConfigurationError(
-                    f"fault '{fault.condition}': recording '{recording}' of data set '{dataset}' has no channel '{fault.channel}' "
-                    f"(it has {known})"
+                    f"fault '{fault.condition}': recording '{recording}' of data set '{dataset}' "
+                    f"has no channel '{fault.channel}' (it has {', '.join(measured)})"
                 )
 
 
@@ -144,12 +165,17 @@ def errors_under(
     *,
     other_vehicle: bool,
 ) -> dict[str, dict[str, float]]:
-    """Errors of guarded estimates with a fault injected into each piece; estimates that it makes missing count as infinite.
+    """Errors of guarded estimates with a fault injected into each piece; estimates that it makes
+    missing count as infinite.
 
-    A piece is a range or sequence, its samples with a warm-up before it, and the state to start from, if any.
+    A piece is a range or sequence, its samples with a warm-up before it, and the state to start
+    from, if any.
 
-    Returns:
-        Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of bands and health where there is a trust.
+    Returns
+    -------
+    dict[str, dict[str, float]]
+        Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of
+        bands and health where there is a trust.
     """
     guarded: list[Estimate] = []
     counted: list[Estimate] = []
@@ -167,8 +193,8 @@ def errors_under(
         counted.append(replace(estimate, channels=channels, covariance=None, covariance_of=()))
         windows.append((onset, onset + fault.duration))
     scored = score(counted)
-    found = errors_under_fault(scored, nominal, windows)
-    if trust is not None and FAULTED in found:
+    errors = errors_under_fault(scored, nominal, windows)
+    if trust is not None and FAULTED in errors:
         flags = []
         for estimate, part in zip(guarded, scored, strict=True):
             band = (
@@ -177,5 +203,5 @@ def errors_under(
                 else np.full(len(part.time), np.nan)
             )
             flags.append((band, estimate.held_at(part.time, "health")))
-        found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
-    return found
+        errors[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
+    return errors

@@ -21,9 +21,9 @@ class Failure:
 
 def failure_of(error: Exception) -> Failure:
     """The failure behind an exception; a defect unless the user or the machine can change it."""
-    known = error if isinstance(error, VehestError) else _of_machine(error)
-    if known is not None:
-        return Failure(str(known), exit_code=known.exit_code)
+    expected = error if isinstance(error, VehestError) else _of_machine(error)
+    if expected is not None:
+        return Failure(str(expected), exit_code=expected.exit_code)
     deep = (
         "; something that was read nests too deeply: make it flatter"
         if isinstance(error, RecursionError)
@@ -38,9 +38,9 @@ def _of_machine(error: Exception) -> MissingError | None:
     """The error in words where the machine is short of something or a file cannot be reached."""
     full = no_room(error)
     if full is not None:
-        where = f"'{full.filename}'" if full.filename else "where results and temporary files go"
+        target = f"'{full.filename}'" if full.filename else "where results and temporary files go"
         return MissingError(
-            f"no room left to write {where} ({full.strerror}); free some space and run again"
+            f"no room left to write {target} ({full.strerror}); free some space and run again"
         )
     if isinstance(error, FileNotFoundError):
         try:
@@ -49,10 +49,12 @@ def _of_machine(error: Exception) -> MissingError | None:
             return MissingError("the working folder has been removed; change to another")
     if isinstance(error, OSError) and error.filename is not None:
         return MissingError(
-            f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions"
+            f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and "
+            "their permissions"
         )
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return MissingError(
-            "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter recordings, smaller networks"
+            "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter "
+            "recordings, smaller networks"
         )
     return None

@@ -16,6 +16,7 @@ from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
 from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.car import CarValues
 from vehest.data.splits import Split
+from vehest.estimators.base import Estimator, FitRecord
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.calibrate import plan_calibrate
@@ -42,7 +43,11 @@ class Member:
     @property
     def made(self) -> list[Artefact]:
         """What exists of it, in the order in which it was made."""
-        return [own for own in (self.model, self.calibration, self.evaluation) if own is not None]
+        return [
+            artefact
+            for artefact in (self.model, self.calibration, self.evaluation)
+            if artefact is not None
+        ]
 
 
 @dataclass(frozen=True)
@@ -64,14 +69,17 @@ class Group:
         return f"{label} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
 
     def run(self, should_stop: Callable[[], bool], on_progress: Report) -> list[Member]:
-        """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+        """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far,
+        marked as interrupted.
 
-        An artefact that another process is making is taken from it once it is done; those that no process makes come first.
+        An artefact that another process is making is taken from it once it is done; those that no
+        process makes come first.
 
-        On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
+        On one thread, that of matrix products included: recursions over small states gain nothing
+        from more, and groups run side by side.
         """
 
-        def made(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
+        def artefact_of(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
             if should_stop():
                 return None
             return self.existing(plan) or ensured(
@@ -83,7 +91,7 @@ class Group:
             models = {job.plan.key: self.existing(job.plan) for job in self.jobs}
             waiting = [job for job in self.jobs if models[job.plan.key] is None]
             while waiting and not should_stop():
-                with _held(waiting, should_stop, on_progress) as jobs:
+                with _locked(waiting, should_stop, on_progress) as jobs:
                     for job in jobs:
                         if STAGE in self.force:
                             drop_checkpoint(job.plan.checkpoint_folder)
@@ -103,14 +111,17 @@ class Group:
                 waiting = [job for job in waiting if job not in jobs]
             members = []
             for job in self.jobs:
-                with _compiled_by_one(job.plan.output, should_stop):
-                    members.append(_member(self, job, models[job.plan.key], made))
+                with _compile_lock(job.plan.output, should_stop):
+                    members.append(_member(self, job, models[job.plan.key], artefact_of))
             return members
 
     def existing(
         self, plan: StagePlan, warn: Callable[[str], None] = lambda text: None
     ) -> Artefact | None:
-        """The artefact of a plan, if it is there and not to be made anew; ``warn`` is told of a damaged one."""
+        """The artefact of a plan, if it is there and not to be made anew.
+
+        ``warn`` is told of a damaged one.
+        """
         return None if plan.stage in self.force else find(plan, warn)
 
 
@@ -128,19 +139,21 @@ def _member(
     group: Group,
     job: TrainJob,
     model: Artefact | None,
-    made: Callable[[StagePlan, Callable[[Path], None]], Artefact | None],
+    artefact_of: Callable[[StagePlan, Callable[[Path], None]], Artefact | None],
 ) -> Member:
-    """A member whose model is calibrated, then evaluated, as far as ``made`` gives artefacts."""
+    """A member whose model is calibrated, then evaluated, as far as ``artefact_of`` gives
+    artefacts.
+    """
     if model is None or model.status != "complete":
         return Member(job, model)
     calibration = evaluation = None
     calibrating = plan_calibrate(model, group.split, job.data, job.plan.output, group.cars)
     if calibrating is not None:
-        calibration = made(*calibrating)
+        calibration = artefact_of(*calibrating)
         if calibration is None:
             return Member(job, model)
     if group.evaluation is not None:
-        evaluation = made(*group.evaluation.of(model, calibration))
+        evaluation = artefact_of(*group.evaluation.of(model, calibration))
     return Member(
         job,
         model,
@@ -150,16 +163,16 @@ def _member(
     )
 
 
-def _compiled_by_one(
-    output: Path, should_stop: Callable[[], bool]
-) -> AbstractContextManager[object]:
-    """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
+def _compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
+    """While kernels of calibration and evaluation are not in the compile cache, one process
+    compiles them, and others wait for it.
+    """
     missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
     return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
 
 
 @contextmanager
-def _held(
+def _locked(
     jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_waiting: Callable[[Waiting], None]
 ) -> Iterator[list[TrainJob]]:
     """Hold the locks of those trainings that are free; where none is, wait for the first.
@@ -193,7 +206,12 @@ def _train(
         if record.interrupted and not record.metrics.get("best_epoch", 1):
             continue  # nothing learnt yet; the checkpoint knows where to go on
 
-        def write(folder: Path, job: TrainJob = job, estimator=estimator, record=record) -> Status:  # type: ignore[no-untyped-def]
+        def write(
+            folder: Path,
+            job: TrainJob = job,
+            estimator: Estimator = estimator,
+            record: FitRecord = record,
+        ) -> Status:
             write_model(job, estimator, record, folder)
             return "interrupted" if record.interrupted else "complete"
 

@@ -1,6 +1,7 @@
 """Finds a car's numbers on its drives with the self-calibrating filter, without any reference.
 
-drives, each from the filter's priors -> means and deviations at its end -> what the drives add to the priors, together -> `CarRecord`
+drives, each from the filter's priors -> means and deviations at its end -> what the drives add to
+the priors, together -> `CarRecord`
 """
 
 from __future__ import annotations
@@ -50,13 +51,20 @@ MEANINGS = {
     "compliance": "slip angle of the rear axle over its lateral acceleration",
     "grip": "lateral acceleration at the rear axle's limit",
 }
-AGREEMENT = 0.95
-"""Quantile of χ² within which the values of several drives count as those of one car; beyond it the number is not identified."""
-LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b and C
+AGREEMENT_QUANTILE = 0.95
+"""Quantile of χ² within which the values of several drives count as those of one car.
+
+Beyond it the number is not identified.
+"""
+# s: standard deviation of the yaw rate's lateness behind ay, which drives cannot distinguish from b
+# and C
+YAW_RATE_LATENESS_SECONDS = 0.03
 
 
 class Normal(NamedTuple):
-    """A number's mean and standard deviation, and what a yaw rate that is late by `LATENESS` adds to the mean."""
+    """A number's mean and standard deviation, and what a yaw rate that is late by
+    `YAW_RATE_LATENESS_SECONDS` adds to the mean.
+    """
 
     mean: Any
     deviation: Any
@@ -64,9 +72,11 @@ class Normal(NamedTuple):
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
-    """Run the filter that comes with vehest over drives of one car, and write the car's record, YAML; raises `VehestError`.
+    """Run the filter that comes with vehest over drives of one car, and write the car's record,
+    YAML; raises `VehestError`.
 
-    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter, ``estimator.KEY=VALUE``.
+    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter,
+    ``estimator.KEY=VALUE``.
     """
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
@@ -109,9 +119,9 @@ def in_words(record: CarRecord) -> TerminalTable:
     """A record for a terminal."""
     numbers = {name: getattr(record, name) for name in LIMITS}
     numbers |= {
-        f"offset of {channel}, {drive}": one
-        for drive, own in record.offsets.items()
-        for channel, one in own.items()
+        f"offset of {channel}, {drive}": number
+        for drive, numbers_of_drive in record.offsets.items()
+        for channel, number in numbers_of_drive.items()
     }
     car = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
     prior = prior_of(with_settings(SelfCalibrating.from_config({}), car))
@@ -120,45 +130,55 @@ def in_words(record: CarRecord) -> TerminalTable:
     rows = [
         (
             name,
-            f"{one.value:.4g}",
-            f"{one.deviation:.2g}",
+            f"{number.value:.4g}",
+            f"{number.deviation:.2g}",
             UNITS.get(name, "m/s²"),
-            _excitation(one.deviation, at_start[name]) if name in at_start else "",
-            ", ".join(one.identified_on) or "not identified",
+            _excitation(number.deviation, at_start[name]) if name in at_start else "",
+            ", ".join(number.identified_on) or "not identified",
             MEANINGS.get(name, "mean error of the accelerometer"),
         )
-        for name, one in numbers.items()
+        for name, number in numbers.items()
     ]
     heads = ("quantity", "value", "deviation", "unit", "seen", "identified on", "meaning")
     return TerminalTable("", heads, rows)
 
 
 def _excitation(deviation: float, at_start: float) -> str:
-    """How much the drives have excited a number: the share of the prior's variance that they removed."""
+    """How much the drives have excited a number: the share of the prior's variance that they
+    removed.
+    """
     return f"{100.0 * max(0.0, 1.0 - (deviation / at_start) ** 2):.0f} %"
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
-    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where it is too short or has gaps."""
+    """Numbers after a drive, grip by its logarithm, and mean offsets.
+
+    Raises
+    ------
+    DataError
+        It is too short or has gaps.
+    """
     drive = prepared_recording(model, recording)
     samples = np.column_stack([drive[name] for name in model.channels])
     if len(samples) < 2:
         raise DataError(f"recording '{recording.id}' is too short to identify anything")
     if not np.isfinite(samples).all():
         raise DataError(
-            f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them"
+            f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a "
+            "part without them"
         )
-    turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
+    turning = YAW_RATE_LATENESS_SECONDS * model.rate_hz * np.gradient(samples[:, 0])
     on_time, early, late = (
-        _found(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
+        _final_state(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]]))
         for shift in (0.0, turning, -turning)
     )
     return {
-        name: Normal(*own, (late[name][0] - early[name][0]) / 2.0) for name, own in on_time.items()
+        name: Normal(*normal, (late[name][0] - early[name][0]) / 2.0)
+        for name, normal in on_time.items()
     }
 
 
-def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
+def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
     """Means and deviations after samples of the model's channels, (T, C)."""
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
@@ -186,7 +206,10 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
 
 
 def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float]:
-    """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
+    """Of log a_max, over the filters that have one.
+
+    The bank resolves half a step between its limits.
+    """
     logs = np.log(model.grips)
     weights = np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
@@ -196,28 +219,38 @@ def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float
 
 
 def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
-    """The record of a car from `posterior_of` its drives; raises `DataError` where a number is not of a car."""
+    """The record of a car from `posterior_of` its drives.
+
+    Raises
+    ------
+    DataError
+        A number is not of a car.
+    """
     prior = prior_of(model)
-    found = {
-        name: together(prior[name], {drive: own[name] for drive, own in drives.items()})
+    combined = {
+        name: together(prior[name], {drive: numbers[name] for drive, numbers in drives.items()})
         for name in LIMITS
     }
-    grip = math.exp(found["grip"].value)
-    found["grip"] = Number(grip, grip * found["grip"].deviation, found["grip"].identified_on)
+    grip = math.exp(combined["grip"].value)
+    combined["grip"] = Number(
+        grip, grip * combined["grip"].deviation, combined["grip"].identified_on
+    )
     offsets = {
-        drive: {name: together(prior[name], {drive: own[name]}) for name in OFFSETS}
-        for drive, own in drives.items()
+        drive: {name: together(prior[name], {drive: numbers[name]}) for name in OFFSETS}
+        for drive, numbers in drives.items()
     }
-    return CarRecord(model.wheelbase, model.cg_to_rear_axle, **found, offsets=offsets)
+    return CarRecord(model.wheelbase, model.cg_to_rear_axle, **combined, offsets=offsets)
 
 
 def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
-    """The prior and what each drive adds to it, weighted by information; deviations hold the yaw rate's lateness, which drives share.
+    """The prior and what each drive adds to it, weighted by information; deviations hold the yaw
+    rate's lateness, which drives share.
 
-    The deviation grows where drives contradict each other, and where they do so beyond `AGREEMENT` none of them identifies the number.
+    The deviation grows where drives contradict each other, and where they do so beyond
+    `AGREEMENT_QUANTILE` none of them identifies the number.
     """
     mean, deviation, of_lateness = (
-        np.array([own for own in drives.values() if own.deviation < prior.deviation])
+        np.array([normal for normal in drives.values() if normal.deviation < prior.deviation])
         .reshape(-1, 3)
         .T
     )
@@ -228,14 +261,14 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     shares = deviation**-2.0 / total
     value = prior.mean + float(shares @ (mean - prior.mean))
     squares = float(np.sum(np.square((alone - value) / of_alone)))
-    others = max(len(alone) - 1, 1)
-    scatter = squares / others if len(alone) > 1 else 1.0
-    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT, others))
-    least = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
+    n_degrees = max(len(alone) - 1, 1)
+    scatter = squares / n_degrees if len(alone) > 1 else 1.0
+    agree = len(alone) < 2 or squares < float(chi2.ppf(AGREEMENT_QUANTILE, n_degrees))
+    max_deviation = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
     identified = tuple(
         drive
-        for drive, own in drives.items()
-        if agree and math.hypot(own.deviation, own.of_lateness) < least
+        for drive, normal in drives.items()
+        if agree and math.hypot(normal.deviation, normal.of_lateness) < max_deviation
     )
     return Number(
         value,
@@ -245,7 +278,9 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
 
 
 def without_prior(prior: Normal, posterior: Normal) -> tuple[Any, Any]:
-    """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation is below the prior's."""
+    """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation
+    is below the prior's.
+    """
     information = 1.0 / posterior.deviation**2 - 1.0 / prior.deviation**2
     return prior.mean + (
         posterior.mean - prior.mean

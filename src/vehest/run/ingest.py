@@ -1,16 +1,18 @@
 """First stage: raw files, or a simulation, to recordings in the store.
 
-data set -> its files, fetched where they are missing -> source -> recording -> checks -> one Parquet file each
+data set -> its files, fetched where they are missing -> source -> recording -> checks -> one
+Parquet file each
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from vehest.trust.health import SLOW_KERNEL, compile_health
 
 STAGE = "ingest"
 PARTS_PREFIX = ".parts-"
-LONGEST_ID = 200  # bytes
+MAX_ID_BYTES = 200  # bytes
 MAX_NAMES = 6  # of recordings in an error
 Report = Callable[
     [int, int, str], None
@@ -44,7 +46,13 @@ PROSE = frozenset(
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """The artefact of an ingest; raises `VehestError` where raw files are missing or the data set's configuration makes no sense."""
+    """The artefact of an ingest.
+
+    Raises
+    ------
+    VehestError
+        Raw files are missing or the data set's configuration makes no sense.
+    """
     dataset: Mapping[str, Any] = config["dataset"]
     if missing := missing_keys(dict(dataset)):
         raise ConfigurationError(
@@ -75,7 +83,8 @@ def write_ingest(
 ) -> None:
     """Read every recording, check it, and write it into ``folder``.
 
-    Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
+    Recordings of slow sources are made side by side and kept beside the artefacts until all are
+    done: an interrupted run goes on.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
@@ -90,9 +99,9 @@ def write_ingest(
     missing = [
         recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()
     ]
+    description = json.dumps(config["dataset"])
     tasks: list[Callable[..., None]] = [
-        partial(_make_part, dict(config["dataset"]), recording_id, parts)
-        for recording_id in missing
+        partial(_make_part, description, recording_id, parts) for recording_id in missing
     ]
     if min(jobs, len(tasks)) > 1 and has_to_compile(
         SLOW_KERNEL
@@ -125,25 +134,36 @@ def write_ingest(
 
 
 def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataError:
-    """The first failure with its recording, the names of other recordings that failed, and its exit code."""
-    (recording_id, first), *others = failures
+    """The first failure with its recording, the names of other recordings that failed, and its exit
+    code.
+    """
+    (recording_id, first), *further_failures = failures
     place = f"data set '{dataset}', recording '{recording_id}'"
     message = first.message if first.message.startswith(place) else f"{place}: {first.message}"
-    if others:
-        names = [f"'{name}'" for name, _ in others[:MAX_NAMES]]
-        more = ", …" if len(others) > MAX_NAMES else ""
-        message += f" (and {len(others)} more: {', '.join(names)}{more})"
+    if further_failures:
+        names = [f"'{name}'" for name, _ in further_failures[:MAX_NAMES]]
+        more = ", …" if len(further_failures) > MAX_NAMES else ""
+        message += f" (and {len(further_failures)} more: {', '.join(names)}{more})"
     error = DataError(message)
     error.exit_code = first.exit_code
     return error
 
 
-def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
-    _make(open_source(dataset), recording_id, parts)
+def _make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
+    _make(_opened(description), recording_id, parts)
+
+
+@lru_cache(maxsize=1)
+def _opened(description: str) -> Source:
+    """The source of a data set, opened once in a process: it checks all drives of the data set."""
+    return open_source(json.loads(description))
 
 
 def _make(source: Source, recording_id: str, folder: Path) -> None:
-    """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
+    """Read, check and write a recording.
+
+    Raises `DataError` where a check finds an error that the data set does not accept.
+    """
     recording = source.read(recording_id)
     refuse_errors(
         recording,
@@ -159,20 +179,32 @@ def parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store, by its id; raises `DataError` where that cannot be a file's name or would lead elsewhere."""
+    """The file of a recording in the store, by its id.
+
+    Raises
+    ------
+    DataError
+        That cannot be a file's name or would lead elsewhere.
+    """
     if (
         not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id)
-        or len(os.fsencode(recording_id)) > LONGEST_ID
+        or len(os.fsencode(recording_id)) > MAX_ID_BYTES
     ):
         raise DataError(
-            f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
-            f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
+            f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's "
+            "name in the store, "
+            f"of up to {MAX_ID_BYTES} bytes, without '/', '\\' and control characters, and no "
+            "hidden "
+            "one"
         )
     return f"{recording_id}.parquet"
 
 
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
-    """Configuration of a simulated data set's ingest; override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`."""
+    """Configuration of a simulated data set's ingest.
+
+    Override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`.
+    """
     spelt_out = [
         f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override
         for override in overrides
@@ -187,20 +219,27 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
 
 
 def outcome_of(ingested: Artefact) -> dict[str, Any]:
-    """Number and hours of drives, and names of those that span, left the road or ended before their manoeuvre did; raises `DataError`."""
+    """Number and hours of drives, and names of those that span, left the road or ended before their
+    manoeuvre did.
+
+    Raises `DataError`.
+    """
     drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
     flags = {drive.id: drive.provenance["flags"] for drive in drives}
     return {
         "drives": len(drives),
         "hours": sum(len(drive) / drive.rate_hz for drive in drives) / 3600.0,
-        "spun": [name for name, own in flags.items() if own["spun"]],
-        "left_road": [name for name, own in flags.items() if own["left_road"]],
-        "not_completed": [name for name, own in flags.items() if not own["completed"]],
+        "spun": [name for name, flag in flags.items() if flag["spun"]],
+        "left_road": [name for name, flag in flags.items() if flag["left_road"]],
+        "not_completed": [name for name, flag in flags.items() if not flag["completed"]],
     }
 
 
 def _datasets_with_download() -> list[str]:
-    """Names of the data sets whose files can be fetched; those whose configuration cannot be read are left out."""
+    """Names of the data sets whose files can be fetched.
+
+    Those whose configuration cannot be read are left out.
+    """
     names = []
     for name in choices("dataset"):
         with suppress(ConfigurationError):
@@ -210,15 +249,20 @@ def _datasets_with_download() -> list[str]:
 
 
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
-    """Fetch a data set's missing files and record or compare the others' checksums; raises as `Download.fetch`, or `ConfigurationError`."""
+    """Fetch a data set's missing files and record or compare the others' checksums.
+
+    Raises as `Download.fetch`, or `ConfigurationError`.
+    """
     from vehest.sources.download import download_of
 
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
-        others = ", ".join(_datasets_with_download()) or "none"
+        downloadable = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
-            f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"put them into its folder by hand, or declare download in its file; data sets that do: {others}"
+            f"data set '{source.name}' does not say where its files can be fetched from "
+            "(download); "
+            "put them into its folder by hand, or declare download in its file; data sets that "
+            f"do: {downloadable}"
         )
     download = download_of(source)
     if dry_run:
@@ -236,11 +280,10 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
             bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
 
         for file in download.fetch(progress):
-            went_on = f", went on after {file.resumed_at / 1e6:.1f} MB" if file.resumed_at else ""
             words = {
                 "matched": "is there, with the recorded checksum",
                 "recorded": f"was there; its checksum is now recorded: sha256 {file.sha256}",
-                "fetched": f"{file.size / 1e6:.1f} MB{went_on}, sha256 {file.sha256}",
+                "fetched": f"{file.size / 1e6:.1f} MB, sha256 {file.sha256}",
             }
             bars.close(f"download {file.name}")
             messages.line(

@@ -1,4 +1,6 @@
-"""Output of `vehest data list | show | check | usable`: data set or file -> recordings -> rows, and lines for a terminal."""
+"""Output of `vehest data list | show | check | usable`: data set or file -> recordings -> rows, and
+lines for a terminal.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +37,19 @@ from vehest.sources.signals import MISSING
 from vehest.sources.tabular import unused_columns
 
 # Time stamps between these count from 1970.
-EARLIEST_UNIX = 6e8  # s, in 1989
-LATEST_UNIX = 4e9  # s, in 2096
-MOST_COLUMNS = 40  # of a table that are listed
+MIN_UNIX_SECONDS = 6e8  # s, in 1989
+MAX_UNIX_SECONDS = 4e9  # s, in 2096
+MAX_LISTED_COLUMNS = 40  # of a table that are listed
 SPREAD = ("min", "mean", "max", "std")
 
 Lines = list[str | TerminalTable]
 
 
 def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
-    """Data sets with their files' presence, licences and citations: for JSON and for a terminal; why others cannot be listed."""
+    """Data sets with their files' presence, licences and citations: for JSON and for a terminal.
+
+    Why others cannot be listed.
+    """
     rows = []
     errors = []
     for name in choices("dataset"):
@@ -77,13 +82,19 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
 
 
 def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
-    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal; raises `VehestError`."""
+    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal.
+
+    Raises `VehestError`.
+    """
     with reading(source, overrides) as config:
         recordings = [_described(read()) for _, read in _readers(source, config)]
     lines: Lines = []
     for recording in recordings:
         period = _stretch(recording["start"], recording["end"])
-        about = f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, {period}"
+        about = (
+            f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, "
+            f"{recording['rate_hz']:g} Hz, {period}"
+        )
         rows = [
             [channel["name"], channel["unit"], *(f"{channel[key]:.4g}" for key in SPREAD)]
             for channel in recording["channels"]
@@ -97,7 +108,10 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
 
 
 def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], Lines]:
-    """Findings of the checks, for JSON and for a terminal; a recording that cannot be read is an error too."""
+    """Findings of the checks, for JSON and for a terminal.
+
+    A recording that cannot be read is an error too.
+    """
     rows: list[dict[str, str]] = []
     with reading(source, overrides) as config:
         for name, read in _readers(source, config):
@@ -131,7 +145,11 @@ def _missing_samples(recording: Recording) -> Iterator[Finding]:
 
 
 def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
-    """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal; raises `VehestError`."""
+    """Estimators that a data set or file can be used with, and missing channels: for JSON and for a
+    terminal.
+
+    Raises `VehestError`.
+    """
     with reading(source, overrides) as config:
         recordings = _contents(source, config)
         columns = unused_columns(
@@ -145,9 +163,12 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
     if missing:
         lines.append(f"missing channels that every score requires: {' and '.join(missing)}")
     if columns:
-        names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
+        names = ", ".join(columns[:MAX_LISTED_COLUMNS]) + (
+            ", …" if len(columns) > MAX_LISTED_COLUMNS else ""
+        )
         lines.append(
-            f"columns without a channel: {names}; if one of them is a missing channel, declare it in conf/dataset"
+            f"columns without a channel: {names}; if one of them is a missing channel, declare it "
+            "in conf/dataset"
         )
     plain = {
         "source": source,
@@ -162,7 +183,13 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
 
 @contextmanager
 def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
-    """The configuration that reads a data set or a file, while its limits hold; raises `ConfigurationError` where it is neither."""
+    """The configuration that reads a data set or a file, while its limits hold.
+
+    Raises
+    ------
+    ConfigurationError
+        It is neither.
+    """
     if source in choices("dataset"):
         config = compose_config("ingest", [f"dataset={source}", *overrides])
     elif os.path.lexists(source):  # also of a name that is too long or holds a null character
@@ -176,7 +203,10 @@ def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
 
 
 def _contents(source: str, config: Config) -> list[RecordingSummary]:
-    """Summaries of the recordings, from the store where they are ingested; of a slow source the first alone."""
+    """Summaries of the recordings, from the store where they are ingested.
+
+    Of a slow source the first alone.
+    """
     ingested = find(plan_ingest(config)) if source in choices("dataset") else None
     if ingested is not None:
         return [stored_summary(ingested.folder / file) for file in ingested.outputs]
@@ -185,7 +215,10 @@ def _contents(source: str, config: Config) -> list[RecordingSummary]:
 
 
 def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Recording]]]:
-    """Names of the recordings and functions that read them; from the store where a slow source is ingested."""
+    """Names of the recordings and functions that read them.
+
+    From the store where a slow source is ingested.
+    """
     if source not in choices("dataset"):
         yield Path(source).name, partial(read_single, config["dataset"], Path(source))
         return
@@ -229,9 +262,12 @@ def _spread(samples: FloatArray) -> dict[str, float]:
 
 def _stretch(start: float, end: float) -> str:
     """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
-    if not EARLIEST_UNIX < start < LATEST_UNIX:
+    if not MIN_UNIX_SECONDS < start < MAX_UNIX_SECONDS:
         return f"{start:.6g} s to {end:.6g} s"
-    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
+    return (
+        f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} "
+        "UTC on"
+    )
 
 
 def _is_here(dataset: dict[str, Any]) -> str:

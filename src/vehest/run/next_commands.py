@@ -1,4 +1,6 @@
-"""Commands that are printed to be pasted into a shell: they find the data and the results of the command that prints them."""
+"""Commands that are printed to be pasted into a shell: they find the data and the results of the
+command that prints them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def location_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def location_of_config(config: Config) -> list[str]:
-    """Overrides that say where a configuration reads and writes, where the environment says otherwise."""
+    """Overrides that say where a configuration reads and writes, where the environment says
+    otherwise.
+    """
     usual = {
         "root": os.environ.get("VEHEST_DATA"),
         "output": os.environ.get("VEHEST_OUTPUT", DEFAULT_OUTPUT),

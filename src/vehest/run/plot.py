@@ -15,8 +15,8 @@ from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
 from vehest.inference.reading import read_checked, without_references
 from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
+from vehest.report.drive_figure import drive_figure
 from vehest.report.style import MatplotlibFigure
-from vehest.run.estimate import estimate_file
 from vehest.run.estimate_tables import read_estimate_table
 
 
@@ -36,7 +36,9 @@ WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
 
 
 def check_plot_name(out: Path) -> None:
-    """Raise `ConfigurationError` where a picture cannot be written to a path, before it is drawn."""
+    """Raise `ConfigurationError` where a picture cannot be written to a path, before it is
+    drawn.
+    """
     if out.suffix.lower() not in WRITERS:
         raise ConfigurationError(
             f"'{out}': pictures are written as {', '.join(WRITERS)}; name such a file"
@@ -45,22 +47,20 @@ def check_plot_name(out: Path) -> None:
         raise ConfigurationError(f"'{out}' is a folder; name a file")
 
 
-def estimate_and_plot(
-    words: Sequence[str], out: Path, picture: Path | None, *, strict: bool, car: Path | None
-) -> dict[str, Any]:
-    """Estimate as `estimate_file` does; where a picture is named, draw what it wrote."""
-    if picture is None:
-        return estimate_file(words, out, strict=strict, car=car)
+def check_plot_of_estimate(out: Path, picture: Path) -> None:
+    """Raise `ConfigurationError` where an estimate at ``out`` cannot be drawn to a path."""
     check_plot_name(picture)
     if out.suffix.lower() != ".parquet":
         raise ConfigurationError(
             f"--plot needs the estimate as .parquet, which has its bands and health, not as '{out}'"
         )
-    outcome = estimate_file(words, out, strict=strict, car=car)
+
+
+def plot_estimate(words: Sequence[str], out: Path, picture: Path) -> None:
+    """Draw an estimate that `vehest.run.estimate.estimate_file` wrote from the same words."""
     has_model = len(words) > 1 and is_file_name(words[1])
     recording, *overrides = words[1:] if has_model else words
     plot_files([recording, str(out), *overrides], picture)
-    return outcome | {"plot": str(picture)}
 
 
 def plot_files(
@@ -92,7 +92,8 @@ def plot_files(
     recording = _with_references_if_any(recording_file, options)
     with use_limits(options.limits):
         estimates = [read_estimate_table(file, recording) for file in estimate_files]
-    content = WRITERS[out.suffix.lower()](recording.plot(*estimates, start=start, stop=stop))
+    figure = drive_figure(recording, estimates, start, stop)
+    content = WRITERS[out.suffix.lower()](figure)
     with written_aside(out) as aside:
         aside.write_bytes(content)
     return {

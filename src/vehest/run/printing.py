@@ -1,4 +1,5 @@
-"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard error.
+"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard
+error.
 
 outcome of a study -> `TerminalSummary`: tables, and figures as JSON -> `emit`
 """
@@ -45,7 +46,9 @@ class TerminalTable:
 
 @dataclass(frozen=True)
 class TerminalSummary:
-    """Tables of a study, a note below them (may be empty), the file of its report, and the figures of ``--json`` as JSON."""
+    """Tables of a study, a note below them (may be empty), the file of its report, and the figures
+    of ``--json`` as JSON.
+    """
 
     tables: tuple[TerminalTable, ...]
     note: str
@@ -58,49 +61,57 @@ class OutputClosed(Exception):
 
 
 def open_streams() -> None:
-    """Replace streams that were closed at the start by a null device; let the others show any character, as an escape if need be."""
+    """Replace streams that were closed at the start by a null device.
+
+    Let the others show any character, as an escape if need be.
+    """
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process lives)
+            mode = "r" if name == "stdin" else "w"
+            null_device = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 (never closed)
+            setattr(sys, name, null_device)
         elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key; raises `MissingError`."""
+def emit(as_json: bool, outcome: Any, lines: Iterable[str | TerminalTable] | None = None) -> None:
+    """Print the outcome of a command, as one JSON object or in lines and tables.
+
+    By default a line for each key; raises `MissingError`.
+    """
     if as_json:
         echo(as_json_text(outcome), keep="\n")
         return
-    if shown is None:
-        shown = (
+    if lines is None:
+        lines = (
             f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}"
             for key, value in outcome.items()
         )
-    for one in shown:
-        if isinstance(one, str):
-            echo(one)
+    for line in lines:
+        if isinstance(line, str):
+            echo(line)
         else:
-            _print_table(one)
+            _print_table(line)
 
 
-def _print_table(shown: TerminalTable) -> None:
+def _print_table(content: TerminalTable) -> None:
     """Print a table, 160 characters wide without a terminal; a title after an empty line."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
 
-    if shown.title:
+    if content.title:
         echo("")
-        echo(shown.title)
+        echo(content.title)
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
     table = Table(
-        *(Column(Text(printable(name))) for name in shown.header),
+        *(Column(Text(printable(name))) for name in content.header),
         box=None,
         header_style="bold",
         pad_edge=False,
     )
-    for row in shown.rows:
+    for row in content.rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     with console.capture() as captured:
         console.print(table)
@@ -110,7 +121,10 @@ def _print_table(shown: TerminalTable) -> None:
 
 
 def echo(text: str, keep: str = "") -> None:
-    """Print a line on standard output, control characters as escapes except for those in ``keep``; errors as of `emit`."""
+    """Print a line on standard output, control characters as escapes except for those in ``keep``.
+
+    Errors as of `emit`.
+    """
     try:
         typer.echo(printable(text, keep))
     except BrokenPipeError:
@@ -145,7 +159,10 @@ def finding_in_words(finding: Finding) -> str:
 
 
 def as_json_text(outcome: Any) -> str:
-    """An outcome as JSON; numbers that are not finite become null, unprintable characters their escapes."""
+    """An outcome as JSON.
+
+    Numbers that are not finite become null, unprintable characters their escapes.
+    """
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -177,7 +194,7 @@ def summary_of_leaderboard(
     tables = []
     notes = []
     for test_set, rows in board.groupby("test_set", sort=False):
-        given = (
+        remark = (
             " (estimates start at the reference state)"
             if (rows["start"] == "reference").any()
             else ""
@@ -192,11 +209,12 @@ def summary_of_leaderboard(
             )
             for row in rows.to_dict("records")
         ]
-        tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
+        tables.append(TerminalTable(f"{title}: test set '{test_set}'{remark}", header, cells))
         share = float(rows["share_below_min_speed"].iloc[0])
         if share > 0:
             notes.append(
-                f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the samples, where the car is slower than "
+                f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the "
+                "samples, where the car is slower than "
                 f"{rows['min_sideslip_speed'].iloc[0]}"
             )
         if rows["rmse_sideslip_low"].isna().all():
@@ -214,10 +232,10 @@ def _summary(
     left_out: Mapping[str, str],
 ) -> TerminalSummary:
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
-    shown = "\n".join([*notes, *missing, *figures.get("verdict", [])])
+    note = "\n".join([*notes, *missing, *figures.get("verdict", [])])
     return TerminalSummary(
         tuple(tables),
-        shown,
+        note,
         "report.html",
         json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})),
     )
@@ -231,7 +249,10 @@ def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
         kind.upper() if kind == "simulated" else kind
         for kind in dict.fromkeys(artefacts.part.kinds.values())
     )
-    title = f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
+    title = (
+        f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval "
+        f"(Student's t); {kinds} data"
+    )
     records = _records(artefacts.table)
     figures = {
         "chosen": next((row for row in records if row["chosen"]), None),

@@ -2,8 +2,9 @@
 
 output root -> artefacts, checkpoints, leftovers -> `unused_artefacts` -> `remove_unused`
 
-An artefact is listed if its code is not today's, if it is damaged, or if its inputs are not in the output root; trainings stay without
-their recordings, which can be made again. Only folders whose manifest gives their own name are artefacts; links are left alone.
+An artefact is listed if its code is not today's, if it is damaged, or if its inputs are not in the
+output root; trainings stay without their recordings, which can be made again. Only folders whose
+manifest gives their own name are artefacts; links are left alone.
 """
 
 from __future__ import annotations
@@ -38,13 +39,16 @@ LEFT_OVER = "left by a process that was killed"
 def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     """List everything in an output root that no current configuration can reuse, stage by stage.
 
-    Returns:
-        ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written to.
+    Returns
+    -------
+    list[dict[str, Any]]
+        ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written
+        to.
     """
     artefacts = _artefacts(output)
-    whole = [artefact for artefact in artefacts.values() if artefact is not None]
+    readable = [artefact for artefact in artefacts.values() if artefact is not None]
     present = {
-        digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())
+        digest for artefact in readable for digest in (artefact.digest, *artefact.outputs.values())
     }
     reasons = {
         folder: reason
@@ -54,7 +58,7 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     for folder in _entries(output / CHECKPOINTS):  # without a model its training may go on
         model = output / TRAIN / folder.name
         if model in reasons or any(
-            own.folder == model and own.status == "complete" for own in whole
+            artefact.folder == model and artefact.status == "complete" for artefact in readable
         ):
             reasons[folder] = SUPERFLUOUS
     for path in (
@@ -70,7 +74,10 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
 
 
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
-    """Remove files and folders, each renamed first so that no half is found; ``on_removed`` is called after each; raises `MissingError`."""
+    """Remove files and folders, each renamed first so that no half is found.
+
+    ``on_removed`` is called after each; raises `MissingError`.
+    """
     for path in paths:
         aside = aside_of(path)
         try:
@@ -85,19 +92,22 @@ def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> 
 
 def _artefacts(output: Path) -> dict[Path, Artefact | None]:
     """Artefacts whose manifest gives their own name; none where one is damaged otherwise."""
-    found: dict[Path, Artefact | None] = {}
+    artefacts: dict[Path, Artefact | None] = {}
     for folder in (folder for stage in VERSIONS for folder in _entries(output / stage)):
         with suppress(VehestError, KeyError, TypeError):
             manifest = read_json(folder / MANIFEST)
             named = (manifest["stage"], f"{manifest['label']}-{manifest['key'][:12]}")
             if named == (folder.parent.name, folder.name) and not (folder / MANIFEST).is_symlink():
-                found[folder] = None
-                found[folder] = read_artefact(folder, hash_files=False)
-    return found
+                artefacts[folder] = None
+                artefacts[folder] = read_artefact(folder, hash_files=False)
+    return artefacts
 
 
 def _reason(artefact: Artefact | None, present: set[str]) -> str:
-    """Why an artefact cannot be reused; empty where it can, and where its estimator or study is not installed."""
+    """Why an artefact cannot be reused.
+
+    Empty where it can, and where its estimator or study is not installed.
+    """
     if artefact is None:
         return DAMAGED
     if not artefact.code.startswith(f"{artefact.stage}="):  # of a vehest without versions
@@ -125,9 +135,9 @@ def _entries(place: Path) -> list[Path]:
 
 
 def _size_and_age(path: Path) -> dict[str, int]:
-    about = [one.lstat() for one in (path, *path.rglob("*"))]
-    size = sum(one.st_size for one in about if not stat.S_ISDIR(one.st_mode))
+    about = [entry.lstat() for entry in (path, *path.rglob("*"))]
+    size = sum(entry.st_size for entry in about if not stat.S_ISDIR(entry.st_mode))
     return {
         "bytes": size,
-        "seconds": round(max(0.0, time.time() - max(one.st_mtime for one in about))),
+        "seconds": round(max(0.0, time.time() - max(entry.st_mtime for entry in about))),
     }

@@ -1,10 +1,13 @@
-"""Compares published results with today's versions, configuration and raw files, without models or an output root.
+"""Compares published results with today's versions, configuration and raw files, without models or
+an output root.
 
-study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date, stale with its causes, or not known
+study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date,
+stale with its causes, or not known
 
-A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and raw files, which the keys of a study
-therefore hold instead. What of the configuration matters, each stage says for both (`training_options`, `evaluation_options`); titles and
-descriptions are in no key of a study.
+A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and
+raw files, which the keys of a study therefore hold instead. What of the configuration matters, each
+stage says for both (`training_options`, `evaluation_options`); titles and descriptions are in no
+key of a study.
 """
 
 from __future__ import annotations
@@ -17,17 +20,17 @@ from typing import Any
 from vehest.artefacts.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
 from vehest.configuration.composition import Config
 from vehest.configuration.files import find_pipeline, pipeline_names
-from vehest.data.errors import ConfigurationError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, MissingError, VehestError, abbreviated
 from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
 from vehest.data.text_files import read_yaml
 from vehest.data.transforms import Preparation
 from vehest.run.console import Messages
 from vehest.run.evaluate import evaluation_options
-from vehest.run.evaluate_faults import all_of, faults_of
+from vehest.run.evaluate_faults import faults_of, union_of_faults
 from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
-from vehest.run.runner import Runner
+from vehest.run.runner import Stages
 from vehest.run.signals import StopSignals
 from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
 from vehest.run.table_records import changes_of_tables
@@ -37,7 +40,7 @@ from vehest.run.versions import code_of, is_of_other_stages
 CODE = "code"
 DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
-MOST_NAMED = 6
+MAX_NAMED = 6
 STALE_LIST = "stale.yaml"
 """File in results/: studies that may still be stale, each with the reason and what will end it."""
 
@@ -46,11 +49,11 @@ def keys_of_study(
     study: Study,
     jobs: Jobs,
     absent: Collection[str],
-    runner: Runner,
+    stages: Stages,
     inputs: Mapping[str, Mapping[str, str]],
 ) -> Keys:
     """Keys of everything that determines the results of a study."""
-    ingests = _ingests(study, jobs, absent, runner)
+    ingests = _ingests(study, jobs, absent, stages)
     keys: Keys = {}
     for name, config in ingests.items():
         content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
@@ -63,20 +66,20 @@ def keys_of_study(
     for part in (name for name in study.parts if name not in absent):
         configs = [job.config for job in jobs[part]]
         keys |= {
-            f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs, runner)
+            f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs, stages)
         }
     return keys | {"report": {CODE: code_of("report", study.report)}}
 
 
 def _ingests(
-    study: Study, jobs: Jobs, absent: Collection[str], runner: Runner
+    study: Study, jobs: Jobs, absent: Collection[str], stages: Stages
 ) -> dict[str, Config]:
-    there = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
+    configs = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
-        return there
+        return configs
     return {
-        name: runner.dataset_config(name, config)
-        for config in there.values()
+        name: stages.dataset_config(name, config)
+        for config in configs.values()
         for name in dataset_names(config["split"])
     }
 
@@ -88,11 +91,11 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
     }
 
 
-def _of_jobs(configs: Sequence[Config], runner: Runner) -> Iterator[tuple[str, dict[str, str]]]:
+def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
-    faults = all_of(map(faults_of, configs))
-    protocol = runner.protocol(first, dataset_names(first["split"]))
+    faults = union_of_faults(map(faults_of, configs))
+    protocol = stages.protocol(first, dataset_names(first["split"]))
     rates = sorted({*map(estimator_rate, configs), protocol.rate_hz})
     preparation = changed_options(
         validated(Preparation, first["downsample"], "", error=ConfigurationError)
@@ -133,8 +136,7 @@ def in_words(verdict: Mapping[str, Any]) -> str:
     for cause in CAUSES:
         named = [change["what"] for change in verdict["changes"] if change["cause"] == cause]
         if named:
-            more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
-            words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
+            words.append(f"{cause} ({abbreviated(named, MAX_NAMED)})")
     may_be = verdict.get("may_be_stale")
     listed = f"may be until {may_be}" if may_be else ""
     failure = verdict["failure"] if may_be else ""
@@ -144,15 +146,24 @@ def in_words(verdict: Mapping[str, Any]) -> str:
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
+    """Compare the recorded keys of published studies with those of today's code, configuration and
+    raw files.
 
-    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each with ``what`` (``train ksnn``) and one of
-    `CAUSES`, and a ``note`` on what was not compared, or why the state is not known.
-    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
+    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
+    with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
+    why the state is not known.
+
+    Raises
+    ------
+    ConfigurationError
+        An override that would change results.
+    MissingError
+        A name of no pipeline or published study.
     """
     if content_overrides(overrides):
         raise ConfigurationError(
-            f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides"
+            f"'{content_overrides(overrides)[0]}' changes the results, which are published without "
+            "overrides"
         )
     published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
     if not (names or published):
@@ -170,10 +181,12 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
 
 
 def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Compare all published studies as `check_published`, and those that are not up to date with the list of those that may be stale.
+    """Compare all published studies as `check_published`, and those that are not up to date with
+    the list of those that may be stale.
 
-    Returns the same, each with ``failure``, empty for a study as it should be. A listed study with keys of other stages than today's, or
-    without keys, is stale without a look at its configuration, which takes a minute for all.
+    Returns the same, each with ``failure``, empty for a study as it should be. A listed study with
+    keys of other stages than today's, or without keys, is stale without a look at its
+    configuration, which takes a minute for all.
     """
     reasons = _stale_list()
     verdicts = []
@@ -188,8 +201,8 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
                 _outcome(study, "not known", note="published before keys were recorded")
             )
         elif changes := [
-            (what, CODE)
-            for what, entry in published.keys.items()
+            (name, CODE)
+            for name, entry in published.keys.items()
             if is_of_other_stages(entry.get(CODE, ""))
         ]:
             verdicts.append(_outcome(study, "stale", changes))
@@ -215,7 +228,10 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
 
 
 def _stale_list() -> dict[str, str]:
-    """Study -> why it may still be stale; raises `ConfigurationError` for anything but text by study."""
+    """Study -> why it may still be stale.
+
+    Raises `ConfigurationError` for anything but text by study.
+    """
     file = RESULTS / STALE_LIST
     content = read_yaml(file) if file.is_file() else {}
     if not isinstance(content, dict) or not all(
@@ -282,30 +298,33 @@ def _outcome(
     return {
         "study": study,
         "state": state,
-        "changes": [{"what": what, "cause": cause} for what, cause in changes],
+        "changes": [{"what": name, "cause": cause} for name, cause in changes],
         "note": note,
         "n_not_trained": n_not_trained,
     }
 
 
 def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when results were published and its cause; a note on what was not compared."""
-    runner = Runner(
+    """Pairs of what differs from when results were published and its cause.
+
+    A note on what was not compared.
+    """
+    stages = Stages(
         Path(str(next(iter(jobs.values()))[0].config["output"])),
         Messages(quiet=True),
         StopSignals(),
     )
-    ingests = _ingests(study, jobs, published.absent, runner)
+    ingests = _ingests(study, jobs, published.absent, stages)
     inputs = {}
     for name, config in ingests.items():
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
-    today = keys_of_study(study, jobs, published.absent, runner, inputs)
+    today = keys_of_study(study, jobs, published.absent, stages, inputs)
     changes = changed_keys(published.keys, today)
     parts = _firsts(study, jobs)
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):
-            runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
+            stages.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
             changes.append((f"{name}, which was not here", DATA))
     return changes, f"data not checked, raw files not here: {', '.join(missing)}" if missing else ""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import math
 import subprocess
 from collections.abc import Mapping
@@ -18,10 +17,10 @@ from pathlib import Path
 from vehest.artefacts.artefact import TIMINGS, Artefact
 from vehest.artefacts.keys import Keys, changed_keys
 from vehest.artefacts.locks import Lock, held
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, abbreviated
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
-from vehest.data.text_files import read_json
+from vehest.data.text_files import read_json, write_json
 from vehest.run.console import Messages
 
 RESULTS = Path("results")
@@ -70,7 +69,12 @@ class Published:
 def published_in(folder: Path) -> Published | None:
     """Read the record of a published study; none where nothing is published.
 
-    Raises `DataError` or `ConfigurationError` where the record is damaged.
+    Raises
+    ------
+    DataError
+        The record is damaged.
+    ConfigurationError
+        The record is damaged.
     """
     path = folder / PROVENANCE
     if not path.is_file():
@@ -81,14 +85,21 @@ def published_in(folder: Path) -> Published | None:
 def publish_study(
     publication: Publication | None, report: Artefact, messages: Messages
 ) -> Path | None:
-    """Copy a study's report without pages and times to results/STUDY, with keys in its provenance; returns the folder, if it is published.
+    """Copy a study's report without pages and times to results/STUDY, with keys in its provenance;
+    returns the folder, if it is published.
 
     CSV files are published with six significant digits (`published_content`).
 
     A published report stays that shows data which this run could not read, or more trainings with
     the same keys. Where keys and all other files are the same, the provenance stays that of the
     first run with these results.
-    Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds something else or is reached by a link.
+
+    Raises
+    ------
+    MissingError
+        It cannot be written.
+    ConfigurationError
+        The folder holds something else or is reached by a link.
     """
     if publication is None:
         return None
@@ -118,8 +129,9 @@ def publish_study(
 
 
 def uncommitted_changes() -> str:
-    """Files that determine results and differ from the last commit, in words; empty where there are none, or no git
-    checkout."""
+    """Files that determine results and differ from the last commit, in words; empty where there are
+    none, or no git checkout.
+    """
     command = ["git", "status", "--porcelain", "--untracked-files=all", "--", *SOURCES_OF_RESULTS]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
@@ -130,12 +142,16 @@ def uncommitted_changes() -> str:
     files = [line[3:] for line in result.stdout.splitlines()]
     if not files:
         return ""
-    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
-    return f"the work tree has changes that are not committed ({', '.join(files[:3])}{more}); commit them and run it again"
+    return (
+        f"the work tree has changes that are not committed ({abbreviated(files, 3)}); "
+        "commit them and run it again"
+    )
 
 
 def check_results_folder(folder: Path) -> None:
-    """Raise `ConfigurationError` where a study cannot be published in a folder: it is reached by a link, or holds something else."""
+    """Raise `ConfigurationError` where a study cannot be published in a folder: it is reached by a
+    link, or holds something else.
+    """
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(
             f"'{folder}' leads elsewhere through a link; remove the link or set publish: false"
@@ -146,7 +162,8 @@ def check_results_folder(folder: Path) -> None:
     names = {file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()}
     if PROVENANCE not in names and names - {PUBLISHED_WEIGHTS}:
         raise ConfigurationError(
-            f"'{folder}' holds files that vehest did not publish; move them away or set publish: false"
+            f"'{folder}' holds files that vehest did not publish; move them away or set publish: "
+            "false"
         )
 
 
@@ -169,10 +186,10 @@ def _is_published(report: Artefact, folder: Path, publication: Publication) -> b
         for file in folder.rglob("*")
         if file.is_file()
     }
-    needed = {
+    expected = {
         name: hashlib.sha256(content).hexdigest() for name, content in _contents(report).items()
     }
-    return {**present, PROVENANCE: ""} == {**needed, PROVENANCE: ""}
+    return {**present, PROVENANCE: ""} == {**expected, PROVENANCE: ""}
 
 
 def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
@@ -184,15 +201,13 @@ def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
         about = {**read_json(report.folder / PROVENANCE), "keys": publication.keys}
         if publication.n_not_trained:
             about["n_not_trained"] = publication.n_not_trained
-        (aside / PROVENANCE).write_text(
-            json.dumps(about, indent=1, ensure_ascii=False) + "\n",
-            encoding="utf-8",
-            errors="backslashreplace",
-        )
+        write_json(aside / PROVENANCE, about)
 
 
 def published_content(file: Path) -> bytes:
-    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits, which other machines reproduce."""
+    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits,
+    which other machines reproduce.
+    """
     if file.suffix != ".csv":
         return file.read_bytes()
     text = io.StringIO(newline="")
@@ -209,5 +224,7 @@ def _rounded(cell: str) -> str:
         value = float(cell)
     except ValueError:
         return cell
-    kept = "." not in cell or len(cell) <= DIGITS or not math.isfinite(value) or value.is_integer()
-    return cell if kept else repr(float(f"{value:.{DIGITS}g}"))
+    is_short = (
+        "." not in cell or len(cell) <= DIGITS or not math.isfinite(value) or value.is_integer()
+    )
+    return cell if is_short else repr(float(f"{value:.{DIGITS}g}"))

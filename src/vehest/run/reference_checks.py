@@ -1,4 +1,6 @@
-"""Findings about references, which estimators are trained on and scored against: a wrong one makes every score wrong."""
+"""Findings about references, which estimators are trained on and scored against: a wrong one makes
+every score wrong.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,16 @@ from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.recording import Recording
 
 CHECKS_OF_SIGNS_AND_UNITS = ("impossible", "sign", "unit", "stuck")
-"""What concerns how a channel was written; that a reference departs from the kinematics is for `vehest data check` to say."""
+"""What concerns how a channel was written.
+
+That a reference departs from the kinematics is for `vehest data check` to say.
+"""
 
 
 def reference_findings(recording: Recording) -> Iterator[Finding]:
-    """Findings that a reference of a recording has another sign or unit, is stuck or impossible, accepted errors included."""
+    """Findings that a reference of a recording has another sign or unit, is stuck or impossible,
+    accepted errors included.
+    """
     if any(name.endswith(REFERENCE_SUFFIX) for name in recording.channels):
         for finding in checks_of_recording(recording):
             concerned = (finding.channel, *finding.suspects)

@@ -29,7 +29,7 @@ from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import describe_band, is_other_vehicle
 
-SAME_RATE = 1e-6
+MAX_RATE_DIFFERENCE = 1e-6
 
 
 def replay_log(
@@ -51,7 +51,10 @@ def replay_log(
     write_dbc: Path | None = None,
     quiet: bool = True,
 ) -> dict[str, Any]:
-    """Replay a log and let a model estimate; returns its figures. The options are those of ``vehest replay``; raises `VehestError`."""
+    """Replay a log and let a model estimate.
+
+    Returns its figures. The options are those of ``vehest replay``; raises `VehestError`.
+    """
     bus = Bus(interface, channel, _speed(speed))
     estimates = EstimateFrames(_identifier(identifier))
     if bus.speed is None and interface != "virtual":
@@ -73,18 +76,18 @@ def replay_log(
     elsewhere = is_other_vehicle(trust, vehicle, options.same_vehicle, car)
     band = describe_band(trust, vehicle, options.same_vehicle, car)
     with use_limits(options.limits):
-        wanted = _signals(options.dataset if dataset else None, dbc, signals, fitted)
+        bus_signals = _signals(options.dataset if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
-        timing = survey(frames, wanted, bus_rate)
+        timing = survey(frames, bus_signals, bus_rate)
         faster = (
             timing.rate_hz
-            if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE
+            if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > MAX_RATE_DIFFERENCE
             else None
         )
         if write_dbc is not None:
             write_dbc_file(write_dbc, estimates.identifiers[0])
         view = View(None if quiet else sys.stderr)
-        figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(
+        figures = Replay(frames, bus_signals, timing, bus, estimates, stopped).run(
             lambda clock: GuardedStepper(fitted, trust, faster, elsewhere=elsewhere, clock=clock),
             out,
             view,
@@ -106,7 +109,9 @@ def replay_log(
 def _signals(
     described: Mapping[str, Any] | None, dbc: Path | None, signals: str, model: Estimator
 ) -> BusSignals:
-    """The signals of a model's channels: from the configuration of a data set, if any, or by their names in a DBC."""
+    """The signals of a model's channels: from the configuration of a data set, if any, or by their
+    names in a DBC.
+    """
     named = [word for word in signals.split(",") if word.strip()]
     if described is not None:
         if named:

@@ -1,12 +1,12 @@
 """Last stage: evaluations, or recordings alone, to tables, figures and pages.
 
-comparisons, data sets -> StudyArtefacts -> the study's module -> report.md, report.html, tables, figures, metrics.csv
-comparison of a sweep -> table of jobs -> SweepArtefacts -> `vehest.studies.sweep` -> report.md, sweep.csv, summary.csv, heat maps
+comparisons, data sets -> StudyArtefacts -> the study's module -> report.md, report.html, tables,
+figures, metrics.csv comparison of a sweep -> table of jobs -> SweepArtefacts ->
+`vehest.studies.sweep` -> report.md, sweep.csv, summary.csv, heat maps
 """
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -21,11 +21,12 @@ from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, provenance
 from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import VALIDATION
+from vehest.data.text_files import write_json
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
-from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
+from vehest.run.evaluate import METRICS, read_metrics, scored_spans
 from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
@@ -40,7 +41,7 @@ from vehest.run.publishing import PROVENANCE, PUBLISHED_WEIGHTS
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, write_trials
 from vehest.run.study import Study
-from vehest.run.train import read_fit_metrics, recording_file
+from vehest.run.train import read_fit_metrics, stored_recording
 from vehest.run.training_differences import difference_suffix, difference_text
 from vehest.run.versions import code_of
 from vehest.run.weights import (
@@ -56,8 +57,10 @@ from vehest.studies.artefacts import (
     StoredDataset,
     StudyArtefacts,
     Trial,
+    nominal_rows,
     of_parts,
     read_frame,
+    write_frame,
 )
 from vehest.studies.kit.timings import timings_of_study
 from vehest.studies.reference_minutes import start_in_words
@@ -78,32 +81,34 @@ def draw_report(
     trials: Sequence[Trial] = (),
     search_remarks: Sequence[str] = (),
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent.
+    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a
+    comparison are named as absent.
 
-    Trials of searches are in no part, so that a report is the same whether they were trained here or published before. The weights of an
-    incomplete study include all that were published before, so that no training is lost.
+    Trials of searches are in no part, so that a report is the same whether they were trained here
+    or published before. The weights of an incomplete study include all that were published before,
+    so that no training is lost.
     """
     is_complete = not any(part.unfinished for part in comparisons.values())
     comparisons = {name: part for name, part in comparisons.items() if name not in study.trials}
-    shown = {name: part for name, part in comparisons.items() if part.members}
+    drawn = {name: part for name, part in comparisons.items() if part.members}
     left_out = {
-        name_in_part(part_name, name, shown): reason
-        for part_name, part in shown.items()
+        name_in_part(part_name, name, drawn): reason
+        for part_name, part in drawn.items()
         for name, reason in part.failed.items()
         if reason != NOT_TRAINED  # the run prints how many these are
     }
-    shown_parts = [name for name in study.parts if name not in study.trials]
+    drawn_parts = [name for name in study.parts if name not in study.trials]
     artefacts = StudyArtefacts(
         study=study.study,
         title=study.title,
         about=study.about,
         command=study.command,
-        titles={name: study.parts[name].title for name in shown_parts},
+        titles={name: study.parts[name].title for name in drawn_parts},
         parts={
             name: _part_artefacts(study, study.parts[name].title, part)
-            for name, part in shown.items()
+            for name, part in drawn.items()
         },
-        absent=[name for name in shown_parts if name not in comparisons],
+        absent=[name for name in drawn_parts if name not in comparisons],
         not_trained={
             name: part.unfinished for name, part in comparisons.items() if part.unfinished
         },
@@ -142,21 +147,21 @@ def draw_report(
         if study.datasets and artefact.stage == INGEST
     ]
     inputs = {artefact.label: artefact.digest for artefact in ingested}
-    for name, part in shown.items():
-        made = [own for member in part.members for own in member.made]
+    for name, part in drawn.items():
+        artefacts_of_part = [artefact for member in part.members for artefact in member.made]
         inputs |= {
             f"{name}: {artefact.label}" if name else artefact.label: artefact.digest
-            for artefact in made
+            for artefact in artefacts_of_part
         }
     models = [
         member.model
-        for part in shown.values()
+        for part in drawn.values()
         for member in part.members
         if member.model is not None
     ]
 
     def write(folder: Path) -> None:
-        _write(artefacts, study.report, _recordings(shown, ingested), folder)
+        _write(artefacts, study.report, _recordings(drawn, ingested), folder)
         if trials:
             write_trials(trials, folder / SEARCHES)
         if study.publish and models:
@@ -183,9 +188,11 @@ def draw_report(
 def _write(
     artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path
 ) -> None:
-    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a comparison metrics.csv and timings.csv.
+    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a
+    comparison metrics.csv and timings.csv.
 
-    On one thread, as groups are trained, so that it has the same last digits whether trainings came before or not.
+    On one thread, as groups are trained, so that it has the same last digits whether trainings came
+    before or not.
     """
     from vehest.report.document import write_documents
 
@@ -204,13 +211,11 @@ def _write(
         )
     if artefacts.parts:
         table = artefacts.metrics
-        kept = getattr(module, "METRICS", None)
-        if kept is not None:
-            table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
+        metric_names = getattr(module, "METRICS", None)
+        if metric_names is not None:
+            table = table[table["metric"].isin(metric_names) & (table["subset"] == "all")]
         for file, written in ((METRICS, table), (TIMINGS, of_parts(timings))):
-            written.to_csv(
-                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
-            )
+            write_frame(written, folder / file)
     kinds = {name: kind for part in artefacts.parts.values() for name, kind in part.kinds.items()}
     about = provenance()
     about |= {
@@ -221,26 +226,24 @@ def _write(
         "kinds": kinds | {dataset.name: dataset.kind for dataset in artefacts.datasets},
         "recordings": recordings,
     }
-    (folder / PROVENANCE).write_text(
-        json.dumps(about, indent=1, ensure_ascii=False) + "\n",
-        encoding="utf-8",
-        errors="backslashreplace",
-    )
+    write_json(folder / PROVENANCE, about)
 
 
 def _recordings(
     comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]
 ) -> dict[str, str]:
-    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate, or shown."""
-    found = {}
+    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate,
+    or shown.
+    """
+    digests = {}
     for part in comparisons.values():
         for span in scored_spans(part.evaluation.split):
             outputs = part.evaluation.references[span.dataset].outputs
-            found[f"{span.dataset}/{span.recording}"] = outputs[f"{span.recording}.parquet"]
-    return found | {
-        f"{own.label}/{Path(name).stem}": digest
-        for own in ingested
-        for name, digest in own.outputs.items()
+            digests[f"{span.dataset}/{span.recording}"] = outputs[f"{span.recording}.parquet"]
+    return digests | {
+        f"{artefact.label}/{Path(name).stem}": digest
+        for artefact in ingested
+        for name, digest in artefact.outputs.items()
     }
 
 
@@ -253,7 +256,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         estimator = new_estimator(member.job.estimator)
         differences = part.differences.get(member.job.plan.key, {})
         variant = estimator.variant + difference_suffix(differences)
-        tables.append(_table_of(member.evaluation.folder, METRICS).assign(variant=variant))
+        tables.append(read_metrics(member.evaluation.folder).assign(variant=variant))
         models.append(
             EvaluatedModel(
                 estimator=estimator.name,
@@ -284,7 +287,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
         metrics=_together(tables, study.study),
         models=models,
         references={
-            (s.dataset, s.recording): recording_file(e.references[s.dataset], s)
+            (s.dataset, s.recording): stored_recording(e.references, s)
             for s in (*e.split.train, *scored_spans(e.split))
         },
         facts=part.facts,
@@ -293,7 +296,9 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
 
 
 def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedModel]:
-    """Models in which estimators that share a title have their variant behind it, so that tables, legends and verdicts distinguish them."""
+    """Models in which estimators that share a title have their variant behind it, so that tables,
+    legends and verdicts distinguish them.
+    """
     names: dict[str, set[tuple[str, str]]] = {}
     for model in models:
         names.setdefault(model.title, set()).add(model.name)
@@ -306,25 +311,24 @@ def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedMode
 
 
 def _timings_of(part: PartArtefacts) -> pd.DataFrame:
-    """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s]; in no published file."""
+    """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s].
+
+    In no published file.
+    """
     tables = []
     for model in part.models:
-        own = _table_of(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
+        times = read_metrics(model.evaluation_folder, TIMINGS).assign(variant=model.variant)
         fit = {
             name: value
             for name, value in read_fit_metrics(model.model_folder).items()
             if name.endswith("_seconds")
         }
-        phases = {name: value for name, value in fit.items() if name not in set(own["metric"])}
+        phases = {name: value for name, value in fit.items() if name not in set(times["metric"])}
         tables += [
-            own,
-            *(own.head(1).assign(metric=name, value=value) for name, value in phases.items()),
+            times,
+            *(times.head(1).assign(metric=name, value=value) for name, value in phases.items()),
         ]
     return _together(tables, part.study)
-
-
-def _table_of(evaluation: Path, file: str) -> pd.DataFrame:
-    return read_frame(evaluation / file, COLUMNS, numbers=("value",))
 
 
 def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
@@ -334,7 +338,10 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
 def draw_sweep(
     study: Study, comparison: Comparison, runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
+    """Draw a sweep, unless its report is there, and sum it up for the terminal.
+
+    A failed job has a row with its reason.
+    """
     configs = [job.config for job in comparison.jobs if "estimator" in job.config]
     conditions = dict.fromkeys(
         fault.condition for config in configs if (fault := chosen_fault(config)) is not None
@@ -347,11 +354,11 @@ def draw_sweep(
     part = _part_artefacts(study, "", comparison)
     part = replace(part, facts=[*part.facts, *under])
     artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
-    made = [
-        own
+    artefacts_of_jobs = [
+        artefact
         for member in comparison.members
-        for own in (member.model, member.evaluation)
-        if own is not None
+        for artefact in (member.model, member.evaluation)
+        if artefact is not None
     ]
     plan = StagePlan(
         stage=SWEEP,
@@ -368,7 +375,10 @@ def draw_sweep(
             "data_titles": part.data_titles,
             "facts": part.facts,
         },
-        inputs={f"{own.stage}/{own.folder.name}": own.digest for own in made},
+        inputs={
+            f"{artefact.stage}/{artefact.folder.name}": artefact.digest
+            for artefact in artefacts_of_jobs
+        },
         code=code_of(SWEEP),
         output=runner.output,
     )
@@ -378,9 +388,7 @@ def draw_sweep(
 
         write_document(build(artefacts), folder, page=False)
         for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", artefacts.table)):
-            written.to_csv(
-                folder / file, index=False, lineterminator="\n", errors="backslashreplace"
-            )
+            write_frame(written, folder / file)
 
     return runner.ensure(plan, write), summary_of_sweep(artefacts)
 
@@ -393,7 +401,7 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
         member = (
             None
             if job.failure is not None or job.training is None
-            else comparison.found.get(job.training.plan.key)
+            else comparison.finished.get(job.training.plan.key)
         )
         title = (
             new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""
@@ -403,8 +411,6 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
             "title": title,
             **job.values,
             "seed": job.config["seed"],
-        }
-        row |= {
             "status": DONE if member else FAILED,
             "error": job.failure.message if job.failure is not None else "",
         }
@@ -415,13 +421,16 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
 def _figures(
     member: Member | None, sets: Sequence[str], fault: FaultSettings | None
 ) -> dict[str, Any]:
-    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one; NaN where it failed."""
+    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one.
+
+    NaN where it failed.
+    """
     columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(["n_parameters", "epochs", *columns], float("nan"))
-    table = _table_of(member.evaluation.folder, METRICS)
-    nominal = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
-    own = {
+    table = read_metrics(member.evaluation.folder)
+    nominal = nominal_rows(table)
+    figures = {
         metric: float(nominal.loc[nominal["metric"] == metric, "value"].iloc[0])
         for metric in ("n_parameters", "epochs")
     }
@@ -430,11 +439,11 @@ def _figures(
         if fault is None
         else table[(table["subset"] == FAULTED) & (table["condition"] == fault.condition)]
     )
-    found = dict(
+    scores = dict(
         zip(scored["metric"] + "." + scored["test_set"], map(float, scored["value"]), strict=True)
     )
     return {
-        **own,
-        **{column: found.get(column, float("nan")) for column in columns},
+        **figures,
+        **{column: scores.get(column, float("nan")) for column in columns},
         "model": member.model.folder.name,
     }

@@ -1,9 +1,12 @@
-"""Remembers the keys of a finished study or sweep, so that it is recognised without the libraries that compute them.
+"""Remembers the keys of a finished study or sweep, so that it is recognised without the libraries
+that compute them.
 
-command, environment, files that determine keys -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
+command, environment, files that determine keys -> `RunCache.load` -> Record -> printed; finished
+run -> `RunCache.save`
 
-A record in the output root holds a hash of these inputs, the key of each artefact and the printed summary. Inputs that are unchanged
-have unchanged keys, and `valid_artefact` decides by them; otherwise the study runs in full, which computes the keys.
+A record in the output root holds a hash of these inputs, the key of each artefact and the printed
+summary. Inputs that are unchanged have unchanged keys, and `valid_artefact` decides by them;
+otherwise the study runs in full, which computes the keys.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from vehest.data.files import (
     written_aside,
 )
 from vehest.data.schema import validated
-from vehest.data.text_files import read_json, read_yaml
+from vehest.data.text_files import read_json, read_yaml, write_json
 from vehest.run.console import REUSED, WARNING, Messages
 from vehest.run.launchers.base import RunOptions
 from vehest.run.printing import TerminalSummary
@@ -76,12 +79,18 @@ class Record:
 class RunCache:
     """The record of one command.
 
-    Args:
-        name: of the pipeline, or its path; of the sweep, if it was given.
+    Parameters
+    ----------
+    name : str
+        Of the pipeline, or its path; of the sweep, if it was given.
 
-    Attributes:
-        file: of the record; none where the output root depends on more than overrides and environment.
-        inputs: hash of the command, files and variables that determine keys, but raw files; empty if these are not all that does.
+    Attributes
+    ----------
+    file
+        Of the record; none where the output root depends on more than overrides and environment.
+    inputs
+        Hash of the command, files and variables that determine keys, but raw files; empty if these
+        are not all that does.
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
@@ -95,16 +104,18 @@ class RunCache:
         ]
         root = named[-1] if named else os.environ.get("VEHEST_OUTPUT", "outputs")
         plain = root and not re.search(r"[\\'\"${},=()\[\]]", root)
-        own = hashlib.sha256(json.dumps(self._words).encode()).hexdigest()[:12]
+        digest = hashlib.sha256(json.dumps(self._words).encode()).hexdigest()[:12]
         self.file = (
-            Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{own}.json")
+            Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{digest}.json")
             if plain
             else None
         )
         self.inputs = self._inputs()
 
     def load(self) -> tuple[Record, list[Artefact]] | None:
-        """The finished study and its artefacts, if nothing has changed since and all of it is there."""
+        """The finished study and its artefacts, if nothing has changed since and all of it is
+        there.
+        """
         if self.file is None or not self.file.is_file():
             return None
         output = self.file.parents[1]
@@ -126,15 +137,21 @@ class RunCache:
         return (record, artefacts) if is_complete else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
-        """The finished study, notes printed first, published as a run in full would; none without a valid record, or under force."""
-        found = None if options.force else self.load()
-        if found is None:
+        """The finished study, notes printed first, published as a run in full would.
+
+        None without a valid record, or under force.
+        """
+        finished = None if options.force else self.load()
+        if finished is None:
             return None
-        (record, (*made, report)) = found
+        (record, (*artefacts, report)) = finished
         messages = Messages(quiet=options.quiet)
         for line in (
             *record.notes,
-            *((REUSED, own.stage, own.label, "up to date") for own in (*made, report)),
+            *(
+                (REUSED, artefact.stage, artefact.label, "up to date")
+                for artefact in (*artefacts, report)
+            ),
         ):
             messages.line(*line)
         published = None if options.dry_run else publish_study(record.publication, report, messages)
@@ -149,7 +166,10 @@ class RunCache:
         raw: dict[str, str],
         publication: Publication | None,
     ) -> None:
-        """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: stamps from before reading."""
+        """Record a finished study, unless runs are left to track or files changed meanwhile.
+
+        ``raw``: stamps from before reading.
+        """
         tracker = runner.tracker
         output = runner.output
         if (
@@ -160,13 +180,20 @@ class RunCache:
             or self._inputs() != self.inputs
         ):
             return
-        made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
+        artefacts = [
+            *(
+                artefact
+                for artefact in runner.artefacts.values()
+                if artefact.folder != report.folder
+            ),
+            report,
+        ]
         record = Record(
             inputs=self.inputs,
             raw=raw,
             made=tuple(
                 (artefact.folder.relative_to(output).as_posix(), artefact.key, artefact.digest)
-                for artefact in made
+                for artefact in artefacts
             ),
             notes=tuple(
                 line
@@ -180,9 +207,7 @@ class RunCache:
         try:
             remove_leftovers(self.file.parent)
             with written_aside(self.file) as aside:
-                aside.write_text(
-                    json.dumps(asdict(record), indent=1, ensure_ascii=False), encoding="utf-8"
-                )
+                write_json(aside, asdict(record))
         except VehestError as error:
             runner.messages.warn(f"{error}; the next run looks at everything again")
 
@@ -212,15 +237,17 @@ def _configuration(pipeline: str) -> Iterator[Path]:
     """Files of the configuration and of the pipeline, with the one that it is based on."""
     for folder in [*conf_folders(), packaged("pipelines")]:
         yield from sorted(folder.rglob("*.yaml"))
-    own = find_pipeline(pipeline) if pipeline else None
-    if own is not None:
-        content = read_yaml(own)
+    pipeline_file = find_pipeline(pipeline) if pipeline else None
+    if pipeline_file is not None:
+        content = read_yaml(pipeline_file)
         base = find_pipeline(str(content.get("based_on"))) if isinstance(content, dict) else None
-        yield from (file for file in (own, base) if file is not None)
+        yield from (file for file in (pipeline_file, base) if file is not None)
 
 
 def _code() -> Iterator[Path]:
-    """Folders, or files, of vehest and of every package that offers it estimators, sources or studies."""
+    """Folders, or files, of vehest and of every package that offers it estimators, sources or
+    studies.
+    """
     points = metadata.entry_points()
     packages = {
         point.module.partition(".")[0]

@@ -1,6 +1,8 @@
-"""Runs stages into one output root: existing artefacts are reused, missing ones are made, every step is printed.
+"""Runs stages into one output root: existing artefacts are reused, missing ones are made, every
+step is printed.
 
-Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups -> launcher -> members -> tracking
+Jobs -> split, recordings at their rates (`Runner.split`, `data_for`) -> groups -> launcher ->
+members -> tracking
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -53,8 +54,11 @@ ALL = "all groups"  # bar above those of trainings
 
 
 @dataclass(eq=False)
-class Runner:
-    """Runs stages into one output root; in a dry run `DryRunStop` is raised where something would have to be made."""
+class Stages:
+    """Runs single stages into one output root: recordings at each rate, split and protocol.
+
+    In a dry run `DryRunStop` is raised where something would have to be made.
+    """
 
     output: Path
     messages: Messages
@@ -62,41 +66,34 @@ class Runner:
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     dry_run: bool = False
-    tracker: Tracker = field(
-        default_factory=lambda: Tracker({}, Path(), print)
-    )  # by default it logs nothing
-    launcher: Launcher = field(default_factory=LocalLauncher)
-    until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
-    weights: PublishedWeights | None = (
-        None  # of a published study, which are taken instead of training
-    )
-    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
-    train_first: str = ""  # command to run first where a training is missing; empty to train here
-    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
-    artefacts: dict[Path, Artefact] = field(
-        default_factory=dict
-    )  # those found or made so far, by folder
-    _known: dict[tuple[str, str], Any] = field(default_factory=dict)
+    artefacts: dict[Path, Artefact] = field(default_factory=dict)  # used so far, by folder
+    _results: dict[tuple[str, str], Any] = field(default_factory=dict)
 
-    def _once(self, what: str, of: Any, make: Callable[[], Value]) -> Value:
+    def _once(self, kind: str, of: Any, make: Callable[[], Value]) -> Value:
         """The value of ``make``, which is called the first time alone."""
-        key = what, json.dumps(of, sort_keys=True)
-        if key not in self._known:
-            self._known[key] = make()
-        value: Value = self._known[key]
+        key = kind, json.dumps(of, sort_keys=True)
+        if key not in self._results:
+            self._results[key] = make()
+        value: Value = self._results[key]
         return value
+
+    def print_waiting(self, waiting: Waiting) -> None:
+        """Print which process makes an artefact that this one waits for."""
+        self.messages.line(
+            "wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it"
+        )
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate."""
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
-            made = self.ensure(
+            artefact = self.ensure(
                 plan,
                 lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report),
             )
         plan.drop(parts_of(plan))
-        return made
+        return artefact
 
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
@@ -106,7 +103,9 @@ class Runner:
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
 
     def dataset_config(self, name: str, config: Config) -> Config:
-        """The configuration of a data set's ingest, with the root and output of another command's."""
+        """The configuration of a data set's ingest, with the root and output of another
+        command's.
+        """
         root = [] if config.get("root") is None else [f"root={quoted(config['root'])}"]
         return self._once(
             "dataset",
@@ -124,7 +123,15 @@ class Runner:
         ]
 
     def look_for_files(self, config: Config) -> None:
-        """Make sure that the raw files of every data set of a split are here; read nothing; raises `MissingError` where some are not."""
+        """Make sure that the raw files of every data set of a split are here.
+
+        Read nothing.
+
+        Raises
+        ------
+        MissingError
+            Some are not.
+        """
         for dataset in self.datasets_of(config):
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()
@@ -133,7 +140,10 @@ class Runner:
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
-        """The split of a configuration; where it names or cuts recordings by rules, its data sets are ingested for it."""
+        """The split of a configuration.
+
+        Where it names or cuts recordings by rules, its data sets are ingested for it.
+        """
 
         def recordings_of(name: str) -> Mapping[str, Reader]:
             ingested = self._ingested(name, config)
@@ -147,7 +157,11 @@ class Runner:
         )
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
-        """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
+        """Channels and rates of the recordings of every data set of a split, which are ingested for
+        it.
+
+        No samples are read.
+        """
 
         def read(name: str) -> tuple[RecordingSummary, ...]:
             ingested = self._ingested(name, config)
@@ -159,12 +173,13 @@ class Runner:
         }
 
     def warn_of_references(self, split: Split, config: Config) -> None:
-        """Warn once of each recording of a split whose reference has another sign or unit, is stuck or impossible.
+        """Warn once of each recording of a split whose reference has another sign or unit, is stuck
+        or impossible.
 
-        The stored recordings are checked, so that a warning does not depend on which run has ingested them. References of a simulation
-        are right.
+        The stored recordings are checked, so that a warning does not depend on which run has
+        ingested them. References of a simulation are right.
         """
-        spans = [*split.train, *split.validation, *chain.from_iterable(split.tests.values())]
+        spans = (*split.train, *split.validation, *split.test_spans)
         for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
             if self.dataset_config(dataset, config)["dataset"]["source"] != SIMULATED:
                 self._once(
@@ -196,7 +211,9 @@ class Runner:
         return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
 
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
-        """How estimates are scored, with the lowest speed of sideslip on each data set, by its car."""
+        """How estimates are scored, with the lowest speed of sideslip on each data set, by its
+        car.
+        """
         cars = self.cars(config, datasets)
         return protocol_from_config(config["evaluation"]).with_wheelbases(
             {name: car.wheelbase for name, car in cars.items()}
@@ -205,7 +222,9 @@ class Runner:
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
-        """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
+        """How a configuration is evaluated: against references that are resampled like everything,
+        but never filtered further.
+        """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
         references = self.data_for(
@@ -231,42 +250,59 @@ class Runner:
         """Make an artefact unless it is there."""
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
-        found = None if plan.stage in self.force else find(plan, self.messages.warn)
-        if found is None and self.dry_run:
+        artefact = None if plan.stage in self.force else find(plan, self.messages.warn)
+        if artefact is None and self.dry_run:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
-        if found is None:
-            found = ensured(
-                plan, write, plan.stage in self.force, self.stop.requested, self._print_waiting
+        if artefact is None:
+            artefact = ensured(
+                plan, write, plan.stage in self.force, self.stop.requested, self.print_waiting
             )
             self.stop.raise_if_requested()
-            assert found is not None
+            assert artefact is not None
         detail = (
             "up to date"
-            if found.skipped
-            else f"{found.provenance['seconds']:.1f} s, {found.folder}"
+            if artefact.skipped
+            else f"{artefact.provenance['seconds']:.1f} s, {artefact.folder}"
         )
-        self.messages.line(REUSED if found.skipped else "done", plan.stage, plan.label, detail)
-        self.artefacts[plan.folder] = found
-        return found
+        self.messages.line(REUSED if artefact.skipped else "done", plan.stage, plan.label, detail)
+        self.artefacts[plan.folder] = artefact
+        return artefact
+
+
+@dataclass(eq=False)
+class Runner(Stages):
+    """Trains, calibrates and evaluates groups by a launcher, and tracks what was made."""
+
+    tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # logs nothing
+    launcher: Launcher = field(default_factory=LocalLauncher)
+    until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
+    weights: PublishedWeights | None = None  # published ones, used instead of training
+    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
+    train_first: str = ""  # command to run first where a training is missing; empty to train here
+    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
-        """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
+        """Train and evaluate groups, side by side where there are cores; where members of a group
+        fail by their data, each is tried alone.
 
-        Raises `MissingError` where no member is there and a command has to be run first, `Stopped` at a signal; finished artefacts stay.
+        Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
+        at a signal; finished artefacts stay.
 
-        Returns:
-            Key of a training -> its member, and key of a training -> why it failed. Where the time is up, members lack what was not
-            made, and trainings that were not begun are in neither.
+        Returns
+        -------
+        tuple[dict[str, Member], dict[str, Failure]]
+            Key of a training -> its member, and key of a training -> why it failed. Where the time
+            is up, members lack what was not made, and trainings that were not begun are in neither.
         """
         if self.weights is not None and TRAIN not in self.force:
             self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
-            found = existing(group, self.messages.warn)
-            members |= self._received([member for member in found if member.finished])
-            missing = [member.job for member in found if not member.finished]
+            members_of_group = existing(group, self.messages.warn)
+            members |= self._received([member for member in members_of_group if member.finished])
+            missing = [member.job for member in members_of_group if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
         self._publish_weights(members.values())
         failures: dict[str, Failure] = {}
@@ -299,7 +335,9 @@ class Runner:
         return members, failures
 
     def _without_trainings(self, groups: Sequence[Group]) -> list[Group]:
-        """Those jobs of groups that take no time to train: the model exists, or is learnt at once."""
+        """Those jobs of groups that take no time to train: the model exists, or is learnt at
+        once.
+        """
         reduced = [
             replace(
                 group,
@@ -313,21 +351,21 @@ class Runner:
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
         """Take models that are published under the key of a training and are not there."""
-        wanted = [plan for plan in plans if plan.key in weights and find(plan) is None]
-        for plan in wanted if not self.dry_run else ():
+        published = [plan for plan in plans if plan.key in weights and find(plan) is None]
+        for plan in published if not self.dry_run else ():
             ensured(
                 plan,
                 partial(weights.write, plan.key),
                 False,
                 self.stop.requested,
-                self._print_waiting,
+                self.print_waiting,
             )
             self.stop.raise_if_requested()
-        if wanted:
+        if published:
             self.messages.line(
                 "note",
                 TRAIN,
-                f"{len(wanted)} of {len(plans)}",
+                f"{len(published)} of {len(plans)}",
                 f"taken from {weights.path}; --retrain trains them",
             )
 
@@ -373,17 +411,22 @@ class Runner:
                     member.job.plan.label,
                     "before its first epoch was over; the next run goes on",
                 )
-            for made in member.made:
-                self.artefacts[made.folder] = made
-                status, detail = _in_words(made)
-                self.messages.line(status, made.stage, made.label, detail)
-                if made.stage == TRAIN and read_fit_metrics(made.folder).get("ended_by_divergence"):
-                    self.messages.warn(f"the training of {made.label} {DIVERGED}")
+            for artefact in member.made:
+                self.artefacts[artefact.folder] = artefact
+                status, detail = _in_words(artefact)
+                self.messages.line(status, artefact.stage, artefact.label, detail)
+                if artefact.stage == TRAIN and read_fit_metrics(artefact.folder).get(
+                    "ended_by_divergence"
+                ):
+                    self.messages.warn(f"the training of {artefact.label} {DIVERGED}")
             self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
     def _publish_weights(self, members: Iterable[Member]) -> None:
-        """Add the models of finished trainings to the published weights, if they are to be; once there is no room, no more."""
+        """Add the models of finished trainings to the published weights, if they are to be.
+
+        Once there is no room, no more.
+        """
         models = [
             member.model
             for member in members
@@ -402,27 +445,25 @@ class Runner:
         """Draw the progress of a group, or print for whom it waits."""
         name = groups[at].name
         if isinstance(news, Waiting):
-            self._print_waiting(news)
+            self.print_waiting(news)
         elif news is None:
             bars.step(name, 0, 1, "starting")
         else:
-            note = f"{news.active}/{news.members} active, best validation loss {news.best_validation_loss:.4g}"
+            note = (
+                f"{news.active}/{news.members} active, best validation loss "
+                f"{news.best_validation_loss:.4g}"
+            )
             bars.step(name, news.epoch, news.max_epochs, note)
 
-    def _print_waiting(self, waiting: Waiting) -> None:
-        self.messages.line(
-            "wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it"
-        )
 
-
-def _in_words(made: Artefact) -> tuple[str, str]:
+def _in_words(artefact: Artefact) -> tuple[str, str]:
     """How a model, a calibration or an evaluation ended, and what came out."""
-    if made.skipped:
+    if artefact.skipped:
         return REUSED, "up to date"
-    if made.status == "interrupted":
-        return "stop", f"the best so far is kept in {made.folder}; the next run goes on"
-    if made.stage == "train":
-        fit = read_fit_metrics(made.folder)
+    if artefact.status == "interrupted":
+        return "stop", f"the best so far is kept in {artefact.folder}; the next run goes on"
+    if artefact.stage == "train":
+        fit = read_fit_metrics(artefact.folder)
         loss = fit.get("best_validation_loss")
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
         if halvings := fit.get("step_size_halvings"):
@@ -432,17 +473,18 @@ def _in_words(made: Artefact) -> tuple[str, str]:
             if loss is None
             else f"validation loss {loss:.4g}"
         )
-    if made.stage == "evaluate":
+    if artefact.stage == "evaluate":
         errors = {
             name: error
-            for name, error in test_figures(made.folder).items()
+            for name, error in test_figures(artefact.folder).items()
             if name.startswith("rmse_sideslip")
         }
         return "done", ", ".join(f"{name} {error:.3f}°" for name, error in errors.items())
-    trust = read_trust(made.folder)
+    trust = read_trust(artefact.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"
     return (
         "done",
-        f"bands by {trust.bands.n_blocks} {'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
+        f"bands by {trust.bands.n_blocks} "
+        f"{'ranges' if trust.bands.blocks == 'range' else 'segments from turn to turn'}",
     )

@@ -1,8 +1,10 @@
 """Searches of a study: what each trial reached on the validation range, and which one that chooses.
 
-planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations -> `trials_of` -> `remarks_on` parts -> report
+planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations ->
+`trials_of` -> `remarks_on` parts -> report
 
-A search is finished where the file has all of its trials with today's keys: then none of them is trained, wherever the study runs.
+A search is finished where the file has all of its trials with today's keys: then none of them is
+trained, wherever the study runs.
 """
 
 from __future__ import annotations
@@ -22,12 +24,12 @@ from vehest.data.splits import VALIDATION
 from vehest.data.text_files import number_in, read_rows
 from vehest.estimators.registry import new_estimator
 from vehest.run.comparison import Comparison
-from vehest.run.evaluate import COLUMNS, METRICS, evaluation_options
+from vehest.run.evaluate import evaluation_options, read_metrics
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.study import Job, Study
 from vehest.run.train import training_options
 from vehest.run.versions import code_of
-from vehest.studies.artefacts import Trial, read_frame
+from vehest.studies.artefacts import Trial, nominal_rows, write_frame
 
 SEARCHES = "searches.csv"
 TRIAL_COLUMNS = (
@@ -48,7 +50,11 @@ DIGITS = 6  # significant ones of a validation value, as in published CSV files
 def published_values(
     study: Study, comparisons: Mapping[str, Comparison], path: Path
 ) -> dict[str, float]:
-    """Validation value of each trial of those searches that a published file has in full, with today's keys; raises `DataError`."""
+    """Validation value of each trial of those searches that a published file has in full, with
+    today's keys.
+
+    Raises `DataError`.
+    """
     if not path.is_file():
         return {}
     values = {
@@ -58,20 +64,22 @@ def published_values(
     finished: dict[str, float] = {}
     for trials in study.searches.values():
         planned = [_planned_trial(study, name, comparisons) for name in trials]
-        found = {
+        published_trials = {
             trial.name: values[trial.key, trial.evaluation, trial.metric]
             for trial in planned
             if trial is not None and (trial.key, trial.evaluation, trial.metric) in values
         }
-        if len(found) == len(trials):
-            finished |= found
+        if len(published_trials) == len(trials):
+            finished |= published_trials
     return finished
 
 
 def trials_of(
     study: Study, comparisons: Mapping[str, Comparison], published: Mapping[str, float]
 ) -> list[Trial]:
-    """The trials of every search of which all have a value: a published one, or that of their evaluation."""
+    """The trials of every search of which all have a value: a published one, or that of their
+    evaluation.
+    """
     finished: list[Trial] = []
     for names in study.searches.values():
         trials = []
@@ -93,9 +101,11 @@ def trials_of(
 def remarks_on(
     study: Study, comparisons: Mapping[str, Comparison], trials: Sequence[Trial]
 ) -> list[str]:
-    """A line for each part and search where the part trains what was searched for, with other options than those chosen.
+    """A line for each part and search where the part trains what was searched for, with other
+    options than those chosen.
 
-    What was searched for is a job that differs from the trials in nothing but the options that they try, and the seed.
+    What was searched for is a job that differs from the trials in nothing but the options that they
+    try, and the seed.
     """
     remarks: dict[str, None] = {}
     for chosen in (trial for trial in trials if trial.chosen):
@@ -113,7 +123,8 @@ def remarks_on(
                 is_searched = _compared(config, tried) == _compared(best, tried)
                 if is_searched and _compared(config) != _compared(best):
                     remarks[
-                        f"part '{name}' does not use what the search '{chosen.search}' chose by {chosen.metric} "
+                        f"part '{name}' does not use what the search '{chosen.search}' chose by "
+                        f"{chosen.metric} "
                         f"on validation: {chosen.options}"
                     ] = None
     return list(remarks)
@@ -122,8 +133,7 @@ def remarks_on(
 def write_trials(trials: Sequence[Trial], path: Path) -> None:
     """Write the trials of searches, a row each, with their keys."""
     rows = [{column: getattr(trial, column) for column in TRIAL_COLUMNS} for trial in trials]
-    table = pd.DataFrame(rows, columns=list(TRIAL_COLUMNS))
-    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
+    write_frame(pd.DataFrame(rows, columns=list(TRIAL_COLUMNS)), path)
 
 
 def _options(study: Study, name: str) -> tuple[str, ...]:
@@ -133,7 +143,10 @@ def _options(study: Study, name: str) -> tuple[str, ...]:
 
 
 def _planned_trial(study: Study, name: str, comparisons: Mapping[str, Comparison]) -> Trial | None:
-    """A trial before it has a value; none where its recordings are not here or it cannot be trained."""
+    """A trial before it has a value.
+
+    None where its recordings are not here or it cannot be trained.
+    """
     if name not in comparisons:
         return None
     comparison = comparisons[name]
@@ -166,16 +179,12 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
     """Value of the metric that chooses, over all samples of the validation range."""
     evaluation = comparison.members[0].evaluation
     assert evaluation is not None
-    table = read_frame(evaluation.folder / METRICS, COLUMNS, numbers=("value",))
-    rows = table[
-        (table["metric"] == trial.metric)
-        & (table["test_set"] == VALIDATION)
-        & (table["subset"] == "all")
-        & (table["condition"] == "nominal")
-    ]
+    table = nominal_rows(read_metrics(evaluation.folder))
+    rows = table[(table["metric"] == trial.metric) & (table["test_set"] == VALIDATION)]
     if len(rows) != 1:
         raise DataError(
-            f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a validation range"
+            f"the search '{trial.search}' cannot choose: {trial.title} has no {trial.metric} on a "
+            "validation range"
         )
     return float(rows["value"].iloc[0])
 
@@ -191,9 +200,9 @@ def _compared(config: Config, tried: set[str] | frozenset[str] = frozenset()) ->
 
 def _without(content: Any, path: Sequence[str]) -> Any:
     """A mapping without a nested key, and without mappings that are empty then."""
-    first, *rest = path
+    first, *nested_path = path
     if not isinstance(content, dict) or first not in content:
         return content
-    others = {key: value for key, value in content.items() if key != first}
-    nested = _without(content[first], rest) if rest else {}
-    return {**others, first: nested} if nested else others
+    siblings = {key: value for key, value in content.items() if key != first}
+    nested = _without(content[first], nested_path) if nested_path else {}
+    return {**siblings, first: nested} if nested else siblings

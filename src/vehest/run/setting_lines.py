@@ -1,6 +1,8 @@
-"""Settings as commented lines of YAML: key, value, text, unit, values and bounds, as the classes declare them.
+"""Settings as commented lines of YAML: key, value, text, unit, values and bounds, as the classes
+declare them.
 
-dataclass of settings -> `described` -> lines of a file of conf/, or of `vehest config` with the values of a configuration
+dataclass of settings -> `described` -> lines of a file of conf/, or of `vehest config` with the
+values of a configuration
 """
 
 from __future__ import annotations
@@ -67,7 +69,9 @@ def as_commented_yaml(lines: Mapping[str, SettingLine], indent: str = "") -> Ite
 
 
 def config_as_commented_yaml(config: Config) -> str:
-    """A configuration as YAML, the settings of its estimator and training with the comments of conf/."""
+    """A configuration as YAML, the settings of its estimator and training with the comments of
+    conf/.
+    """
     comments = {}
     with suppress(VehestError, KeyError):  # no estimator, or a name without a class
         kind = estimator_class(str(config["estimator"]["name"]))
@@ -88,8 +92,10 @@ def _config_lines(
         text = textwrap.indent(as_yaml({key: value}), indent)
         if line is not None and isinstance(value, list):
             text = f"{indent}{key}: {value_as_yaml(tuple(value))}\n"
-        is_one_line = text.count("\n") == 1
-        yield _line(text.rstrip("\n"), line.comment) if line is not None and is_one_line else text
+        is_single_line = text.count("\n") == 1
+        yield (
+            _line(text.rstrip("\n"), line.comment) if line is not None and is_single_line else text
+        )
 
 
 def _line(key: str, comment: str) -> str:
@@ -97,7 +103,9 @@ def _line(key: str, comment: str) -> str:
 
 
 def field_comments(described: type) -> dict[str, str]:
-    """Comments of the fields of a dataclass, within the statement of each or behind it: name -> text."""
+    """Comments of the fields of a dataclass, within the statement of each or behind it: name ->
+    text.
+    """
     source = textwrap.dedent(inspect.getsource(described))
     comments = {
         token.start[0]: token.string.lstrip("# ")
@@ -119,7 +127,9 @@ def field_comments(described: type) -> dict[str, str]:
 
 
 def _comment_of(described: type, name: str) -> str:
-    """The comment behind a field of a dataclass that declares no settings, such as the parameters of a car."""
+    """The comment behind a field of a dataclass that declares no settings, such as the parameters
+    of a car.
+    """
     for kind in described.__mro__[:-1]:
         if comment := field_comments(kind).get(name):
             return comment
@@ -152,7 +162,9 @@ def _values(field: Field[Any]) -> Iterator[str]:
 
 
 def value_as_yaml(value: Any) -> str:
-    """A value as YAML reads it back: whole numbers without a point, so that they are spelled as people do."""
+    """A value as YAML reads it back: whole numbers without a point, so that they are spelled as
+    people do.
+    """
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         return str(int(value))
     if isinstance(value, float):

@@ -1,4 +1,6 @@
-"""Early ends of the work: Ctrl-C and SIGTERM, after which a fit keeps the best so far and other stages leave nothing, and a time limit."""
+"""Early ends of the work: Ctrl-C and SIGTERM, after which a fit keeps the best so far and other
+stages leave nothing, and a time limit.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,13 @@ class DryRunStop(Exception):
 
 
 class StopSignals:
-    """Records the first SIGINT or SIGTERM; raises `Stopped` at once, or later where a fit is to end cleanly."""
+    """Records the first SIGINT or SIGTERM.
+
+    Raises
+    ------
+    Stopped
+        At once, or later where a fit is to end cleanly.
+    """
 
     def __init__(self) -> None:
         self.number: int | None = None
@@ -42,7 +50,8 @@ class StopSignals:
     def installed(self) -> Iterator[None]:
         """Listen, and restore the former handlers afterwards.
 
-        Raises `Stopped` in place of an exception after a signal: compiled modules turn one into another, and what a signal ends may fail.
+        Raises `Stopped` in place of an exception after a signal: compiled modules turn one into
+        another, and what a signal ends may fail.
         """
         former = {
             number: signal.signal(number, self._handle)
@@ -75,7 +84,8 @@ class StopSignals:
 
 @contextmanager
 def blocked_signals() -> Iterator[None]:
-    """Start processes in here that are to leave SIGINT and SIGTERM to this one: they inherit that this thread blocks both.
+    """Start processes in here that are to leave SIGINT and SIGTERM to this one: they inherit that
+    this thread blocks both.
 
     A handler that they install themselves comes too late for a Ctrl-C while they start.
     """
@@ -91,7 +101,10 @@ def blocked_signals() -> Iterator[None]:
 
 
 class TimeLimit:
-    """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s]; None for no limit."""
+    """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s].
+
+    None for no limit.
+    """
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:
         self._stop = stop

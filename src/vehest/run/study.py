@@ -1,6 +1,7 @@
 """Reads what a study compares, from a file or from a command's overrides, and composes its jobs.
 
-pipelines/*.yaml -> `read_study` -> Study -> `jobs_of` -> part -> jobs, each a configuration; a sweep's overrides -> `sweep_of` -> both
+pipelines/*.yaml -> `read_study` -> Study -> `jobs_of` -> part -> jobs, each a configuration; a
+sweep's overrides -> `sweep_of` -> both
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import difflib
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -43,11 +44,14 @@ from vehest.run.failures import Failure, failure_of
 from vehest.run.next_commands import command_line, location_overrides
 from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
-from vehest.studies.sweep import Value, short_names, shown_value
+from vehest.studies.sweep import Value, override_text, short_names
 
-FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
-SAME_IN_A_PART = ("split", "evaluation", "downsample")
-ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
+FORMS = (
+    "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; "
+    "datasets, each once"
+)
+SHARED_KEYS = ("split", "evaluation", "downsample")
+SINGLE_VALUED = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
 Sweeps = Annotated[
     tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"
@@ -66,7 +70,10 @@ class Search:
 
 @dataclass(frozen=True)
 class Part:
-    """One comparison of a study: sweeps of trainings on one split; docs/cli.md says what the keys mean."""
+    """One comparison of a study: sweeps of trainings on one split.
+
+    Docs/cli.md says what the keys mean.
+    """
 
     split: str = ""
     sweeps: Sweeps = ()
@@ -98,7 +105,10 @@ class PipelineFile:
 
 @dataclass(frozen=True)
 class Study(PipelineFile):
-    """A pipeline or a sweep as it is run; the only part of a study that is not in parts is called ``""``, and has no title."""
+    """A pipeline or a sweep as it is run.
+
+    The only part of a study that is not in parts is called ``""``, and has no title.
+    """
 
     file: Path = Path()
     command: str = ""  # that makes it, without where data come from and results go
@@ -114,7 +124,9 @@ class Study(PipelineFile):
 
     @property
     def shows_failed(self) -> bool:
-        """Whether its report can leave out failed jobs: it is not in parts, or its module says so."""
+        """Whether its report can leave out failed jobs: it is not in parts, or its module says
+        so.
+        """
         return (
             not self.parts
             or "" in self.parts
@@ -145,31 +157,43 @@ Jobs = Mapping[
 ]  # part of a study -> its jobs; the one part of a study without parts is called ``""``
 
 
+def failure_messages(jobs: Iterable[Job]) -> str:
+    """Why jobs failed, each reason once; empty where none failed."""
+    return "; ".join(dict.fromkeys(job.failure.message for job in jobs if job.failure is not None))
+
+
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
-    """Read a pipeline by path or name; ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`."""
+    """Read a pipeline by path or name.
+
+    ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`.
+    """
     file, content = _content_of(name, location_overrides(overrides))
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
-    shown = [*read.datasets, *read.optional_datasets]
-    forms = {"split": read.split or read.sweeps, "parts": read.parts, "datasets": shown}
-    given = [form for form, keys in forms.items() if keys]
-    odd = len(set(shown)) < len(shown) or (shown and (read.evaluation or not read.datasets))
-    if not read.study or not read.report or len(given) != 1 or odd:
+    datasets = [*read.datasets, *read.optional_datasets]
+    forms = {"split": read.split or read.sweeps, "parts": read.parts, "datasets": datasets}
+    stated_forms = [form for form, keys in forms.items() if keys]
+    odd = len(set(datasets)) < len(datasets) or (
+        datasets and (read.evaluation or not read.datasets)
+    )
+    if not read.study or not read.report or len(stated_forms) != 1 or odd:
         raise ConfigurationError(f"'{file}' is not a pipeline: {FORMS}")
     for key in (read.study, *read.parts):
         check_name(key, f"'{file}'")
-    parts = read.parts or ({} if shown else {"": Part(read.split, read.sweeps)})
+    parts = read.parts or ({} if datasets else {"": Part(read.split, read.sweeps)})
     for key, part in parts.items():
         if not part.split or not part.sweeps or not all(part.sweeps):
-            where = f"part '{key}'" if key else "it"
+            subject = f"part '{key}'" if key else "it"
             raise ConfigurationError(
-                f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides"
+                f"'{file}': {subject} needs split and sweeps; sweeps must be a list of lists of "
+                "overrides"
             )
     if read.report not in study_names():
         raise ConfigurationError(
-            f"'{file}': there is no study module '{read.report}'; there are: {', '.join(study_names())}"
+            f"'{file}': there is no study module '{read.report}'; there are: "
+            f"{', '.join(study_names())}"
         )
     takes = getattr(study_module(read.report), "TAKES", "")
-    if given != ["split" if takes == "folds" else takes]:
+    if stated_forms != ["split" if takes == "folds" else takes]:
         draws = {
             "split": "split and sweeps",
             "folds": "split and sweeps, where the split has folds",
@@ -222,22 +246,23 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
     """A part with a search as parts, one a candidate."""
     search = part.search
     assert search is not None
-    where = f"'{file}': the search '{name}'"
+    subject = f"'{file}': the search '{name}'"
     if search.metric not in UNITS:
-        raise ConfigurationError(f"{where} chooses by '{search.metric}', which is no metric")
+        raise ConfigurationError(f"{subject} chooses by '{search.metric}', which is no metric")
     candidates = [tuple(job) for sweep in search.candidates for job in expand(sweep)]
     if len(candidates) < 2:
         raise ConfigurationError(
-            f"{where} needs candidates, a list of lists of overrides with two combinations or more"
+            f"{subject} needs candidates, a list of lists of overrides with two combinations or "
+            "more"
         )
     if len(part.sweeps) != 1 or count(part.sweeps[0]) != 1:
         raise ConfigurationError(
-            f"{where} needs sweeps with one list of overrides for one training"
+            f"{subject} needs sweeps with one list of overrides for one training"
         )
     stated = {key_of(override) for override in (*part.overrides, *part.sweeps[0])}
     for key in (key_of(override) for candidate in candidates for override in candidate):
         if key in stated:
-            raise ConfigurationError(f"{where} tries '{key}', which its sweeps state too")
+            raise ConfigurationError(f"{subject} tries '{key}', which its sweeps state too")
     return {
         f"{name}_{number}": replace(
             part,
@@ -305,7 +330,7 @@ def _as_override(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{','.join(map(_as_override, value))}]"
     if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_as_override(own)}" for key, own in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{_as_override(inner)}" for key, inner in value.items()) + "}"
     return f"'{value}'" if isinstance(value, str) else json.dumps(value)
 
 
@@ -315,7 +340,8 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
     number = folds.get("number", FoldsFile.number) if isinstance(folds, dict) else None
     if not isinstance(number, int) or number < 1:
         raise ConfigurationError(
-            f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, of: laps}}"
+            f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, "
+            f"of: laps}}"
         )
     check_jobs(number, f"the folds of '{file.name}' stand")
     return {
@@ -327,13 +353,18 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key; raises `ConfigurationError`."""
-    what, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
+    """Every job of a pipeline.
+
+    Further overrides apply to the sweeps, or data sets, that have their key; raises
+    `ConfigurationError`.
+    """
+    unit, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
         raise ConfigurationError(
-            f"'{fixed}' belongs to the study; copy '{study.file.name}' to pipelines/ under another name and change that there"
+            f"'{fixed}' belongs to the study; copy '{study.file.name}' to pipelines/ under another "
+            "name and change that there"
         )
-    used = {
+    matching = {
         override
         for override in overrides
         if study.datasets and key_of(override).split(".")[0] == "tracking"
@@ -343,16 +374,23 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
 
     def suiting(config: Config) -> list[str]:
         matched.append(config)
-        found = [override for override in overrides if has_key(config, key_of(override))]
-        used.update(found)
-        return found
+        suitable = [override for override in overrides if has_key(config, key_of(override))]
+        matching.update(suitable)
+        return suitable
 
     if study.datasets:
-        own = [[f"dataset={name}"] for name in (*study.datasets, *study.optional_datasets)]
+        dataset_overrides = [
+            [f"dataset={name}"] for name in (*study.datasets, *study.optional_datasets)
+        ]
         jobs: Jobs = {
             "": [
-                Job(compose_config("ingest", [*one, *suiting(compose_config("ingest", one))]))
-                for one in own
+                Job(
+                    compose_config(
+                        "ingest",
+                        [*dataset_override, *suiting(compose_config("ingest", dataset_override))],
+                    )
+                )
+                for dataset_override in dataset_overrides
             ]
         }
     else:
@@ -369,13 +407,13 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
                 for name, part in study.parts.items()
             }
     for override in overrides:
-        if override not in used:
+        if override not in matching:
             key = key_of(override)
             meant = next(filter(None, (close_key(key, config) for config in matched)), "")
             hint = option_hint(key) or f": none has an option '{key}'"
             if meant:
                 hint += f"; did you mean '{meant}'?"
-            raise ConfigurationError(f"'{override}' matches no {what} of '{study.file.name}'{hint}")
+            raise ConfigurationError(f"'{override}' matches no {unit} of '{study.file.name}'{hint}")
     return jobs
 
 
@@ -406,16 +444,19 @@ def _part_jobs(
                 config["seed"] = value_of(seeds[-1])
             configs.setdefault(json.dumps({**config, GIVEN: None}, sort_keys=True), config)
     jobs = [Job(config) for config in configs.values()]
-    for key in SAME_IN_A_PART:
+    for key in SHARED_KEYS:
         if any(job.config[key] != jobs[0].config[key] for job in jobs):
             raise ConfigurationError(
-                f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own"
+                f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of "
+                "its own"
             )
     return jobs
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
+    """Those overrides that change what comes out: not where data come from, where results go, or
+    tracking.
+    """
     return [
         override
         for override in overrides
@@ -424,9 +465,11 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
-    """A study with one sweep: all combinations of overrides over their seeds, in the order of the command; raises `ConfigurationError`.
+    """A study with one sweep: all combinations of overrides over their seeds, in the order of the
+    command; raises `ConfigurationError`.
 
-    A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
+    A combination that its estimator refuses stays in the list with the reason. By default the study
+    is named after estimators and split.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")
@@ -436,37 +479,48 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
                 raise ConfigurationError(
                     f"'{key}' is named twice; give all its values at once: {key}=1,2"
                 )
-        swept = [str(one.key_or_group) for one in map(parsed, overrides) if one.is_sweep_override()]
-        for key in swept:
-            if key.split(".")[0] in ONE_VALUE:
-                raise ConfigurationError(
-                    f"'{key}' takes one value in a sweep, whose combinations are compared with each other; run one sweep a value"
-                )
-        others = [override for override in overrides if key_of(override) != "seed"]
-        found = [_combination(own, swept, number) for number, own in enumerate(expand(others))]
-        seeds = [
-            value_of(own[0])
-            for own in expand([override for override in overrides if override not in others])
-            if own
+        swept = [
+            str(override.key_or_group)
+            for override in map(parsed, overrides)
+            if override.is_sweep_override()
         ]
-    usable = [job.config for job in found if job.failure is None]
-    if not usable:
-        raise ConfigurationError(
-            "; ".join(
-                dict.fromkeys(job.failure.message for job in found if job.failure is not None)
+        for key in swept:
+            if key.split(".")[0] in SINGLE_VALUED:
+                raise ConfigurationError(
+                    f"'{key}' takes one value in a sweep, whose combinations are compared with "
+                    "each other; run one sweep a value"
+                )
+        unseeded = [override for override in overrides if key_of(override) != "seed"]
+        combinations = [
+            _combination(combination, swept, number)
+            for number, combination in enumerate(expand(unseeded))
+        ]
+        seeds = [
+            value_of(combination[0])
+            for combination in expand(
+                [override for override in overrides if override not in unseeded]
             )
-        )
+            if combination
+        ]
+    usable = [job.config for job in combinations if job.failure is None]
+    if not usable:
+        raise ConfigurationError(failure_messages(combinations))
     split = str(usable[0]["split"]["name"])
     study = (
         name
-        or f"{'_'.join(dict.fromkeys(str(config['estimator']['name']) for config in usable))}-{split}"
+        or "_".join(dict.fromkeys(str(config["estimator"]["name"]) for config in usable))
+        + f"-{split}"
     )
     check_name(study, "--name")
     words = [*map(shlex.quote, content_overrides(overrides)), *(["--name", study] if name else [])]
     of_jobs = {repr(seed): seed for seed in seeds or [usable[0]["seed"]]}.values()
-    jobs = [replace(job, config={**job.config, "seed": seed}) for job in found for seed in of_jobs]
+    jobs = [
+        replace(job, config={**job.config, "seed": seed})
+        for job in combinations
+        for seed in of_jobs
+    ]
     command = " ".join(["vehest sweep", *words])
-    own = Study(
+    combination = Study(
         study,
         "sweep",
         study,
@@ -474,7 +528,7 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
         command=command,
         words=(*overrides, *(["--name", study] if name else [])),
     )
-    return own, {"": jobs}
+    return combination, {"": jobs}
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
@@ -486,7 +540,7 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
                 value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
             )
     names = short_names(list(values))
-    label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
+    label = ", ".join(f"{names[key]}={override_text(value)}" for key, value in values.items())
     try:
         config = compose_config("eval", overrides)
         estimator = new_estimator(config["estimator"])

@@ -1,6 +1,8 @@
-"""Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is printed and published.
+"""Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is
+printed and published.
 
-jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
+jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> results/ and
+`RunCache.save`
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from vehest.data.errors import (
     JobsFailedError,
     MissingError,
     VehestError,
+    abbreviated,
 )
 from vehest.data.files import stamp_of
 from vehest.data.limits import limits_from_config, use_limits
@@ -58,7 +61,16 @@ from vehest.run.run_cache import Ran, RunCache
 from vehest.run.runner import Runner
 from vehest.run.searches import SEARCHES, published_values, remarks_on, trials_of
 from vehest.run.signals import DryRunStop, StopSignals
-from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
+from vehest.run.study import (
+    Job,
+    Jobs,
+    Study,
+    content_overrides,
+    failure_messages,
+    jobs_of,
+    read_study,
+    sweep_of,
+)
 from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import learnt_spans, model_artefact, read_fit_metrics, trained_rate
@@ -73,7 +85,9 @@ MAX_NAMED = 6  # trainings in one message
 def open_runner(
     config: Config, options: RunOptions, stages: Collection[str], study: str = ""
 ) -> Iterator[Runner]:
-    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
+    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs
+    under a study, if there is one.
+    """
     messages = Messages(quiet=options.quiet)
     stop = StopSignals()
     output = Path(config["output"])
@@ -93,8 +107,8 @@ def open_runner(
         options.jobs or default_jobs(),
         forced,
         options.dry_run,
-        tracker,
-        launcher,
+        tracker=tracker,
+        launcher=launcher,
     )
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         try:
@@ -112,20 +126,34 @@ def run_study(
     sweep: bool = False,
     only_report: bool = False,
 ) -> Ran:
-    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that overrides changed is not published.
+    """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that
+    overrides changed is not published.
 
-    Args:
-        name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
-        overrides: for all jobs that have their key; of a sweep, with several values.
-        cache: keeps the finished study.
-        sweep: whether the overrides make a sweep.
-        only_report: train and evaluate nothing.
+    Parameters
+    ----------
+    name : str or None
+        Of the pipeline, or its path; of a sweep the start of its folder's name, none for the
+        estimators and the split.
+    overrides : Sequence[str]
+        For all jobs that have their key; of a sweep, with several values.
+    cache : RunCache
+        Keeps the finished study.
+    sweep : bool
+        Whether the overrides make a sweep.
+    only_report : bool
+        Train and evaluate nothing.
 
-    Raises:
-        JobsFailedError: some jobs of a study in parts, or all of another, failed; finished artefacts are kept.
-        DataError: recordings lack what some job of a study in parts, or all of another, needs; nothing was trained.
-        MissingError: raw files are missing, or ``only_report`` and a training is.
-        DryRunStop: in a dry run.
+    Raises
+    ------
+    JobsFailedError
+        Some jobs of a study in parts, or all of another, failed; finished artefacts are kept.
+    DataError
+        Recordings lack what some job of a study in parts, or all of another, needs; nothing was
+        trained.
+    MissingError
+        Raw files are missing, or ``only_report`` and a training is.
+    DryRunStop
+        In a dry run.
     """
     begun = time.monotonic()
     if sweep:
@@ -151,16 +179,18 @@ def run_study(
         runner.evaluates_trained = not (only_report or _trains_missing(study, overrides, options))
         if only_report or runner.evaluates_trained:
             runner.train_first = command_line("run", study.words)
-        shown = [job.config for job in jobs[""]] if study.datasets else []
-        used = [config["dataset"] for config in shown]
+        dataset_configs = [job.config for job in jobs[""]] if study.datasets else []
+        datasets_read = [config["dataset"] for config in dataset_configs]
         for part in study.parts:
-            used += runner.datasets_of(_first(jobs[part]))
+            datasets_read += runner.datasets_of(_first(jobs[part]))
         raw = {
             path: stamp_of(Path(path).expanduser())
-            for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)
+            for path in dict.fromkeys(
+                str(dataset["path"]) for dataset in datasets_read if "path" in dataset
+            )
         }
         datasets: list[StoredDataset | AbsentDataset] = []
-        for config in shown:
+        for config in dataset_configs:
             with suppress(DryRunStop):
                 datasets.append(_dataset(config, study, runner))
         planned = _planned(study, jobs, runner)
@@ -174,7 +204,9 @@ def run_study(
                 f"{len(values)} of {len(study.trials)} trials",
                 f"taken from {RESULTS / study.study / SEARCHES}; --retrain trains them",
             )
-        comparisons = {name: own for name, own in planned.items() if name not in values}
+        comparisons = {
+            name: comparison for name, comparison in planned.items() if name not in values
+        }
         _note_missing(comparisons, runner)
         for comparison in comparisons.values():
             if runner.evaluates_trained:
@@ -194,20 +226,20 @@ def run_study(
                 runner.messages.warn(remark)
             report, summary = draw_report(study, comparisons, datasets, runner, trials, remarks)
         published = None
-        n_not_trained = sum(len(own.unfinished) for own in comparisons.values())
+        n_not_trained = sum(len(comparison.unfinished) for comparison in comparisons.values())
         if error is None and not runner.dry_run and (runner.evaluates_trained or not n_not_trained):
             publication = None
             if study.publish and not content_overrides(overrides):
                 gone = {name: f"part '{name}'" for name in study.parts if name not in planned}
                 gone |= {
-                    own.name: f"data set '{own.name}'"
-                    for own in datasets
-                    if isinstance(own, AbsentDataset)
+                    dataset.name: f"data set '{dataset.name}'"
+                    for dataset in datasets
+                    if isinstance(dataset, AbsentDataset)
                 }
                 inputs = {
-                    own.label: own.inputs
-                    for own in runner.artefacts.values()
-                    if own.stage == INGEST
+                    artefact.label: artefact.inputs
+                    for artefact in runner.artefacts.values()
+                    if artefact.stage == INGEST
                 }  # raw files as they were
                 publication = Publication(
                     study.study,
@@ -228,7 +260,10 @@ def run_study(
 
 
 def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeights:
-    """The published weights of a study, which each training adds to; raises `ConfigurationError` where it is not published so."""
+    """The published weights of a study, which each training adds to.
+
+    Raises `ConfigurationError` where it is not published so.
+    """
     changes = content_overrides(overrides)
     if not study.publish or changes:
         why = f"leave out '{changes[0]}'" if changes else "it needs publish: true"
@@ -243,7 +278,9 @@ def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeigh
 
 
 def _trains_missing(study: Study, overrides: Sequence[str], options: RunOptions) -> bool:
-    """Whether a run trains what is missing: as its option says, else unless the study is published without some trainings."""
+    """Whether a run trains what is missing: as its option says, else unless the study is published
+    without some trainings.
+    """
     if options.train_missing is not None:
         return options.train_missing
     trains = options.force or options.retrain or options.publish_weights
@@ -254,7 +291,9 @@ def _trains_missing(study: Study, overrides: Sequence[str], options: RunOptions)
 
 
 def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None:
-    """Print how many trainings neither exist here nor are published, before the first of them begins."""
+    """Print how many trainings neither exist here nor are published, before the first of them
+    begins.
+    """
     if runner.weights is None or not runner.weights.path.is_file() or runner.train_first:
         return
     plans = {
@@ -277,7 +316,9 @@ def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
-    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time."""
+    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in
+    time.
+    """
     if minutes is None:
         return None
     if not minutes > 0:
@@ -291,72 +332,85 @@ def _first(jobs: Sequence[Job]) -> Config:
 
 
 def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
-    """Part -> its planned jobs, before anything is trained; optional parts whose raw files are missing are left out."""
-    found: dict[str, Comparison] = {}
+    """Part -> its planned jobs, before anything is trained.
+
+    Optional parts whose raw files are missing are left out.
+    """
+    comparisons: dict[str, Comparison] = {}
     for name, part in study.parts.items():
         try:
             runner.look_for_files(_first(jobs[name]))
-            found[name] = Comparison(
+            comparisons[name] = Comparison(
                 [replace(job) for job in jobs[name]]
             )  # published keys hold rates before they are lowered
         except MissingError as error:
             if not part.optional:
                 raise
             runner.messages.warn(f"{error}; the study goes on without part '{name}'")
-    if study.parts and not found:
+    if study.parts and not comparisons:
         raise MissingError(
-            f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER"
+            f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give "
+            "root=FOLDER"
         )
-    for comparison in found.values():
+    for comparison in comparisons.values():
         with suppress(DryRunStop):
             comparison.plan(runner)
-            if not any(comparison.evaluation.split.tests.values()):
+            if not comparison.evaluation.split.test_spans:
                 raise ConfigurationError(
-                    f"split '{comparison.evaluation.split.name}' has no test ranges to compare estimators on"
+                    f"split '{comparison.evaluation.split.name}' has no test ranges to compare "
+                    "estimators on"
                 )
-    lacking = dict.fromkeys(
-        job.failure.message for own in found.values() for job in own.jobs if job.failure is not None
+    reasons = failure_messages(
+        job for comparison in comparisons.values() for job in comparison.jobs
     )
-    if lacking and not study.shows_failed:
-        raise DataError(f"a study in parts needs all of its jobs; {'; '.join(lacking)}")
-    return found
+    if reasons and not study.shows_failed:
+        raise DataError(f"a study in parts needs all of its jobs; {reasons}")
+    return comparisons
 
 
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
-    """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
-    own = config["dataset"]
+    """An ingested data set of a study of recordings alone, or an optional one whose raw files are
+    missing.
+    """
+    dataset = config["dataset"]
     title, licence, citation = (
-        " ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation")
+        " ".join(str(dataset.get(key, dataset["name"])).split())
+        for key in ("title", "licence", "citation")
     )
     try:
         planned = plan_ingest(config)
     except MissingError as error:
-        if own["name"] not in study.optional_datasets:
+        if dataset["name"] not in study.optional_datasets:
             raise
         runner.messages.warn(f"{error}; the study goes on without it")
-        return AbsentDataset(own["name"], title, licence, citation)
+        return AbsentDataset(dataset["name"], title, licence, citation)
     is_only_drawn = runner.train_first and not runner.evaluates_trained
     if is_only_drawn and find(planned, runner.messages.warn) is None:
         raise MissingError(
             f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first"
         )
-    made = runner.ingest(config)
-    files = {Path(name).stem: made.folder / name for name in made.outputs}
-    return StoredDataset(own["name"], title, kind_of(own), made.config, files, licence, citation)
+    artefact = runner.ingest(config)
+    files = {Path(name).stem: artefact.folder / name for name in artefact.outputs}
+    return StoredDataset(
+        dataset["name"], title, kind_of(dataset), artefact.config, files, licence, citation
+    )
 
 
 def _error_of(
     study: Study, comparisons: Mapping[str, Comparison], runner: Runner
 ) -> JobsFailedError | None:
-    """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
+    """The error that a study ends with after its report.
+
+    Raised at once where there is nothing to report, or not without what failed.
+    """
     reasons: dict[str, list[str]] = {}
     for name, failure in (
-        pair for own in comparisons.values() for pair in named_failures(own.jobs)
+        pair for comparison in comparisons.values() for pair in named_failures(comparison.jobs)
     ):
         if failure.detail:
             runner.messages.warn(f"{name}:\n{failure.detail}")
         reasons.setdefault(failure.message, []).append(name)
-    jobs = [job for own in comparisons.values() for job in own.jobs]
+    jobs = [job for comparison in comparisons.values() for job in comparison.jobs]
     error = None
     if reasons:
         listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
@@ -364,11 +418,13 @@ def _error_of(
         error = JobsFailedError(
             f"{n_failed} of {len(jobs)} jobs failed, the others are kept; {listed}"
         )
-    nothing = bool(study.parts) and not any(own.members for own in comparisons.values())
+    nothing = bool(study.parts) and not any(
+        comparison.members for comparison in comparisons.values()
+    )
     unfinished = [
         name_in_part(part, name, comparisons)
-        for part, own in comparisons.items()
-        for name in own.unfinished
+        for part, comparison in comparisons.items()
+        for name in comparison.unfinished
     ]
     if unfinished and runner.train_first and (nothing or not study.shows_failed):
         option = " --train-missing" if runner.evaluates_trained else ""
@@ -380,23 +436,26 @@ def _error_of(
         raise error
     if nothing:
         raise DataError(
-            f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}"
+            "no estimator was done in this time; the same command goes on with: "
+            f"{', '.join(unfinished)}"
         )
     if unfinished and not runner.dry_run:
         going_on = command_line("run" if study.file.name else "sweep", study.words)
         option = " --train-missing" if runner.evaluates_trained else ""
-        more = f" and {len(unfinished) - MAX_NAMED} more" if len(unfinished) > MAX_NAMED else ""
         runner.messages.line(
             "note",
             REPORT,
             f"{len(unfinished)} of {len(jobs)} not done",
-            f"{', '.join(unfinished[:MAX_NAMED])}{more}; '{going_on}{option}' goes on with them",
+            f"{abbreviated(unfinished, MAX_NAMED)}; '{going_on}{option}' goes on with them",
         )
     return error
 
 
-def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
+def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
+    """Train and calibrate one estimator.
+
+    Empty where it was stopped before its first epoch was over; raises `VehestError`.
+    """
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
         members, failures = runner.run(Comparison([Job(config)]).plan(runner))
@@ -417,10 +476,14 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     }
 
 
-def evaluate_one(
+def evaluate_model(
     overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Evaluate a model by folder or start of its name, or the one that overrides train, on the tests of a split; raises `MissingError`."""
+    """Evaluate a model by folder or start of its name, or the one that overrides train, on the
+    tests of a split.
+
+    Raises `MissingError`.
+    """
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)
@@ -431,23 +494,24 @@ def evaluate_one(
             trained = model_artefact(find_model(model, runner.output, note))
             if not any(key_of(override).split(".")[0] == "downsample" for override in overrides):
                 config["downsample"] = preparation_of(trained.folder)
-            how = runner.evaluation(
+            evaluation = runner.evaluation(
                 config, runner.data_for(split, trained_rate(trained), config), faults_of(config)
             )
-            check_channels(how.faults, split, how.data)
+            check_channels(evaluation.faults, split, evaluation.data)
         else:
             (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
-            if (found := find(plan, runner.messages.warn)) is None:
+            if (existing_model := find(plan, runner.messages.warn)) is None:
                 training = overrides_of_config(overrides, compose_config("train"))
                 raise MissingError(
-                    f"{plan.label} has not been trained; run '{command_line('train', training)}' first"
+                    f"{plan.label} has not been trained; run '{command_line('train', training)}' "
+                    "first"
                 )
             assert group.evaluation is not None
-            trained = found
-            how = group.evaluation
-        calibration = _calibration(trained, how, runner)
-        artefact = runner.ensure(*how.of(trained, calibration))
+            trained = existing_model
+            evaluation = group.evaluation
+        calibration = _calibration(trained, evaluation, runner)
+        artefact = runner.ensure(*evaluation.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
     return {
         "folder": str(artefact.folder),
@@ -457,20 +521,24 @@ def evaluate_one(
     }
 
 
-def _calibration(model: Artefact, how: Evaluation, runner: Runner) -> Artefact | None:
-    """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
+def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Artefact | None:
+    """The calibration of a model: made on the split that it is evaluated on if it was trained
+    there, else looked for.
+    """
     learnt = learnt_spans(model)
-    found = None
+    calibration = None
     if model.status == "complete" and (
-        not learnt or set(learnt) == {*how.split.train, *how.split.validation}
+        not learnt or set(learnt) == {*evaluation.split.train, *evaluation.split.validation}
     ):
-        job = plan_calibrate(model, how.split, how.data, runner.output, how.cars)
+        job = plan_calibrate(
+            model, evaluation.split, evaluation.data, runner.output, evaluation.cars
+        )
         if job is not None:
-            found = runner.ensure(*job)
+            calibration = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests
-        found = calibration_of(model.folder, runner.output)
-    if found is None:
+        calibration = calibration_of(model.folder, runner.output)
+    if calibration is None:
         runner.messages.line(
             "note", "calibrate", model.label, "has no calibration, so its estimates have no bands"
         )
-    return found
+    return calibration

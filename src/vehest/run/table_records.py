@@ -1,15 +1,17 @@
-"""Records of tables in results/ that a command outside pipelines made, and their comparison with today's code and raw files.
+"""Records of tables in results/ that a command outside pipelines made, and their comparison with
+today's code and raw files.
 
-command -> `record_tables` -> ``tables`` and ``keys`` in provenance.json of the folder -> `changes_of_tables` -> `vehest report --check`
+command -> `record_tables` -> ``tables`` and ``keys`` in provenance.json of the folder ->
+`changes_of_tables` -> `vehest report --check`
 
-A key is named ``TABLE: WHAT``. WHAT is ``content`` (the table as it was written), ``script FILE`` (the line ``VERSION = "…"`` of the
-script that made it), ``data DATASET`` (its ingest and raw files), ``files PATTERN`` (raw files below VEHEST_DATA that belong to no data
-set) or a stage with a name, ``train ksnn``.
+A key is named ``TABLE: WHAT``. WHAT is ``content`` (the table as it was written), ``script FILE``
+(the line ``VERSION = "…"`` of the script that made it), ``data DATASET`` (its ingest and raw
+files), ``files PATTERN`` (raw files below VEHEST_DATA that belong to no data set) or a stage with a
+name, ``train ksnn``.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +23,7 @@ from vehest.artefacts.keys import hash_of
 from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.files import sha256_of, written_aside
-from vehest.data.text_files import read_json
+from vehest.data.text_files import read_json, write_json
 from vehest.run.ingest import plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, TableRecord
 from vehest.run.versions import code_of
@@ -30,7 +32,8 @@ VERSION_LINE = re.compile(r'^VERSION = "(.+?)"', re.MULTILINE)
 
 
 class RowKeys(NamedTuple):
-    """Keys of a table's groups of rows, where a command may make some groups alone, as ``--only gru``.
+    """Keys of a table's groups of rows, where a command may make some groups alone, as ``--only
+    gru``.
 
     Attributes
     ----------
@@ -55,17 +58,27 @@ def record_tables(
 
     Tables outside results/, of a trial, are not recorded.
 
-    Args:
-        tables: files just written, all in one folder; files that are not there are left out.
-        command: what makes them again.
-        determined_by: what else all numbers follow from, as in the names of keys. While rows of an earlier run
-            stay, a recorded key of it stays too: the table is stale until all rows are made with today's.
-        without_keys: what of them was made before keys were recorded.
-        rows: further keys, each of some rows; groups without a recorded key are named as ``without_keys``.
+    Parameters
+    ----------
+    tables : Sequence[Path]
+        Files just written, all in one folder; files that are not there are left out.
+    command : str
+        What makes them again.
+    determined_by : Sequence[str]
+        What else all numbers follow from, as in the names of keys. While rows of an earlier run
+        stay, a recorded key of it stays too: the table is stale until all rows are made with
+        today's.
+    without_keys : str
+        What of them was made before keys were recorded.
+    rows : RowKeys or None
+        Further keys, each of some rows; groups without a recorded key are named as
+        ``without_keys``.
 
-    Raises:
-        MissingError: raw files that the numbers follow from are not here, as where a record is written
-            after the tables; without their digest the tables would be stale wherever the files are.
+    Raises
+    ------
+    MissingError
+        Raw files that the numbers follow from are not here, as where a record is written after the
+        tables; without their digest the tables would be stale wherever the files are.
     """
     file = tables[0].parent / PROVENANCE
     if file.parent.parent.name != RESULTS.name:
@@ -75,56 +88,55 @@ def record_tables(
     about = provenance()
     record = {"command": command, "created": about["created"], "commit": about["commit"]}
     keys = {
-        what: key
-        for what, key in recorded.get("keys", {}).items()
-        if what.partition(": ")[0] not in names
+        origin: key
+        for origin, key in recorded.get("keys", {}).items()
+        if origin.partition(": ")[0] not in names
     }
     remade, former = rows or RowKeys({}, {})
     records = dict(recorded.get("tables", {}))
     for name in names:
         before = {
-            what: key
-            for what, key in recorded.get("keys", {}).items()
-            if what.startswith(f"{name}: ")
+            origin: key
+            for origin, key in recorded.get("keys", {}).items()
+            if origin.startswith(f"{name}: ")
         }
         keys[f"{name}: content"] = today_of(f"{name}: content", file.parent)
-        for what in (*determined_by, *former.values(), *remade.values()):
-            key = f"{name}: {what}"
-            if former and key in before and what not in remade.values():
+        for origin in (*determined_by, *former.values(), *remade.values()):
+            key = f"{name}: {origin}"
+            if former and key in before and origin not in remade.values():
                 keys[key] = before[key]
-            elif what not in former.values():
+            elif origin not in former.values():
                 keys[key] = today_of(key, file.parent)
             else:
                 continue
-            if what.startswith(("data ", "files ")) and "data" not in keys[key]:
+            if origin.startswith(("data ", "files ")) and "data" not in keys[key]:
                 raise MissingError(
-                    f"'{file}' cannot record '{name}': raw files of {what} are not here"
+                    f"'{file}' cannot record '{name}': raw files of {origin} are not here"
                 )
-        groups = [group for group, what in former.items() if f"{name}: {what}" not in before]
+        groups = [group for group, origin in former.items() if f"{name}: {origin}" not in before]
         remark = f"rows of {', '.join(groups)}" if groups else without_keys
         records[name] = record | ({"without_keys": remark} if remark else {})
     with written_aside(file) as aside:
-        aside.write_text(
-            json.dumps({"tables": records, "keys": keys}, indent=1, ensure_ascii=False) + "\n",
-            encoding="utf-8",
-        )
+        write_json(aside, {"tables": records, "keys": keys})
 
 
 def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
     """What a key of a table in ``folder`` is today; without ``data`` where raw files are not here.
 
-    Raises:
-        ConfigurationError: the name is unknown.
+    Raises
+    ------
+    ConfigurationError
+        The name is unknown.
     """
-    table, _, what = key.partition(": ")
-    kind, _, name = what.partition(" ")
-    if what == "content":
+    table, _, origin = key.partition(": ")
+    kind, _, name = origin.partition(" ")
+    if origin == "content":
         file = folder / table
         return {"data": sha256_of(file)[:16] if file.is_file() else "removed"}
     if kind == "script":
         script = CHECKOUT / name
-        found = VERSION_LINE.search(script.read_text("utf-8")) if script.is_file() else None
-        return {"code": f"{name}={found[1] if found else 'none'}"}
+        version = VERSION_LINE.search(script.read_text("utf-8")) if script.is_file() else None
+        return {"code": f"{name}={version[1] if version else 'none'}"}
     if kind == "data":
         config = compose_config("ingest", [f"dataset={name}", *overrides])
         entry = {"code": code_of("ingest", str(config["dataset"]["source"]))}
@@ -144,18 +156,21 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str] = (),
 ) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when tables were made and its cause; a note on what was not compared."""
+    """Pairs of what differs from when tables were made and its cause.
+
+    A note on what was not compared.
+    """
     changes = []
     missing = []
-    for what, then in keys.items():
+    for key, then in keys.items():
         try:
-            today = today_of(what, folder, overrides)
+            today = today_of(key, folder, overrides)
         except ConfigurationError:
-            changes.append((f"{what} removed", "configuration"))
+            changes.append((f"{key} removed", "configuration"))
             continue
-        changes += [(what, cause) for cause in today if today[cause] != then.get(cause)]
+        changes += [(key, cause) for cause in today if today[cause] != then.get(cause)]
         if "data" in then and "data" not in today:
-            missing.append(what.partition(": ")[2].partition(" ")[2])
+            missing.append(key.partition(": ")[2].partition(" ")[2])
     files = {file.name for file in folder.iterdir()} - {PROVENANCE}
     changes += [(f"{name} without a record", "data") for name in sorted(files - records.keys())]
     notes = [

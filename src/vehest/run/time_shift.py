@@ -1,4 +1,6 @@
-"""The shift between the clock of an estimate and that of a recording, by correlation with the reference."""
+"""The shift between the clock of an estimate and that of a recording, by correlation with the
+reference.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ MAX_RATE = 100.0  # Hz, at which both are correlated at most
 MIN_OVERLAP_SECONDS = 5.0
 MIN_OVERLAP_SHARE = 0.5  # of the shorter of both
 MIN_VARIANCE_RATIO = 1.5
-"""By which the second best shift must leave more variance unexplained than the best one, to be refused otherwise."""
+"""By which the second best shift must leave more variance unexplained than the best one, to be
+refused otherwise.
+"""
 
 MIN_UNEXPLAINED = 1e-3  # share of the variance, below which two shifts are equally good
 
@@ -39,7 +43,9 @@ class Series:
         return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
 
     def sampled(self, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-        """Deviations from the mean on a uniform clock, 0 where there is no sample, and 1 where there is one."""
+        """Deviations from the mean on a uniform clock, 0 where there is no sample, and 1 where
+        there is one.
+        """
         grid = self.time[0] + np.arange(int((self.time[-1] - self.time[0]) * rate_hz) + 1) / rate_hz
         finite = np.isfinite(self.values)
         measured = np.interp(grid, self.time, finite.astype(np.float64)) > 0.999
@@ -79,11 +85,13 @@ def estimate_shift(estimate: Series, reference: Series) -> Shift:
         raise DataError("--shift auto: both are too short to correlate; give --shift SECONDS")
     best = int(np.argmax(correlations))
     peak = float(correlations[best])
-    other = _second_peak(correlations, best)
-    second = float(correlations[other]) if other is not None else 0.0
+    second_best = _second_peak(correlations, best)
+    second = float(correlations[second_best]) if second_best is not None else 0.0
     unexplained = max(1.0 - max(peak, 0.0) ** 2, MIN_UNEXPLAINED)
     if 1.0 - max(second, 0.0) ** 2 < MIN_VARIANCE_RATIO * unexplained:
-        alternative = f", {second:.2f} at {shifts[other]:.3g} s" if other is not None else ""
+        alternative = (
+            f", {second:.2f} at {shifts[second_best]:.3g} s" if second_best is not None else ""
+        )
         raise DataError(
             f"--shift auto is ambiguous: its correlation with the reference is {peak:.2f} at "
             f"{shifts[best]:.3g} s{alternative}; give --shift SECONDS"
@@ -96,7 +104,10 @@ def _correlations(
     estimate: tuple[FloatArray, FloatArray],
     rate_hz: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Pearson's correlation of the samples in common at every lag of the estimate in samples; -inf where these are too few."""
+    """Pearson's correlation of the samples in common at every lag of the estimate in samples.
+
+    -inf where these are too few.
+    """
     a, has_a = reference
     b, has_b = estimate
     size = len(a) + len(b) - 1
@@ -135,12 +146,14 @@ def _second_peak(correlations: FloatArray, best: int) -> int | None:
         high += 1
     outside = correlations.copy()
     outside[low : high + 1] = -np.inf
-    other = int(np.argmax(outside))
-    return other if np.isfinite(outside[other]) else None
+    highest = int(np.argmax(outside))
+    return highest if np.isfinite(outside[highest]) else None
 
 
 def _vertex(correlations: FloatArray, best: int) -> float:
-    """Place of the vertex of the parabola through the best lag and its neighbours, in samples from it."""
+    """Place of the vertex of the parabola through the best lag and its neighbours, in samples from
+    it.
+    """
     if not 0 < best < len(correlations) - 1:
         return 0.0
     before, peak, after = correlations[best - 1 : best + 2]

@@ -1,6 +1,8 @@
-"""Logs trainings, calibrations and evaluations to MLflow, one run an artefact, found again by its tags.
+"""Logs trainings, calibrations and evaluations to MLflow, one run an artefact, found again by its
+tags.
 
-One process writes. When the store does not answer, work goes on without it, and the next run logs the missing artefacts.
+One process writes. When the store does not answer, work goes on without it, and the next run logs
+the missing artefacts.
 """
 
 from __future__ import annotations
@@ -60,7 +62,10 @@ class Tracker:
 
     @property
     def store(self) -> str:
-        """Name of the local store in the output root; empty where nothing is tracked, or a server has the runs."""
+        """Name of the local store in the output root.
+
+        Empty where nothing is tracked, or a server has the runs.
+        """
         return STORE if self.config.get("name") == "mlflow" and not self.config.get("uri") else ""
 
     def log(self, *artefacts: Artefact | None) -> None:
@@ -77,7 +82,8 @@ class Tracker:
         except Exception as error:  # results matter more than any failure of a tracking server
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
             self.warn(
-                f"logging to MLflow at {printable(self._address)} failed ({why}); going on without tracking, the next run makes up for it"
+                f"logging to MLflow at {printable(self._address)} failed ({why}); going on without "
+                "tracking, the next run makes up for it"
             )
 
     def _log(self, artefact: Artefact) -> None:
@@ -85,11 +91,11 @@ class Tracker:
 
         client = self._client
         tags = {KEY_TAG: artefact.key, STAGE_TAG: artefact.stage, DIGEST_TAG: artefact.digest}
-        found = self._runs(tags)
-        if any(run.info.status != "RUNNING" for run in found):
+        runs = self._runs(tags)
+        if any(run.info.status != "RUNNING" for run in runs):
             return
         begun = [
-            run for run in found if run.data.tags.get(OUTPUT_TAG) == self._root
+            run for run in runs if run.data.tags.get(OUTPUT_TAG) == self._root
         ]  # by a process that was killed
         run = (
             begun[0]
@@ -136,10 +142,10 @@ class Tracker:
         return get_artifact_repository(address, tracking_uri=self._address)
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
-        wanted = " and ".join(
+        condition = " and ".join(
             f"tags.`{name}` = '{value}'" for name, value in tags.items()
         )  # hashes and names of files: without quotes
-        return list(self._client.search_runs([self._experiment_id], wanted))
+        return list(self._client.search_runs([self._experiment_id], condition))
 
     def _new_run(self, name: str, tags: Mapping[str, str]) -> Any:
         source = " ".join(["vehest", *sys.argv[1:]])[:VALUE_LENGTH]
@@ -149,9 +155,9 @@ class Tracker:
     def _parent(self) -> str:
         """Run of the study, above those of its artefacts."""
         tags = {STUDY_TAG: self.study, STAGE_TAG: "study"}
-        own = [run for run in self._runs(tags) if run.data.tags.get(OUTPUT_TAG) == self._root]
-        run_id = str((own[0] if own else self._new_run(self.study, tags)).info.run_id)
-        if not own:
+        runs = [run for run in self._runs(tags) if run.data.tags.get(OUTPUT_TAG) == self._root]
+        run_id = str((runs[0] if runs else self._new_run(self.study, tags)).info.run_id)
+        if not runs:
             self._client.set_terminated(run_id, "FINISHED")
         return run_id
 
@@ -186,8 +192,12 @@ class Tracker:
     def _experiment_id(self) -> str:
         name = str(self.config.get("experiment", "vehest"))
         location = (self.output / "mlartifacts").resolve().as_uri() if self.store else None
-        found = self._client.get_experiment_by_name(name)
-        return str(found.experiment_id if found else self._client.create_experiment(name, location))
+        experiment = self._client.get_experiment_by_name(name)
+        return str(
+            experiment.experiment_id
+            if experiment
+            else self._client.create_experiment(name, location)
+        )
 
     @property
     def _root(self) -> str:

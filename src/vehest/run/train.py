@@ -70,12 +70,26 @@ class TrainJob:
 
 
 def estimator_rate(config: Mapping[str, Any]) -> float:
-    """The rate that the estimator of a configuration works at [Hz]; raises `ConfigurationError` for a wrong setting."""
+    """The rate that the estimator of a configuration works at [Hz].
+
+    Raises
+    ------
+    ConfigurationError
+        A wrong setting.
+    """
     return new_estimator(config["estimator"]).settings.rate_hz
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
+    """A training and its artefact.
+
+    Raises
+    ------
+    ConfigurationError
+        A wrong setting or nothing to learn.
+    DataError
+        Without a recording.
+    """
     estimator = new_estimator(config["estimator"])
     seed = config["seed"]
     options = training_options(config)
@@ -85,7 +99,8 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         split = replace(split, train=(), validation=())
     elif not split.train:
         raise ConfigurationError(
-            f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' learns; take another split"
+            f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' "
+            "learns; take another split"
         )
     ranges = {
         "train": [_plain(span) for span in split.train],
@@ -101,10 +116,7 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         "seed": seed,
         **ranges,
     }
-    inputs = {
-        f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span)
-        for span in (*split.train, *split.validation)
-    }
+    inputs = digests_of_spans(data, (*split.train, *split.validation))
     label = f"{estimator.name}-{estimator.variant}-seed{seed}"
     plan = StagePlan(
         STAGE,
@@ -119,7 +131,11 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
 
 
 def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a training that enter its key: those that differ from their defaults, and the seed; raises `ConfigurationError`."""
+    """Options of a training that enter its key: those that differ from their defaults, and the
+    seed.
+
+    Raises `ConfigurationError`.
+    """
     estimator = new_estimator(config["estimator"])
     training: Any = settings_from_config(estimator.training_type, config["training"], "training")
     changed = changed_options(training)
@@ -141,7 +157,13 @@ def _plain(span: Span) -> dict[str, str]:
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone; raises `DataError` where recordings do not fit the estimator."""
+    """Train the jobs of one group together, each as if it were alone.
+
+    Raises
+    ------
+    DataError
+        Recordings do not fit the estimator.
+    """
     first = jobs[0]
     members = [new_estimator(job.estimator) for job in jobs]
     for member, job in zip(members, jobs, strict=True):
@@ -149,9 +171,7 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
     training: Any = settings_from_config(members[0].training_type, first.training, "training")
     train, validation = (
         [
-            read_recording(recording_file(first.data[span.dataset], span)).cut(
-                span.start, span.stop
-            )
+            read_recording(stored_recording(first.data, span)).cut(span.start, span.stop)
             for span in spans
         ]
         for spans in (first.split.train, first.split.validation)
@@ -161,7 +181,9 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
-    """Write a fitted estimator, its history, its figures and, in a file of their own, its times into ``folder``."""
+    """Write a fitted estimator, its history, its figures and, in a file of their own, its times
+    into ``folder``.
+    """
     about = {
         "seed": job.seed,
         "trained_on": [span.describe() for span in job.split.train],
@@ -228,15 +250,20 @@ def trained_rate(model: Artefact) -> float:
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
-    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles."""
+    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those
+    of the named roles.
+    """
 
     def ranges(config: Mapping[str, Any]) -> list[Span]:
-        named = [own for role in roles or ("train", "validation") for own in config[role]]
         return [
             Span(
-                str(own["dataset"]), str(own["recording"]), float(own["start"]), float(own["stop"])
+                str(entry["dataset"]),
+                str(entry["recording"]),
+                float(entry["start"]),
+                float(entry["stop"]),
             )
-            for own in named
+            for role in roles or ("train", "validation")
+            for entry in config[role]
         ]
 
     return _from_manifest(model, ranges)
@@ -253,7 +280,9 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
 
 
 def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as
+    `pretrained_folder` or a saved model.
+    """
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != STAGE:
@@ -270,18 +299,37 @@ def model_artefact(folder: Path) -> Artefact:
     )
 
 
-def recording_file(data: Artefact, span: Span) -> Path:
-    """The stored recording of a span; raises `DataError` where the data set does not have it."""
-    file_digest(data, span)
-    return data.folder / f"{span.recording}.parquet"
+def stored_recording(data: Mapping[str, Artefact], span: Span) -> Path:
+    """The file of a span's recording.
 
+    Parameters
+    ----------
+    data : mapping
+        Data set -> its recordings.
+    span : Span
+        Range of a recording.
 
-def file_digest(data: Artefact, span: Span) -> str:
-    """Digest of the recording of a span; raises `DataError` where the data set does not have it."""
+    Raises
+    ------
+    DataError
+        The data set does not have the recording.
+    """
+    artefact = data[span.dataset]
     name = f"{span.recording}.parquet"
-    if name not in data.outputs:
-        known = ", ".join(sorted(Path(file).stem for file in data.outputs))
+    if name not in artefact.outputs:
+        available = ", ".join(sorted(Path(file).stem for file in artefact.outputs))
         raise DataError(
-            f"data set '{span.dataset}' has no recording '{span.recording}' (it has {known}); correct the split"
+            f"data set '{span.dataset}' has no recording '{span.recording}' "
+            f"(it has {available}); correct the split"
         )
-    return data.outputs[name]
+    return artefact.folder / name
+
+
+def digests_of_spans(data: Mapping[str, Artefact], spans: Iterable[Span]) -> dict[str, str]:
+    """``DATASET/RECORDING`` -> digest of its file; raises as `stored_recording`."""
+    return {
+        f"{span.dataset}/{span.recording}": data[span.dataset].outputs[
+            stored_recording(data, span).name
+        ]
+        for span in spans
+    }

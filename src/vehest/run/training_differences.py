@@ -1,4 +1,6 @@
-"""Options that distinguish trainings of one variant and one seed, which the variant's name does not say."""
+"""Options that distinguish trainings of one variant and one seed, which the variant's name does not
+say.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Usability of recordings: contents and configuration -> missing channels, transforms that supply them, settings that avoid them."""
+"""Usability of recordings: contents and configuration -> missing channels, transforms that supply
+them, settings that avoid them.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vehest.configuration.composition import Config, compose_config
 from vehest.configuration.files import choices
-from vehest.data.derivable_channels import Derivation, derivation_of, made_by
+from vehest.data.derivable_channels import Derivation, channels_made_by, derivation_of
 from vehest.data.errors import ConfigurationError, VehestError
 from vehest.data.recording_summary import RecordingSummary, common_channels
 from vehest.data.schema import settings_from_config
@@ -33,7 +35,9 @@ SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
 @dataclass(frozen=True)
 class Missing:
-    """Channels that some recording lacks, those that an estimator reads and those that its fit reads."""
+    """Channels that some recording lacks, those that an estimator reads and those that its fit
+    reads.
+    """
 
     to_estimate: list[str]
     to_train: list[str]
@@ -60,7 +64,7 @@ class Usability:
 
     estimator: str  # name in conf/estimator
     rate_hz: float | None  # that it would run at [Hz]; None where its settings are incomplete
-    own_rate_hz: float | None  # of its configuration [Hz]
+    configured_rate_hz: float | None  # of its configuration [Hz]
     missing: Missing  # channels that the recordings lack
     gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
     settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
@@ -68,7 +72,7 @@ class Usability:
     patterns: tuple[
         str, ...
     ] = ()  # overrides that its fit needs, since it asks for recordings by other names
-    to_give: str = ""  # setting that only the user knows, or why it cannot be used at all, in words; empty if none
+    to_give: str = ""  # setting that only the user knows, or why it is unusable
     car: tuple[
         str, ...
     ] = ()  # keys of the car's parameters, which are those of another car unless given
@@ -96,7 +100,7 @@ class Usability:
             "estimator": self.estimator,
             "usable": self.usable,
             "rate_hz": self.rate_hz,
-            "own_rate_hz": self.own_rate_hz,
+            "own_rate_hz": self.configured_rate_hz,
             "missing_to_estimate": self.missing.to_estimate,
             "missing_to_train": self.missing.to_train,
             "supplies": {
@@ -114,40 +118,26 @@ class Usability:
 def all_usabilities(
     recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None = None
 ) -> list[Usability]:
-    """A row for each estimator of conf/estimator, then of other packages that have no file there, with the car of a data set, if any.
+    """A row for each estimator of conf/estimator, then of other packages that have no file there,
+    with the car of a data set, if any.
 
-    There is at least one recording. A file or a package that cannot be used is a row with the reason.
+    There is at least one recording. A file or a package that cannot be used is a row with the
+    reason.
     """
-    rows = [_choice_usability(name, recordings, dataset) for name in choices("estimator")]
-    listed = {row.estimator for row in rows}
-    for name in estimator_names():
-        if name not in listed:
-            config: Config = {"estimator": {"name": name}, "training": {}}
-            rows.append(_usability_with_car(name, config, recordings, dataset))
+    cars = [car_of(dataset)] if dataset else []
+    with_files = choices("estimator")
+    rows = []
+    for name in dict.fromkeys((*with_files, *estimator_names())):
+        config: Config = {"estimator": {"name": name}, "training": {}}
+        try:
+            if name in with_files:
+                config = compose_config("train", [f"estimator={name}"])
+            rows.append(usability(name, with_car_values(config, cars), recordings))
+        except ConfigurationError as error:
+            if name not in with_files:
+                raise
+            rows.append(Usability(name, None, None, Missing([], [], {}), to_give=str(error)))
     return rows
-
-
-def _choice_usability(
-    name: str, recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None
-) -> Usability:
-    """The row of a file of conf/estimator; one that is no configuration is unusable for the reason that its error names."""
-    try:
-        config = compose_config("train", [f"estimator={name}"])
-        return _usability_with_car(name, config, recordings, dataset)
-    except ConfigurationError as error:
-        return Usability(name, None, None, Missing([], [], {}), to_give=str(error))
-
-
-def _usability_with_car(
-    name: str,
-    config: Config,
-    recordings: Sequence[RecordingSummary],
-    dataset: Mapping[str, Any] | None,
-) -> Usability:
-    """A row with the car of a data set, if any."""
-    return usability(
-        name, with_car_values(config, [car_of(dataset)] if dataset else []), recordings
-    )
 
 
 def usability(
@@ -196,8 +186,8 @@ def _usability(
         if recordings
         else ()
     )
-    own_rate = estimator.settings.rate_hz
-    rate = min([own_rate, *(summary.rate_hz for summary in summaries)])
+    configured_rate = estimator.settings.rate_hz
+    rate = min([configured_rate, *(summary.rate_hz for summary in summaries)])
     gappy = {name for summary in summaries for name in summary.gappy}
     gaps = tuple(
         channel
@@ -208,7 +198,7 @@ def _usability(
     return Usability(
         name,
         rate,
-        own_rate,
+        configured_rate,
         missing,
         gaps,
         settings,
@@ -221,7 +211,9 @@ def _usability(
 
 
 def _overrides_of_car(estimator: Estimator) -> str:
-    """Overrides with values of the car that a first comparison needs and the settings do not have yet, for people."""
+    """Overrides with values of the car that a first comparison needs and the settings do not have
+    yet, for people.
+    """
     overrides = " ".join(trial.overrides for trial in estimator.trials)
     if "{car}" in overrides:
         return "estimator.car.mass=… and the car's other values"
@@ -242,7 +234,9 @@ def car_parameters(estimator: str) -> tuple[str, ...]:
 
 
 def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
-    """A table of estimators, transforms that make channels that some lack, and estimators that take another car's parameters."""
+    """A table of estimators, transforms that make channels that some lack, and estimators that take
+    another car's parameters.
+    """
     supplies = {
         channel: supply.in_words()
         for row in rows
@@ -259,7 +253,8 @@ def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     if borrowing:
         names = ", ".join(borrowing)
         lines.append(
-            f"{names} require the parameters of your car, estimator.car.mass=… and so on; the defaults are those of another car"
+            f"{names} require the parameters of your car, estimator.car.mass=… and so on; the "
+            "defaults are those of another car"
         )
     return lines
 
@@ -291,8 +286,8 @@ def _cells(row: Usability) -> list[str]:
         "exclude the gaps in conf/split" if row.gaps else "",
     ]
     rate = "" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
-    if row.rate_hz is not None and row.rate_hz != row.own_rate_hz:
-        rate += f", not {row.own_rate_hz:g}"
+    if row.rate_hz is not None and row.rate_hz != row.configured_rate_hz:
+        rate += f", not {row.configured_rate_hz:g}"
     return [
         row.estimator,
         row.usable,
@@ -302,13 +297,14 @@ def _cells(row: Usability) -> list[str]:
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
-    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none; raises `ConfigurationError`."""
+    """Channels that recordings of a split lack and its estimator needs, as one line.
+
+    Empty if none; raises `ConfigurationError`.
+    """
     estimator, training = _built(config)
-    tested = (
-        [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
-    )
+    tested = split.test_spans if "evaluation" in config else ()
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
-    derived = made_by(config["downsample"]["transforms"])  # of references they are no part
+    derived = channels_made_by(config["downsample"]["transforms"])  # of references they are no part
     to_train, to_estimate = (
         [replace(summary, channels=summary.channels | derived) for summary in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)
@@ -334,11 +330,15 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         and_more = f" and {len(incomplete) - 1} more lack" if len(incomplete) > 1 else " lacks"
         reasons = Missing([], [], by_scores.supplies | usable.missing.supplies).in_words()
         without = [usable.without] if usable.settings else []
-        return f"recording '{incomplete[0]}'{and_more} channels that estimator '{estimator.name}' requires: {'; '.join([*reasons, *without])}"
+        return (
+            f"recording '{incomplete[0]}'{and_more} channels that estimator '{estimator.name}' "
+            f"requires: {'; '.join([*reasons, *without])}"
+        )
     trained = [summary.id for summary in _recordings(split.train, contents)]
     patterns = estimator.unmatched_patterns(training, trained) if trained else ()
     return (
-        f"no training recording has a name that estimator '{estimator.name}' expects; set {', '.join(patterns)}"
+        f"no training recording has a name that estimator '{estimator.name}' expects; set "
+        f"{', '.join(patterns)}"
         if patterns
         else ""
     )
@@ -353,7 +353,10 @@ def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSumma
 def _recordings(
     spans: Sequence[Span], contents: Mapping[str, Sequence[RecordingSummary]]
 ) -> list[RecordingSummary]:
-    """The recordings of ranges, each once; unknown ones are skipped, and reported where they are read."""
+    """The recordings of ranges, each once.
+
+    Unknown ones are skipped, and reported where they are read.
+    """
     named = {(span.dataset, span.recording) for span in spans}
     return [
         summary
@@ -389,7 +392,10 @@ def _missing(
 
 
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
-    """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks; none where nothing is learnt."""
+    """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks.
+
+    None where nothing is learnt.
+    """
     required = (
         (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
     )
@@ -412,7 +418,10 @@ def _settings_without(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> tuple[tuple[str, ...], str]:
-    """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
+    """Overrides that avoid channels without a supply, taken while they help.
+
+    And the same in words.
+    """
     changes: dict[str, Any] = {}
     while missing:
         tried = []
@@ -449,7 +458,9 @@ def _settings_without(
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, Any]]:
-    """Each other choice of a setting with two or a few, and each list of channels without one of them."""
+    """Each other choice of a setting with two or a few, and each list of channels without one of
+    them.
+    """
     settings = new_estimator(config["estimator"]).settings
     for key, hint in get_type_hints(type(settings)).items():
         now = getattr(settings, key, None)

@@ -20,9 +20,13 @@ FAULTS = "3"  # of an evaluation's faults, likewise
 
 
 def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
-    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or study by name, and of ``faults``.
+    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or
+    study by name, and of ``faults``.
 
-    Raises `ConfigurationError` where the name is unknown.
+    Raises
+    ------
+    ConfigurationError
+        The name is unknown.
     """
     code = f"{stage}={VERSIONS[stage]}"
     if stage == "ingest":
@@ -37,7 +41,8 @@ def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
 
 
 def is_of_other_stages(code: str) -> bool:
-    """Whether a recorded version names another version of a stage than today's, or is a hash of code, as versions were before.
+    """Whether a recorded version names another version of a stage than today's, or is a hash of
+    code, as versions were before.
 
     Versions of classes are not compared.
     """

@@ -1,8 +1,11 @@
-"""Publishes the models of a study in one file, from which the same trainings are taken elsewhere instead of being repeated.
+"""Publishes the models of a study in one file, from which the same trainings are taken elsewhere
+instead of being repeated.
 
-models -> `PublishedWeights.add` -> results/STUDY/weights.safetensors -> `PublishedWeights.write` -> folder of a training with the same key
+models -> `PublishedWeights.add` -> results/STUDY/weights.safetensors -> `PublishedWeights.write` ->
+folder of a training with the same key
 
-Each model has its digest in the file, so that the file is consistent by itself: it grows training by training, and is replaced in one step.
+Each model has its digest in the file, so that the file is consistent by itself: it grows training
+by training, and is replaced in one step.
 """
 
 from __future__ import annotations
@@ -64,7 +67,8 @@ class PublishedWeights:
         return key in self._models
 
     def add(self, models: Iterable[Artefact]) -> int:
-        """Add models of finished trainings, in one step: whoever reads or is killed finds the file of before or after.
+        """Add models of finished trainings, in one step: whoever reads or is killed finds the file
+        of before or after.
 
         Returns
         -------
@@ -111,7 +115,8 @@ class PublishedWeights:
         return len(added)
 
     def write(self, key: str, folder: Path) -> None:
-        """Write a model into the folder of its training, byte for byte as that did, but without times.
+        """Write a model into the folder of its training, byte for byte as that did, but without
+        times.
 
         Raises
         ------
@@ -134,7 +139,8 @@ class PublishedWeights:
         names = [WEIGHTS, *record.files]
         if hash_of({name: sha256_of(folder / name) for name in names}) != record.digest:
             raise DataError(
-                f"'{self.path}' was changed after it was published: {record.label} does not have its digest; "
+                f"'{self.path}' was changed after it was published: {record.label} does not have "
+                "its digest; "
                 f"restore the file by 'git checkout {self.path}', or add --retrain"
             )
 
@@ -150,7 +156,8 @@ class PublishedWeights:
                 )
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             raise DataError(
-                f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout {self.path}', "
+                f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout "
+                f"{self.path}', "
                 "remove it, or add --retrain"
             ) from error
 
@@ -165,7 +172,10 @@ def _record_of(model: Artefact) -> PublishedModel:
 def publish_weights(
     weights: PublishedWeights, models: Sequence[Artefact], output: Path, messages: Messages
 ) -> bool:
-    """Add models of finished trainings to a study's published weights; returns whether there was room for them."""
+    """Add models of finished trainings to a study's published weights.
+
+    Returns whether there was room for them.
+    """
     study = weights.path.parent.name
     with held(Lock(output, "publish", study), lambda: False):
         try:

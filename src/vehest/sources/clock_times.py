@@ -12,21 +12,23 @@ DAY = 86_400.0  # s
 HOUR = 3600.0  # s
 MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one another
 WRITTEN = (
-    r"^\s*(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]+"
+    r"^\s*(?:(?P<date>\d{4}[-/.]?\d{1,2}[-/.]?\d{1,2}|\d{1,2}[-/. ]\w{1,3}[-/. ]\d{2,4})[T _]+"
     r"|(?P<days>\d+) days?,? *)?"
-    r"(?:(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"(?:(?P<hour>\d{1,2}):?(?P<minute>\d{2}):?(?P<second>\d{2}(?:[.,:]\d+)?)"
     r"|(?P<minutes>\d{1,3}):(?P<seconds>\d{2}[.,]\d+))"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
-DATE = r"^(?P<first>\d+)[-/.](?P<second>\d+)[-/.](?P<third>\d+)$"
+DATE = r"^(?P<first>\d{4}|\d{1,2})[-/. ]?(?P<second>\d{1,2})[-/. ]?(?P<third>\d+)$"
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times that are written as a clock's, in seconds, (N,); None for other text.
 
-    ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``2024-05-03T10:59:30.25Z``, ``3.5.2024
-    10:59:30,25``, ``5/3/2024 10:59:30 AM`` and ``0 days 00:00:30.25``. With a date they count from
-    1970, without one from midnight, and on beyond the next. The zone is not read.
+    ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``105930.25``, ``2024-05-03T10:59:30.25Z``,
+    ``20240503T105930``, ``3.5.2024 10:59:30,25``, ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM``
+    and ``0 days 00:00:30.25``. With a date they count from 1970, without one from midnight, and on
+    beyond the next. The zone is not read.
     """
     from pyarrow import compute
 
@@ -53,6 +55,9 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
         days = compute.if_else(compute.equal(matched.field("days"), ""), "0", matched.field("days"))
         counted = np.asarray(compute.cast(days, pa.float64()))
         return past_midnight(times) if not counted.any() else times + DAY * counted
+    dates = compute.utf8_lower(dates)
+    for number, name in enumerate(MONTHS, 1):
+        dates = compute.replace_substring(dates, name, str(number))
     parts = compute.extract_regex(dates, pattern=DATE)
     if parts.null_count:
         return None
@@ -60,7 +65,8 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
         np.asarray(compute.cast(parts.field(name), pa.int64()))
         for name in ("first", "second", "third")
     )
-    orders = [(third, first, second), (third, second, first)]  # of the United States, of Europe
+    year = np.where(third < 100, third + 2000, third)
+    orders = [(year, first, second), (year, second, first)]  # of the United States, of Europe
     if first.min() > 31:
         orders = [(first, second, third)]
     elif not is_halved.any():

@@ -63,7 +63,7 @@ def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False
     """
     if fault := _order_fault(stamps, fix, may_repeat):
         return fault
-    step = float(np.median(np.diff(stamps)))
+    step = typical_step(stamps)
     if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
         return (
             f"the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to "
@@ -77,10 +77,10 @@ def span_fault(stamps: FloatArray) -> str:
 
     Empty where none is.
     """
-    steps = np.diff(stamps)
-    step = float(np.median(steps)) or float(steps.mean())
+    step = typical_step(stamps)
     if not stamps[-1] - stamps[0] > MOST_STEPS * step:
         return ""
+    steps = np.diff(stamps)
     at = int(np.argmax(steps))
     return (
         f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of "
@@ -88,6 +88,12 @@ def span_fault(stamps: FloatArray) -> str:
         f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, "
         "or what lies on one side"
     )
+
+
+def typical_step(stamps: FloatArray) -> float:
+    """Median step of time stamps (T,) [s]; the mean where most of them repeat."""
+    steps = np.diff(stamps)
+    return float(np.median(steps)) or float(steps.mean())
 
 
 def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
 from pydantic import AfterValidator, Field
@@ -24,11 +26,17 @@ from vehest.data.files import remove_leftovers, sha256_of, writing_error, writte
 from vehest.data.schema import validated
 from vehest.data.text_files import first_line, read_text
 from vehest.sources.base import Source, existing_folder
-from vehest.sources.resuming import REMEDY, Progress, ResumingDownloader
+from vehest.version import __version__
 
 CHECKSUMS = "checksums.txt"
 UNDER_WAY = ".download"
+CHUNK = 1 << 15  # bytes
+TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
+REMEDY = "correct download.url or put the file into the data set's folder by hand"
 NAME = re.compile(r'[^./\\:*?"<>|\s-][^/\\:*?"<>|\x00-\x1f\x7f]*')
+
+# file, bytes received, bytes in all where the server states them
+Progress = Callable[[str, int, int | None], None]
 
 
 def _file_name(name: str) -> str:
@@ -60,7 +68,6 @@ class Outcome:
     ]  # matched its known checksum; was there and its checksum is recorded on first sight
     sha256: str
     size: int  # bytes
-    resumed_at: int = 0  # bytes that an earlier attempt had left
 
 
 @dataclass(frozen=True)
@@ -90,20 +97,19 @@ class Download:
         checked and recorded.
 
         Raises `DataError`: a file that is there or that came has other bytes than recorded. Raises
-        `MissingError`: the server cannot be reached or does not have it, or the disk is full; what
-        has arrived is kept.
+        `MissingError`: the server cannot be reached or does not have it, or the disk is full.
         """
-        under_way = self.folder / UNDER_WAY
         try:
-            under_way.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise writing_error(under_way, error) from error
+            raise writing_error(self.folder, error) from error
         with _locked(self.folder):
             remove_leftovers(self.folder)
-            for name in self.files:
-                yield self._outcome(name, progress)
-            with suppress(OSError):  # parts of other files stay
-                under_way.rmdir()
+            try:
+                for name in self.files:
+                    yield self._outcome(name, progress)
+            finally:
+                shutil.rmtree(self.folder / UNDER_WAY, ignore_errors=True)
 
     def _outcome(self, name: str, progress: Progress | None) -> Outcome:
         import pooch
@@ -117,13 +123,16 @@ class Download:
                 name, "matched" if recorded else "recorded", checksum, path.stat().st_size
             )
         address = self.address(name)
-        under_way = self.folder / UNDER_WAY
-        downloader = ResumingDownloader(under_way / f"{name}.part", progress)
+        downloader = partial(_download, report=partial(progress, name) if progress else None)
         pooch.get_logger().setLevel("WARNING")
         try:
             complete = Path(
                 pooch.retrieve(
-                    address, self._expected(name), name, under_way, downloader=downloader
+                    address,
+                    self._expected(name),
+                    name,
+                    self.folder / UNDER_WAY,
+                    downloader=downloader,
                 )
             )
             checksum = sha256_of(complete)
@@ -132,18 +141,13 @@ class Download:
         except OSError as error:
             if error.errno is not None:
                 raise writing_error(path, error) from error
-            again = (
-                "; when the server answers again, the same command goes on after what has arrived"
-                if downloader.part.exists()
-                else ""
-            )
             cause = str(error)[-200:]  # which comes last
-            raise MissingError(f"cannot fetch {address}: {cause}; {REMEDY}{again}") from None
+            raise MissingError(f"cannot fetch {address}: {cause}; {REMEDY}") from None
         except ValueError as error:  # of pooch, which has removed the file
             raise DataError(
                 f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})"
             ) from None
-        return Outcome(name, "fetched", checksum, path.stat().st_size, downloader.resumed_at)
+        return Outcome(name, "fetched", checksum, path.stat().st_size)
 
     def _checked(self, name: str) -> str | None:
         """Checksum of a file that is there and has the expected one; None where it is not there."""
@@ -165,6 +169,38 @@ class Download:
 
     def _expected(self, name: str) -> str | None:
         return self.sha256.get(name) or _read_checksums(self.folder).get(name)
+
+
+def _download(
+    url: str,
+    output_file: str,
+    pooch: Any = None,
+    report: Callable[[int, int | None], None] | None = None,
+) -> None:
+    """Download ``url`` into ``output_file``, as pooch calls it.
+
+    Raises `MissingError`: the server refuses, sends a web page, or does not state a length. Raises
+    `OSError`: it is out of reach or breaks off, or the disk is full.
+    """
+    import requests
+
+    headers = {"Accept-Encoding": "identity", "User-Agent": f"vehest/{__version__}"}
+    with requests.get(url, headers=headers, stream=True, timeout=TIMEOUTS) as response:
+        length = response.headers.get("Content-Length", "")
+        fault = ""
+        if response.status_code != requests.codes.ok:
+            fault = f"the server answers {response.status_code} {response.reason}"
+        elif "html" in response.headers.get("Content-Type", ""):
+            fault = "it is a web page, not a file"
+        elif not length and not response.raw.chunked:
+            fault = "the server does not state its length, so that a break would not show"
+        if fault:
+            raise MissingError(f"cannot fetch {url}: {fault}; {REMEDY}")
+        with open(output_file, "wb") as stream:
+            for chunk in response.iter_content(CHUNK):  # a short answer is a ConnectionError
+                stream.write(chunk)
+                if report is not None:
+                    report(stream.tell(), int(length) if length else None)
 
 
 def download_of(source: Source) -> Download:

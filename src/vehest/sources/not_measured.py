@@ -13,7 +13,7 @@ from vehest.constants import FloatArray
 # of integers, which a scale of a power of ten brings to 327.67 or 65.535
 _ENDS_OF_RANGE = frozenset(
     sign * (2**bits - below)
-    for bits in (15, 16, 23, 24, 31, 32)
+    for bits in (*range(7, 17), 23, 24, 31, 32)
     for sign, below in ((1, 1), (1, 0), (-1, 1), (-1, 0))
 )
 _NINES = frozenset(sign * (10**digits - 1) for digits in range(3, 10) for sign in (1, -1))

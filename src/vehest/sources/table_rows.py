@@ -141,12 +141,13 @@ def timed_runs(
         Longest time without a row, or without a sample of a column, within a run [s]; runs that
         last less are left out.
     restarts : bool
-        Whether a run begins where times go backwards.
+        Whether a run begins where times go backwards; a single row is none.
     columns : iterable of FloatArray
         Columns that must have samples throughout, NaN where there is none, shape (N,) each.
     """
     if max_gap is None:
-        return {**dict(enumerate(stretches((np.diff(times) < 0) & restarts, len(times))))}
+        runs = stretches((np.diff(times) < 0) & restarts, len(times))
+        return {**dict(enumerate(run for run in runs if run.stop - run.start > 1))}
     measured = np.ones(len(times), dtype=np.bool_)
     for column in columns:
         measured &= np.isfinite(bridged(column, times, max_gap))

@@ -87,14 +87,15 @@ def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
 def names_of(header: Sequence[str], first_row: Sequence[str]) -> list[str]:
     """Names of a table's columns, one for each cell of its rows, each once.
 
-    One that occurs again has the number of its column behind it. Rows that end in a delimiter have
-    a nameless column more than the line of names; one that ends so itself has one less.
+    One that occurs again has the number of its column behind it. Rows may end in delimiters, which
+    make nameless columns; the line of names may end in more of them.
     """
-    names = list(header)
-    if len(first_row) == len(names) + 1 and not first_row[-1].strip():
-        names.append("")
-    elif len(first_row) == len(names) - 1 and not names[-1].strip():
-        names.pop()
+    n_cells = len(first_row)
+    names = [*header, *[""] * (n_cells - len(header))]
+    if any(map(str.strip, (*first_row[len(header) :], *header[n_cells:]))):
+        names = list(header)
+    elif first_row:
+        names = names[:n_cells]
     return [
         f"{name} #{place}" if name and names.count(name) > 1 else name
         for place, name in enumerate(names, 1)

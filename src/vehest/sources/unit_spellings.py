@@ -8,55 +8,45 @@ from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column
 
-# without blanks, dots, stars, brackets and case, sec as s -> the spelling of vehest, or a unit of
-# no channel; ambiguous ones are left out
-_SPELLINGS = {
-    **dict.fromkeys(("m/s", "mps", "meter/s", "meters/s", "ms-1", "ms^-1"), "m/s"),
-    **dict.fromkeys(("km/h", "kmh", "kph", "km/hr", "kmph", "kmh-1", "kmh^-1"), "km/h"),
-    **dict.fromkeys(("mph", "mi/h", "mile/h", "miles/h"), "mph"),
-    **dict.fromkeys(("kt", "kts", "knot", "knots", "knoten", "noeuds", "nœuds"), "knots"),
-    **dict.fromkeys(("ft/s", "fps"), "ft/s"),
-    **dict.fromkeys(
-        (
-            "m/s²",
-            "m/s^2",
-            "m/s2",
-            "m/s/s",
-            "mps2",
-            "mps^2",
-            "meter/s^2",
-            "meters/s^2",
-            "ms-2",
-            "ms^-2",
-        ),
-        "m/s²",
-    ),
-    **dict.fromkeys(("ft/s²", "ft/s^2", "ft/s2"), "ft/s²"),
-    **dict.fromkeys(("g", "gs", "g's", "gn", "g0"), "g"),
-    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
-    **dict.fromkeys(("deg", "°", "degree", "degrees"), "deg"),
-    **dict.fromkeys(("rad/s", "radian/s", "radians/s", "rads-1", "rads^-1"), "rad/s"),
-    **dict.fromkeys(
-        ("deg/s", "°/s", "degree/s", "degrees/s", "degs-1", "degs^-1", "°s-1", "dps"), "deg/s"
-    ),
-    **dict.fromkeys(("rpm", "1/min", "u/min", "r/min", "rev/min", "upm", "min-1", "min^-1"), "rpm"),
-    **{unit: unit for unit in ("cm/s", "mm/s", "mrad", "mrad/s", "mg")},
-    **{f"{unit}/s{square}": f"{unit}/s²" for unit in ("cm", "mm") for square in ("²", "^2", "2")},
-    **dict.fromkeys(("n", "newton"), "N"),
-    "nm": "Nm",
-    **dict.fromkeys(("pa", "pascal"), "Pa"),
-    "kpa": "kPa",
-    "mpa": "MPa",
+# unit as vehest spells it, or a unit of no channel -> its spellings, without blanks, dots, stars,
+# brackets and case, sec as s; ambiguous ones are left out
+_SPELLINGS_OF = {
+    "m/s": "m/s mps meter/s meters/s ms-1 ms^-1",
+    "km/h": "km/h kmh kph km/hr kmph kmh-1 kmh^-1",
+    "mph": "mph mi/h mile/h miles/h",
+    "knots": "kt kts knot knots knoten noeuds nœuds",
+    "ft/s": "ft/s fps",
+    "m/s²": "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2",
+    "ft/s²": "ft/s² ft/s^2 ft/s2",
+    "g": "g gs g's gn g0",
+    "rad": "rad radian radians",
+    "deg": "deg ° degree degrees",
+    "rad/s": "rad/s radian/s radians/s rads-1 rads^-1",
+    "deg/s": "deg/s °/s degree/s degrees/s degs-1 degs^-1 °s-1 dps",
+    "rpm": "rpm 1/min u/min r/min rev/min upm min-1 min^-1",
+    "cm/s": "cm/s",
+    "mm/s": "mm/s",
+    "mrad": "mrad",
+    "mrad/s": "mrad/s",
+    "mg": "mg",
+    "cm/s²": "cm/s² cm/s^2 cm/s2",
+    "mm/s²": "mm/s² mm/s^2 mm/s2",
+    "N": "n newton",
+    "Nm": "nm",
+    "Pa": "pa pascal",
+    "kPa": "kpa",
+    "MPa": "mpa",
     "bar": "bar",
     "psi": "psi",
-    **dict.fromkeys(("a", "amp", "ampere"), "A"),
-    **dict.fromkeys(("v", "volt"), "V"),
-    **dict.fromkeys(("%", "percent"), "%"),
-    **dict.fromkeys(("°c", "degc"), "°C"),
-    **dict.fromkeys(("m", "meter", "metre"), "m"),
-    **dict.fromkeys(
-        ("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"
-    ),
+    "A": "a amp ampere",
+    "V": "v volt",
+    "%": "% percent",
+    "°C": "°c degc",
+    "m": "m meter metre",
+    "another unit": "mm cm km mv ma hpa mbar hz kg ms s",
+}
+_SPELLINGS = {
+    spelling: unit for unit, spellings in _SPELLINGS_OF.items() for spelling in spellings.split()
 }
 # where upper and lower case differ in meaning
 _CASES = {

@@ -1,4 +1,6 @@
-"""What a study is made from: recordings, metrics, estimates, references and training histories that earlier stages wrote."""
+"""What a study is made from: recordings, metrics, estimates, references and training histories that
+earlier stages wrote.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,11 @@ from vehest.evaluation.metrics import Protocol, Scored, score_all
 def read_frame(
     path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()
 ) -> pd.DataFrame:
-    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which ``numbers`` hold numbers; else a `DataError`."""
+    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which
+    ``numbers`` hold numbers.
+
+    Else a `DataError`.
+    """
     text = read_text(path)
     try:
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
@@ -36,6 +42,16 @@ def read_frame(
         if not pd.api.types.is_numeric_dtype(table[name]):
             raise DataError(f"'{path}': column '{name}' holds text where numbers belong")
     return table
+
+
+def write_frame(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV, numbers with all their digits."""
+    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
+
+
+def nominal_rows(metrics: pd.DataFrame) -> pd.DataFrame:
+    """Rows of metrics over all samples without a fault."""
+    return metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
 
 
 HEAD = (
@@ -63,7 +79,8 @@ class EvaluatedModel:
     title: str  # for people, for example ``KS-NN linear + bias, P = 2``
     seed: int  # its seed
     model_folder: Path  # what the train stage wrote (``history.csv`` in it, where there is one)
-    # what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence
+    # what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or
+    # the n-th sequence
     evaluation_folder: Path
     training: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, as configured
     calibration_folder: Path | None = None  # where trust.yaml lies, if it was calibrated
@@ -79,21 +96,32 @@ class EvaluatedModel:
         return read_frame(path) if path.is_file() else None
 
     def fit_metrics(self) -> dict[str, float]:
-        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``, no times; none where nothing was written."""
+        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``, no times.
+
+        None where nothing was written.
+        """
         path = self.model_folder / "fit.csv"
         rows = read_rows(path, ("metric", "value")) if path.is_file() else []
         return {row["metric"]: number_in(row, "value", path) for row in rows}
 
     def segments(self, test_set: str) -> Segments:
-        """Sums of its errors over segments of a test set; raises `DataError` where the file is damaged, or has no such test set."""
+        """Sums of its errors over segments of a test set.
+
+        Raises
+        ------
+        DataError
+            The file is damaged, or has no such test set.
+        """
         path = self.evaluation_folder / "blocks.csv"
-        found = read_segments(path)
-        if test_set not in found:
+        segments = read_segments(path)
+        if test_set not in segments:
             raise DataError(f"'{path}' has no test set '{test_set}'; evaluate again")
-        return found[test_set]
+        return segments[test_set]
 
     def estimate(self, test_set: str, position: int) -> Estimate:
-        """The stored estimate of the n-th range of a test set, or of the n-th sequence (`sequences`)."""
+        """The stored estimate of the n-th range of a test set, or of the n-th sequence
+        (`sequences`).
+        """
         return read_estimate(self.evaluation_folder / test_set / f"{position}.parquet")
 
 
@@ -109,11 +137,13 @@ class PartArtefacts:
     protocol: Protocol  # how estimates are scored
     kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
     data_titles: Mapping[str, str]  # data set -> title, for people
-    # long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are not among them, since what a study draws
+    # long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are
+    # not among them, since what a study draws
     # is published, and a time is never the same twice.
     metrics: pd.DataFrame
     models: Sequence[EvaluatedModel]  # evaluated models, in the order of the pipeline file
-    # (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split
+    # (data set, recording) -> Parquet file at the evaluation rate, references included; of all
+    # ranges of the split
     references: Mapping[tuple[str, str], Path]
     facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
     failed: Mapping[str, str] = field(
@@ -137,7 +167,9 @@ class PartArtefacts:
         return " and ".join(sorted({self.kinds[span.dataset] for span in spans}))
 
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
-        """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""
+        """Estimate and reference of a model on each range of a test set, or on each sequence if the
+        protocol cuts ranges.
+        """
         spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
         return score_all(
             lambda position: model.estimate(test_set, position),
@@ -169,7 +201,13 @@ class StoredDataset:
     citation: str = ""  # what to cite
 
     def recordings(self) -> Iterator[Recording]:
-        """All recordings, one at a time; raises `DataError` where a file is damaged."""
+        """All recordings, one at a time.
+
+        Raises
+        ------
+        DataError
+            A file is damaged.
+        """
         return map(read_recording, self.files.values())
 
 
@@ -185,7 +223,9 @@ class AbsentDataset:
 
 @dataclass(frozen=True)
 class Trial:
-    """One candidate of a search: a training whose error on the validation range is compared with that of others."""
+    """One candidate of a search: a training whose error on the validation range is compared with
+    that of others.
+    """
 
     search: str  # part of the pipeline file that names the candidates
     name: str  # part that trained this one
@@ -226,7 +266,8 @@ class StudyArtefacts:
     ] = ()  # of a study of recordings alone, in the order of the pipeline file
     absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
     report_command: str = ""  # that draws this report again, with all of its overrides
-    # overrides, as text for a shell, that say where raw files come from and results go; in no published file
+    # overrides, as text for a shell, that say where raw files come from and results go; in no
+    # published file
     location: str = ""
 
     @property
@@ -236,5 +277,8 @@ class StudyArtefacts:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Metrics of all parts, `METRIC_COLUMNS`; after ``trained_on`` the part, if it has a name: ``sim_two_cars/scheme_1``."""
+        """Metrics of all parts, `METRIC_COLUMNS`.
+
+        After ``trained_on`` the part, if it has a name: ``sim_two_cars/scheme_1``.
+        """
         return of_parts({name: part.metrics for name, part in self.parts.items()})

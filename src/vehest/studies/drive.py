@@ -1,6 +1,7 @@
 """The study of one car: estimators trained on some ranges of its drives and compared on others.
 
-Used by the pipelines ``ferrari_drive`` and ``quickstart``. `documents` makes the report, `leaderboard` the table in it.
+Used by the pipelines ``ferrari_drive`` and ``quickstart``. `documents` makes the report,
+`leaderboard` the table in it.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -44,7 +46,15 @@ from vehest.studies.kit.drawings import (
 )
 from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.recommendation import plain_text, recommendation_of
-from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
+from vehest.studies.kit.runs import (
+    Name,
+    by_name,
+    chosen_seed,
+    of_model,
+    runs_of,
+    value_of_run,
+    values_of,
+)
 from vehest.studies.kit.standing import (
     BEST,
     NOT_SIGNIFICANT,
@@ -56,7 +66,7 @@ from vehest.studies.kit.standing import (
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
-MOST_SHOWN = 8
+MAX_DRAWN = 8
 
 VERSION = "5"
 _ACCURACY = (
@@ -110,7 +120,8 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 
 
 def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> Document:
-    """The report of a comparison: verdict, figures of the first test set, minutes of reference; then the appendices.
+    """The report of a comparison: verdict, figures of the first test set, minutes of reference;
+    then the appendices.
 
     Parameters
     ----------
@@ -188,7 +199,7 @@ def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
     for test_set in artefacts.split.tests:
         ranking = ranking_of(artefacts, test_set)
         if ranking.order:
-            paragraphs.append(basis_sentence(ranking, _where(artefacts, test_set)))
+            paragraphs.append(basis_sentence(ranking, _describe_test_set(artefacts, test_set)))
     warned = warnings_of(artefacts)
     if warned:
         paragraphs.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
@@ -196,17 +207,25 @@ def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
 
 
 def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
-    """One row per test set and (estimator, variant), the lowest RMSE(β) over all seeds of a test set first.
+    """One row per test set and (estimator, variant), the lowest RMSE(β) over all seeds of a test
+    set first.
 
-    ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 % interval over blocks of the drive and seeds;
-    ``_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
-    figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on the validation range (the lower seed of
-    two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to best) are
-    corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
-    ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``, at which sideslip is not scored.
-    ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol passes the true
-    initial state, else ``own``.
-    Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
+    ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 %
+    interval over blocks of the drive and seeds; ``_median``, ``_min``, ``_max`` and ``_std``
+    (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
+    figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on
+    the validation range (the lower seed of two equals): test data choose nothing. ``beats_zero``,
+    ``beats_static_map`` and ``against_best`` (difference to best) are corrected by Holm
+    (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there
+    is none. ``share_below_min_speed`` is the share of samples slower than ``min_sideslip_speed``,
+    at which sideslip is not scored. ``epochs`` is NaN for a method without. ``start`` is
+    ``reference`` if the protocol passes the true initial state, else ``own``. Sideslip in deg,
+    velocities in m/s.
+
+    Raises
+    ------
+    DataError
+        A run has two values of a metric, or no validation metrics.
     """
     runs = runs_of(artefacts)
     start = "reference" if artefacts.protocol.initial_state else "own"
@@ -220,33 +239,34 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
         for name, models in by_name(artefacts.models).items():
             seeds = sorted(model.seed for model in models)
             seed = chosen_seed(seeds, name, runs)
-            own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
-            shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
+            of_seeds = {
+                metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY
+            }
+            of_chosen = {metric: values[seeds.index(seed)] for metric, values in of_seeds.items()}
+            chosen = of_chosen.pop("rmse_sideslip")
+            finite = name in ranking.order and math.isfinite(chosen)
+            value_of = partial(value_of_run, runs, name, seed)
             row: dict[str, object] = {
                 "estimator": name[0],
                 "variant": name[1],
                 "title": models[0].title,
                 "test_set": test_set,
-            }
-            row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
-            row |= {"min_sideslip_speed": min_speed}
-            chosen = shown.pop("rmse_sideslip")
-            finite = name in ranking.order and math.isfinite(chosen)
-            row |= {
+                "seed": seed,
+                "n_seeds": len(seeds),
+                "start": start,
+                "min_sideslip_speed": min_speed,
                 "rmse_sideslip": ranking.rmse[name] if finite else math.nan,
                 "rmse_sideslip_chosen": chosen,
+                **standing_columns(ranking, name),
+                **_spread_of(of_seeds["rmse_sideslip"]),
+                "rmse_sideslip_training": value_of(TRAINING, "rmse_sideslip"),
+                "rmse_sideslip_validation": value_of(VALIDATION, "rmse_sideslip"),
+                "rmse_vy": of_chosen["rmse_vy"],
+                "rmse_vy_validation": value_of(VALIDATION, "rmse_vy"),
+                **of_chosen,
+                _BOUND: value_of(test_set, _BOUND),
+                **{metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL},
             }
-            row |= {**standing_columns(ranking, name), **_spread_of(own["rmse_sideslip"])}
-            row |= {
-                f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0]
-                for role in (TRAINING, VALIDATION)
-            }
-            row |= {
-                "rmse_vy": shown["rmse_vy"],
-                "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0],
-            }
-            row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
-            row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
             placed.append((ranking.order.index(name) if finite else math.inf, row))
         rows += [row for _, row in sorted(placed, key=lambda pair: pair[0])]
     board = pd.DataFrame(rows)
@@ -271,14 +291,17 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 # The words
 
 
-def _where(artefacts: PartArtefacts, test_set: str) -> str:
+def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
     ranges = "; ".join(
         f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}"
         for span in spans[:3]
     )
     if len(spans) > 3:
-        ranges = f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
+        ranges = (
+            f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} "
+            "recordings"
+        )
     return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {ranges})"
 
 
@@ -288,7 +311,10 @@ def data_sentence(artefacts: PartArtefacts) -> str:
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
         kind = next(iter(kinds.values()))
-        return f"**{kind.capitalize()} data:** every number here comes from {kind} recordings ({'; '.join(titles.values())})."
+        return (
+            f"**{kind.capitalize()} data:** every number here comes from {kind} recordings "
+            f"({'; '.join(titles.values())})."
+        )
     parts = "; ".join(f"{titles[dataset]} ({kind})" for dataset, kind in kinds.items())
     return f"**Real and simulated data:** {parts}."
 
@@ -302,45 +328,55 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
         if len(counts) == 1
         else f"{counts[0]} to {counts[-1]} seeds each"
     )
-    words = f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with {seeds}, {len(artefacts.models)} fits in all"
+    words = (
+        f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with "
+        f"{seeds}, {len(artefacts.models)} fits in all"
+    )
     runs = runs_of(artefacts)
     epochs = np.array(
         [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]
     )
     if (epochs > 0).any():
-        fewest, most = (
+        lowest, highest = (
             fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max())
         )
         words += (
-            f"; training took {fewest} epochs a network"
-            if fewest == most
-            else f"; training took {fewest} to {most} epochs a network"
+            f"; training took {lowest} epochs a network"
+            if lowest == highest
+            else f"; training took {lowest} to {highest} epochs a network"
         )
     return words + "."
 
 
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     """How one of several parts was made; its tables are called after it."""
-    made, ranges = how_it_was_made(part)
+    method, ranges = how_it_was_made(part)
     title = f"## Appendix: {as_text(part.title)}, method and ranges"
     return [
-        made.replace("## Appendix: method and ranges", title),
+        method.replace("## Appendix: method and ranges", title),
         replace(ranges, name=f"ranges_{name}"),
     ]
 
 
-CHOICE = "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing."
+CHOICE = (
+    "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. "
+    "Test data choose nothing."
+)
 
 
 def how_it_was_made(
     artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)
 ) -> tuple[str, Table]:
-    """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table ``ranges``."""
+    """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table
+    ``ranges``.
+    """
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values. Estimators may "
-        f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never "
+        "interpolated from later values. Estimators may "
+        f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first "
+        f"{protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored, for anyone.{protocol.start_description}",
         f"Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike."
         f"{protocol.describe_sideslip(artefacts.split.datasets)}{_describe_excluded(artefacts)}",
@@ -450,7 +486,7 @@ def _figures_of(
     finite = board[np.isfinite(board["rmse_sideslip"])]
     if finite.empty:
         return DrawnTest([], [], [], "", {})
-    rows = _shown(finite, recommended)
+    rows = _drawn_rows(finite, recommended)
     forest = _forest(artefacts, finite, test_set, lines)
     signals = signals_of(artefacts, rows, test_set, lines)
     estimators = {
@@ -461,7 +497,8 @@ def _figures_of(
     remark = ""
     if len(rows) < len(finite):
         remark = (
-            f" Figures of signals show {len(rows)} of them: those with the lowest RMSE(v) on validation, the best on the test "
+            f" Figures of signals show {len(rows)} of them: those with the lowest RMSE(v) on "
+            "validation, the best on the test "
             "and the recommended one."
         )
     opening: list[Block] = [busiest_block(signals, file)]
@@ -510,7 +547,9 @@ def _sections_of_test(
 
 
 def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
-    """Section ``Minutes of reference``: how much was recorded for each role, and how hard it was driven."""
+    """Section ``Minutes of reference``: how much was recorded for each role, and how hard it was
+    driven.
+    """
     split = artefacts.split
     roles = {
         "training": split.train,
@@ -543,7 +582,10 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
         "sideslip_99": Column("|β|, 99 % [deg]", decimals=1),
     }
     frame = pd.DataFrame(rows)
-    caption = "Minutes of recording with a reference of v, and 99th percentiles of lateral acceleration and sideslip in them."
+    caption = (
+        "Minutes of recording with a reference of v, and 99th percentiles of lateral "
+        "acceleration and sideslip in them."
+    )
     columns = {name: column for name, column in columns.items() if name in frame}
     return ["## Minutes of reference", Table("minutes", caption, frame, columns)]
 
@@ -569,7 +611,8 @@ def _forest(
         for row in board.to_dict("records")
     ]
     caption = (
-        f"RMSE(β) of every estimator over all its seeds with its 95 % interval, on {_where(artefacts, test_set)}. "
+        "RMSE(β) of every estimator over all its seeds with its 95 % interval, on "
+        f"{_describe_test_set(artefacts, test_set)}. "
         "Filled: the best and those that are not significantly worse."
     )
     return Figure(f"forest_{file_of(test_set)}", caption, forest_figure(rows))
@@ -588,12 +631,16 @@ def _leaderboard_table(
     chosen = [
         folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")
     ]
-    standing = Table(
+    ranked = Table(
         name,
-        f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
-        "another drive of this kind and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
-        "validation. The difference to the best, and whether an estimator is significantly better than zero and the static map: "
-        "paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v that remains unexplained."
+        f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the "
+        "lowest first, with its 95 % interval for "
+        "another drive of this kind and another training; training, validation, RMSE(v) and FVU "
+        "are those of the seed chosen on "
+        "validation. The difference to the best, and whether an estimator is significantly better "
+        "than zero and the static map: "
+        "paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v "
+        "that remains unexplained."
         f"{bound if has_bound else ''}",
         frame,
         {
@@ -613,15 +660,16 @@ def _leaderboard_table(
         # a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY
         [
             ModelLink(
-                f"../../{own.parent.name}/{own.name}/",
-                f"vehest estimate {own.name} lap.csv -o out.parquet",
+                f"../../{folder.parent.name}/{folder.name}/",
+                f"vehest estimate {folder.name} lap.csv -o out.parquet",
             )
-            for own in chosen
+            for folder in chosen
         ],
     )
     seeds = Table(
         f"{name}_seeds",
-        "RMSE(β) of single seeds: the one chosen on validation, median, lowest, highest and sample standard deviation (s.d.); p99 and peak "
+        "RMSE(β) of single seeds: the one chosen on validation, median, lowest, highest and sample "
+        "standard deviation (s.d.); p99 and peak "
         "are the 99th percentile and the maximum of the absolute error of β of the chosen one.",
         frame,
         {
@@ -638,13 +686,14 @@ def _leaderboard_table(
             "epochs": Column("epochs", decimals=0),
         },
     )
-    return [standing, seeds]
+    return [ranked, seeds]
 
 
-def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
+def _drawn_rows(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
     """At most `MOST_SHOWN` rows in the order of the board, picked by validation.
 
-    Where an estimator is ``named``, it comes first, and the best on the test is among them, since the verdict names both.
+    Where an estimator is ``named``, it comes first, and the best on the test is among them, since
+    the verdict names both.
     """
     ours = (
         (board["estimator"] == named[0]) & (board["variant"] == named[1])
@@ -652,13 +701,13 @@ def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
         else board["seed"].isna()
     )
     sure = ours | (board.index == board.index[0]) if named else ours
-    kept = (
+    rows = (
         board["rmse_vy_validation"]
         .where(~sure, -math.inf)
         .sort_values(kind="stable", na_position="last")
-        .index[:MOST_SHOWN]
+        .index[:MAX_DRAWN]
     )
-    return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
+    return board.loc[sorted(rows, key=lambda row: (not ours[row], row))]
 
 
 # The training
@@ -670,7 +719,7 @@ def _training(
     models = {(*model.name, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []
-    for row in _shown(first).to_dict("records"):
+    for row in _drawn_rows(first).to_dict("records"):
         name = (row["estimator"], row["variant"])
         history = models[*name, row["seed"]].history()
         if history is not None and len(history) and set(figures.LOSSES) <= set(history):
@@ -678,7 +727,8 @@ def _training(
     if not runs:
         return []
     caption = (
-        "Loss over the epochs of each chosen seed: mean squared error of v on training and validation ranges. The marker is where the "
+        "Loss over the epochs of each chosen seed: mean squared error of v on training and "
+        "validation ranges. The marker is where the "
         "validation loss is lowest, whose weights are kept."
     )
     return ["## Training", Figure("learning", caption, figures.learning_curves(runs))]

@@ -1,6 +1,8 @@
-"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated by a model that was not trained on it.
+"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated
+by a model that was not trained on it.
 
-Used by pipelines whose split has ``folds``. Errors of all folds count together, so that the whole recording decides, not one segment of it.
+Used by pipelines whose split has ``folds``. Errors of all folds count together, so that the whole
+recording decides, not one segment of it.
 """
 
 from __future__ import annotations
@@ -30,12 +32,16 @@ VERSION = "3"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as the appendix; raises `DataError`."""
+    """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as
+    the appendix.
+
+    Raises `DataError`.
+    """
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
     ranking = rank(
-        {name: [joined(own) for own in seeds] for name, seeds in folds.items()},
+        {name: [joined(folds_of_seed) for folds_of_seed in seeds] for name, seeds in folds.items()},
         first.protocol.rate_hz,
     )
     titles = {model.name: as_text(model.title) for part in parts.values() for model in part.models}
@@ -45,7 +51,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         if set(artefacts.titles) <= set(parts)
         else f"{len(parts)} of {len(artefacts.titles)} folds"
     )
-    where = f"{number} ({kinds} data), each estimated by models that were not trained on it"
+    test_text = f"{number} ({kinds} data), each estimated by models that were not trained on it"
     board = overview(ranking, folds, titles, list(parts))
     blocks: list[Block] = [
         _table(board, list(parts)),
@@ -55,7 +61,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "\n\n".join(
             [
                 data_sentence(first),
-                verdict_sentences(ranking, titles, where),
+                verdict_sentences(ranking, titles, test_text),
                 f"In each fold: {budget_sentence(first)}",
             ]
         )
@@ -80,12 +86,17 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
-    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold."""
+    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors
+    in every fold.
+    """
     groups = [
-        {name: {model.seed: model for model in own} for name, own in by_name(part.models).items()}
+        {
+            name: {model.seed: model for model in models}
+            for name, models in by_name(part.models).items()
+        }
         for part in parts.values()
     ]
-    found = {}
+    segments = {}
     for name in groups[0]:
         if not all(name in group and set(group[name]) == set(groups[0][name]) for group in groups):
             continue
@@ -93,15 +104,11 @@ def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[lis
             [group[name][seed].segments(TEST) for group in groups]
             for seed in sorted(groups[0][name])
         ]
-        if all(
-            math.isfinite(float(own.squared_error_sideslip.sum()))
-            for folds in seeds
-            for own in folds
-        ):
-            found[name] = seeds
-    if not found:
+        if all(fold.is_finite for folds in seeds for fold in folds):
+            segments[name] = seeds
+    if not segments:
         raise DataError("no estimator has finite errors in all folds")
-    return found
+    return segments
 
 
 def overview(
@@ -110,7 +117,9 @@ def overview(
     titles: Mapping[Name, str],
     parts: Sequence[str],
 ) -> pd.DataFrame:
-    """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands, and its error in each fold [deg]."""
+    """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands,
+    and its error in each fold [deg].
+    """
     rows = []
     for name in ranking.order:
         seeds = folds[name]
@@ -119,11 +128,12 @@ def overview(
             "variant": name[1],
             "title": titles[name],
             "n_seeds": len(seeds),
+            "rmse_sideslip": ranking.rmse[name],
+            **standing_columns(ranking, name),
         }
-        row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
         for fold, part in enumerate(parts):
             square, samples = (
-                sum(float(getattr(own[fold], name).sum()) for own in seeds)
+                sum(float(getattr(folds_of_seed[fold], name).sum()) for folds_of_seed in seeds)
                 for name in ("squared_error_sideslip", "sideslip_samples")
             )
             row[part] = math.sqrt(square / samples) if samples else math.nan
@@ -166,8 +176,10 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         **{part: Column(part.replace("_", " "), decimals=decimals) for part in parts},
     }
     caption = (
-        "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
-        "difference to best, and whether an estimator is significantly better than zero and the static map: paired, corrected by Holm."
+        "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over "
+        "blocks of the drives and seeds. The "
+        "difference to best, and whether an estimator is significantly better than zero and the "
+        "static map: paired, corrected by Holm."
     )
     frame = board.drop(columns=["estimator", "variant"]).assign(
         interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]

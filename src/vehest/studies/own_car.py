@@ -1,8 +1,10 @@
-"""The study of a user's car: which estimator is recommended on it and with which error; then the comparison as of any drive.
+"""The study of a user's car: which estimator is recommended on it and with which error; then the
+comparison as of any drive.
 
-Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was recorded; further ones, with
-``split.minutes``, make the curve of how much reference is needed. `documents` makes the report, `leaderboard` the table in it, `verdict`
-what the terminal says at the end.
+Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was
+recorded; further ones, with ``split.minutes``, make the curve of how much reference is needed.
+`documents` makes the report, `leaderboard` the table in it, `verdict` what the terminal says at the
+end.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
 SHOWS_FAILED = True
-HARD = 4.0  # m/s², above which the tyres leave their linear range
-PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
+HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
+PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
 VERSION = "9"
 leaderboard = drive.leaderboard
@@ -39,7 +41,10 @@ Verdict = tuple[
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Verdict, figures and next commands; then the appendices: what was not compared and the whole comparison."""
+    """Verdict, figures and next commands.
+
+    Then the appendices: what was not compared and the whole comparison.
+    """
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
     commands = "\n".join(_commands(artefacts, verdicts))
@@ -49,13 +54,13 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         for curve in curves_of(list(artefacts.parts.values()))
         for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))
     ]
-    absent = not_compared(part)
+    not_included = not_compared(part)
     appendices: list[Block] = []
-    if absent:
-        lines = "\n".join(f"- {as_text(line)}" for line in absent)
+    if not_included:
+        lines = "\n".join(f"- {as_text(line)}" for line in not_included)
         appendices.append(f"## Estimators that were not compared\n\n{lines}")
-    for name, other in list(artefacts.parts.items())[1:]:
-        appendices += drive.appendix_of(name, other)
+    for name, further_part in list(artefacts.parts.items())[1:]:
+        appendices += drive.appendix_of(name, further_part)
     sentences = {name: text for name, (text, _) in verdicts.items()}
     models = {name: model.name for name, (_, model) in verdicts.items() if model is not None}
     report = drive.comparison(
@@ -75,7 +80,9 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
-    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be expected, and what it beats."""
+    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be
+    expected, and what it beats.
+    """
     recommendation = recommendation_of(part, test_set)
     sentences = recommendation.describe(_reach(part, test_set))
     if not recommendation.ranking.order:
@@ -89,7 +96,9 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
 
 
 def _comparison_with_plain(recommendation: Recommendation) -> str:
-    """How the recommended estimator compares with the plain ones other than the baselines, which it beats."""
+    """How the recommended estimator compares with the plain ones other than the baselines, which it
+    beats.
+    """
     ranking = recommendation.ranking
     name = recommendation.model.name if recommendation.model is not None else ranking.order[0]
     sentences = {
@@ -97,16 +106,20 @@ def _comparison_with_plain(recommendation: Recommendation) -> str:
         "not told apart": "It is not significantly different from",
         "higher": "It is significantly worse than",
     }
-    others: dict[str, list[str]] = {verdict: [] for verdict in sentences}
-    for other in ranking.order:
-        if other != name and other[0] in PLAIN and other[0] not in BASELINES:
-            pair = ranking.pairs.get((name, other))
+    by_verdict: dict[str, list[str]] = {verdict: [] for verdict in sentences}
+    for plain_name in ranking.order:
+        if (
+            plain_name != name
+            and plain_name[0] in PLAIN_ESTIMATORS
+            and plain_name[0] not in BASELINES
+        ):
+            pair = ranking.pairs.get((name, plain_name))
             if pair is not None:
-                others[pair.verdict].append(recommendation.titles[other])
+                by_verdict[pair.verdict].append(recommendation.titles[plain_name])
     return " ".join(
-        f"{words} {listed(others[verdict])}."
+        f"{words} {listed(by_verdict[verdict])}."
         for verdict, words in sentences.items()
-        if others[verdict]
+        if by_verdict[verdict]
     )
 
 
@@ -133,18 +146,28 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     counted = np.concatenate(scored)
     left_out = np.concatenate(hidden)
     share = 100.0 * len(counted) / max(len(counted) + len(left_out), 1)
-    most, most_hidden = (
-        float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out)
+    largest, largest_hidden = (
+        float(np.nanmax(angles)) if np.isfinite(angles).any() else 0.0
+        for angles in (counted, left_out)
     )
     words = f"{fixed(share, 0)} % of the test is scored"
-    words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
-    if most_hidden > most:
-        words += f", **which contain the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
+    words += (
+        f", without the first {protocol.skip_seconds:g} s of its {len(scored)} "
+        f"{protocol.piece}{'s' if len(scored) > 1 else ''}"
+    )
+    if largest_hidden > largest:
+        words += (
+            f", **which contain the largest sideslip** ({fixed(largest_hidden, 1)}°; scored: up "
+            f"to {fixed(largest, 1)}°)"
+        )
     if n_slow:
         speed = protocol.describe_min_sideslip_speed(
             span.dataset for span in part.split.tests[test_set]
         )
-        words += f"; in {fixed(100.0 * n_slow / len(counted), 1)} % of that the car is slower than {speed}, and only v is scored"
+        words += (
+            f"; in {fixed(100.0 * n_slow / len(counted), 1)} % of that the car is slower than "
+            f"{speed}, and only v is scored"
+        )
     return f"{words}."
 
 
@@ -162,7 +185,8 @@ def _commands(artefacts: StudyArtefacts, verdicts: Mapping[str, Verdict]) -> lis
     name = models[0][0].model_folder.name
     dataset = models[0][1]
     return [
-        f"vehest estimate {name} YOUR_LOG dataset={dataset}{location} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
+        f"vehest estimate {name} YOUR_LOG dataset={dataset}{location} -o beta.csv   # v, β, "
+        "bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name}{location} -o on_the_car    # the same in C99",
         f"{artefacts.report_command}                 # this report again",
     ]
@@ -184,31 +208,35 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
 
 
 def _hard_driving(part: PartArtefacts) -> str:
-    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one over the root of the time."""
+    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one
+    over the root of the time.
+    """
     split = part.split
-    spans = [
-        *split.train,
-        *split.validation,
-        *(span for spans in split.tests.values() for span in spans),
-    ]
+    spans = (*split.train, *split.validation, *split.test_spans)
     ay = _samples(part, spans, "ay")
     if not len(ay):
         return ""
-    minutes = float((np.abs(ay) > HARD).sum()) / part.protocol.rate_hz / 60.0
+    minutes = float((np.abs(ay) > HARD_DRIVING_AY).sum()) / part.protocol.rate_hz / 60.0
     if minutes < 0.5:
         return (
-            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above {HARD:g} m/s²: record at least ten minutes "
+            f"Your recordings contain {fixed(60.0 * minutes, 0)} s with |ay| above "
+            f"{HARD_DRIVING_AY:g} m/s²: "
+            "record at least ten minutes "
             "of harder driving."
         )
     return (
-        f"Your recordings contain {fixed(minutes, 1)} min with |ay| above {HARD:g} m/s²: "
+        f"Your recordings contain {fixed(minutes, 1)} min with |ay| above {HARD_DRIVING_AY:g} "
+        "m/s²: "
         f"{fixed(3.0 * minutes, 0)} min more would halve the interval."
     )
 
 
 def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatArray:
-    """Samples of a channel over ranges, at the evaluation rate, end to end; none where a recording lacks it."""
-    found = []
+    """Samples of a channel over ranges, at the evaluation rate, end to end.
+
+    None where a recording lacks it.
+    """
+    samples = []
     for span in spans:
         file = part.references.get((span.dataset, span.recording))
         if file is None:
@@ -216,17 +244,20 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
         recording = read_recording(file).cut(span.start, span.stop)
         if channel not in recording:
             return np.zeros(0)
-        found.append(recording[channel][np.isfinite(recording[channel])])
-    return np.concatenate(found) if found else np.zeros(0)
+        samples.append(recording[channel][np.isfinite(recording[channel])])
+    return np.concatenate(samples) if samples else np.zeros(0)
 
 
 def not_compared(part: PartArtefacts) -> list[str]:
-    """Families that were not compared, each with the channels that its plainest form lacks; those that failed or had no time come first."""
+    """Families that were not compared, each with the channels that its plainest form lacks.
+
+    Those that failed or had no time come first.
+    """
     lines = [f"{name}: {reason}" for name, reason in part.failed.items()]
-    there = {model.estimator for model in part.models} | {
+    compared = {model.estimator for model in part.models} | {
         name.split("-")[0] for name in part.failed
     }
-    spans = [*part.split.train, *(span for spans in part.split.tests.values() for span in spans)]
+    spans = (*part.split.train, *part.split.test_spans)
     files = [
         part.references[key]
         for span in spans
@@ -236,13 +267,13 @@ def not_compared(part: PartArtefacts) -> list[str]:
         return lines
     channels = set(read_recording(files[0]).channels)
     for name, family in estimator_classes().items():
-        if name in there:
+        if name in compared:
             continue
         reads = getattr(family, "channels", None)
-        lacking = (
+        missing = (
             [channel for channel in reads if channel not in channels]
             if isinstance(reads, tuple)
             else []
         )
-        lines.append(f"{name}: {f'lacks {listed(lacking)}' if lacking else 'not in the pipeline'}")
+        lines.append(f"{name}: {f'lacks {listed(missing)}' if missing else 'not in the pipeline'}")
     return lines

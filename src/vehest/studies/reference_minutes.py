@@ -1,7 +1,9 @@
-"""The study of how many minutes with a reference an estimator needs, over several cars: its error over the minutes, a learning curve.
+"""The study of how many minutes with a reference an estimator needs, over several cars: its error
+over the minutes, a learning curve.
 
-Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and ``split.minutes_at``, and in whether trainings
-start from another model (``training.start_from``). Minutes count training and validation together, since both need the sensor.
+Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and
+``split.minutes_at``, and in whether trainings start from another model (``training.start_from``).
+Minutes count training and validation together, since both need the sensor.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ COLUMNS = {
     "against_scratch": Column("than from scratch"),
 }
 """Of a table of `rows_of_curve`."""
-NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
+MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -109,24 +111,31 @@ class Curve:
 
 
 def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
-    """A curve for every test set of parts that share it; test sets with a single amount of reference make none."""
+    """A curve for every test set of parts that share it.
+
+    Test sets with a single amount of reference make none.
+    """
     groups: dict[tuple[str, tuple[Span, ...]], list[PartArtefacts]] = {}
     for part in parts:
         for test_set, spans in part.split.tests.items():
             groups.setdefault((test_set, tuple(spans)), []).append(part)
-    found = [_curve(test_set, own) for (test_set, _), own in groups.items()]
-    return [curve for curve in found if len({point.minutes for point in curve.points}) > 1]
+    curves = [_curve(test_set, parts_of_test) for (test_set, _), parts_of_test in groups.items()]
+    return [curve for curve in curves if len({point.minutes for point in curve.points}) > 1]
 
 
 def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
         named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
-        there = minutes_of(part)
-        wanted = (
+        recorded = minutes_of(part)
+        requested = (
             float(named[1]) if named is not None else math.nan
         )  # by split.minutes, which the split's name then ends in
-        minutes = wanted if abs(there - wanted) <= NEARLY * wanted else round(there, 2)
+        minutes = (
+            requested
+            if abs(recorded - requested) <= MAX_MINUTES_DEVIATION * requested
+            else round(recorded, 2)
+        )
         for model in part.models:
             models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
@@ -134,45 +143,48 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
         Point(
             estimator,
             variant,
-            as_text(own[0].title.removesuffix(start_in_words(own[0].training))),
+            as_text(trained[0].title.removesuffix(start_in_words(trained[0].training))),
             start,
             minutes,
-            len(own),
-        ): own
-        for (estimator, variant, start, minutes), own in models.items()
+            len(trained),
+        ): trained
+        for (estimator, variant, start, minutes), trained in models.items()
         if counts[estimator, variant] > 1 or estimator in BASELINES
     }
     segments: dict[Name, list[Segments]] = {}
-    for point, own in points.items():
-        segments.setdefault(point.name, []).extend(model.segments(test_set) for model in own)
+    for point, trained in points.items():
+        segments.setdefault(point.name, []).extend(model.segments(test_set) for model in trained)
     finite = {
-        name: own
-        for name, own in segments.items()
-        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)
+        name: trained
+        for name, trained in segments.items()
+        if all(part.is_finite for part in trained)
     }
     ordered = sorted(
         (point for point in points if point.name in finite),
         key=lambda p: (p.estimator, p.variant, p.start, p.minutes),
     )
-    asked = [
-        (tuned.name, plain.name) for plain in ordered for tuned in ordered if _same(plain, tuned)
+    claimed_pairs = [
+        (tuned.name, plain.name)
+        for plain in ordered
+        for tuned in ordered
+        if _differ_in_start(plain, tuned)
     ]
     return Curve(
         as_text(parts[0].title),
         test_set,
         ordered,
-        rank(finite, parts[0].protocol.rate_hz, claimed_pairs=asked),
+        rank(finite, parts[0].protocol.rate_hz, claimed_pairs=claimed_pairs),
     )
 
 
-def _same(plain: Point, tuned: Point) -> bool:
+def _differ_in_start(plain: Point, tuned: Point) -> bool:
     """Whether two points differ in what their trainings start from alone."""
-    same = (plain.estimator, plain.variant, plain.minutes) == (
+    have_equal_training = (plain.estimator, plain.variant, plain.minutes) == (
         tuned.estimator,
         tuned.variant,
         tuned.minutes,
     )
-    return same and plain.start == SCRATCH != tuned.start
+    return have_equal_training and plain.start == SCRATCH != tuned.start
 
 
 def start_of(training: Mapping[str, object]) -> str:
@@ -203,15 +215,18 @@ def minutes_of(part: PartArtefacts) -> float:
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """Sentences, figure and table of a curve; ``name`` ends the files' names."""
     caption = (
-        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference for training and "
-        f"validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
+        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a "
+        "reference for training and "
+        "validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: "
+        "zero-sideslip baseline."
     )
     return [
         _in_words(curve),
         Figure(f"reference_minutes_{name}", caption, _figure(curve)),
         Table(
             f"reference_minutes_{name}",
-            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive times seeds. The last column: compared with "
+            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive "
+            "times seeds. The last column: compared with "
             f"the same estimator from scratch on as many minutes, corrected by Holm.",
             pd.DataFrame(rows_of_curve(curve)),
             COLUMNS,
@@ -220,40 +235,53 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
 
 
 def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
-    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and how it stands to one from scratch."""
+    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and
+    how it stands to one from scratch.
+    """
     rows: list[dict[str, object]] = []
     for point in curve.points:
         if point.estimator != BASELINES[0]:
             low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
-            row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
-            row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
-            row |= {
+            row = {
+                "title": point.title,
+                "start": point.start,
+                "minutes": point.minutes,
+                "rmse_sideslip": curve.ranking.rmse[point.name],
                 "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
                 "n_trainings": point.n_trainings,
+                "against_scratch": _against_scratch(curve, point) or "–",
             }
-            rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
+            rows.append(row)
     return rows
 
 
 def _against_scratch(curve: Curve, point: Point) -> str:
-    plain = next((other for other in curve.points if _same(other, point)), None)
-    own = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
-    return own.verdict if own is not None else ""
+    plain = next(
+        (candidate for candidate in curve.points if _differ_in_start(candidate, point)), None
+    )
+    pair = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
+    return pair.verdict if pair is not None else ""
 
 
 def _lines(curve: Curve) -> list[list[Point]]:
-    """Points by estimator and start, each with more minutes than the one before; none of the zero-sideslip baseline."""
+    """Points by estimator and start, each with more minutes than the one before.
+
+    None of the zero-sideslip baseline.
+    """
     groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
-    return [list(own) for key, own in groups if key[0] != BASELINES[0]]
+    return [list(points) for key, points in groups if key[0] != BASELINES[0]]
 
 
 def _in_words(curve: Curve) -> str:
-    """Errors with the fewest and the most minutes of reference, and significant effects of starting from another model."""
+    """Errors with the fewest and the most minutes of reference, and significant effects of starting
+    from another model.
+    """
     sentences = []
-    for first, *_, last in (own for own in _lines(curve) if len(own) > 1):
-        how = "" if first.start == SCRATCH else f" ({first.start})"
+    for first, *_, last in (points for points in _lines(curve) if len(points) > 1):
+        origin = "" if first.start == SCRATCH else f" ({first.start})"
         sentences.append(
-            f"{first.title}{how}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
+            f"{first.title}{origin}: {fixed(curve.ranking.rmse[first.name], 2)}° after "
+            f"{first.minutes:g} min of reference, "
             f"{fixed(curve.ranking.rmse[last.name], 2)}° after {last.minutes:g} min."
         )
     better = [
@@ -263,12 +291,15 @@ def _in_words(curve: Curve) -> str:
         f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"
     ]
     if any(_against_scratch(curve, point) for point in curve.points):
-        found = [f"significantly lower with {listed(better)} min"] if better else []
-        found += [f"significantly higher with {listed(worse)} min"] if worse else []
+        effects = [f"significantly lower with {listed(better)} min"] if better else []
+        effects += [f"significantly higher with {listed(worse)} min"] if worse else []
         sentences.append(
-            f"Starting from another model, the error is {' and '.join(found)}."
-            if found
-            else "Starting from another model makes no significant difference to starting from scratch with any amount."
+            f"Starting from another model, the error is {' and '.join(effects)}."
+            if effects
+            else (
+                "Starting from another model makes no significant difference to starting from "
+                "scratch with any amount."
+            )
         )
     return f"**{curve.title}.** " + " ".join(sentences)
 
@@ -280,14 +311,14 @@ def _figure(curve: Curve) -> MatplotlibFigure:
     with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.subplots()
         drawn = _lines(curve)
-        for shift, own in enumerate(drawn):
-            line = line_of(own[0].estimator, own[0].variant)
-            start = own[0].start
-            apart = 1.03 ** (shift - len(drawn) / 2)
-            minutes = [point.minutes * apart for point in own]
-            errors = [ranking.rmse[point.name] for point in own]
+        for shift, points in enumerate(drawn):
+            line = line_of(points[0].estimator, points[0].variant)
+            start = points[0].start
+            factor = 1.03 ** (shift - len(drawn) / 2)
+            minutes = [point.minutes * factor for point in points]
+            errors = [ranking.rmse[point.name] for point in points]
             dash = "solid" if start == SCRATCH else "dashed"
-            label = own[0].title + ("" if start == SCRATCH else f", {start}")
+            label = points[0].title + ("" if start == SCRATCH else f", {start}")
             axes.plot(
                 minutes,
                 errors,
@@ -298,7 +329,7 @@ def _figure(curve: Curve) -> MatplotlibFigure:
                 linewidth=1.1,
                 label=label,
             )
-            for at, point in zip(minutes, own, strict=True):
+            for at, point in zip(minutes, points, strict=True):
                 low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
                 if math.isfinite(low):
                     axes.plot([at, at], [low, high], color=line.colour, linewidth=0.8)

@@ -1,7 +1,8 @@
 """Tables and heat maps of a sweep: every combination of settings, over its seeds.
 
-`SweepArtefacts.table` has a row a combination, `build` makes the report. The mean over seeds comes with a 95 % confidence interval from
-Student's t distribution. The combination is chosen on the validation range; tests choose nothing.
+`SweepArtefacts.table` has a row a combination, `build` makes the report. The mean over seeds comes
+with a 95 % confidence interval from Student's t distribution. The combination is chosen on the
+validation range; tests choose nothing.
 """
 
 from __future__ import annotations
@@ -33,15 +34,17 @@ CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
 DONE = "done"
 FAILED = "failed"
-LOGARITHMIC_FROM = 20.0
-MOST_COLUMNS_SIDE_BY_SIDE = 6
+MIN_RATIO_FOR_LOG = 20.0
+MAX_COLUMNS_SIDE_BY_SIDE = 6
 CELL_HEIGHT = 0.42  # in
-NO_VALUE = "#ececec"
+NO_VALUE_COLOUR = "#ececec"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
 Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
-"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and column of those with a frame."""
+"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and
+column of those with a frame.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,10 @@ class SweepArtefacts:
     keys: Sequence[
         str
     ]  # those that take several values, the seed aside, in the order of the command
-    # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
-    # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
+    # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status``
+    # (``done`` or ``failed``), ``error``,
+    # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for
+    # each set of `sets`; those of a
     # combination with a fault count the samples while it lasts
     jobs: pd.DataFrame
 
@@ -64,21 +69,24 @@ class SweepArtefacts:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """One row a combination, in the order of the jobs: its number, title, keys, parameters, seeds that are done and failed.
+        """One row a combination, in the order of the jobs: its number, title, keys, parameters,
+        seeds that are done and failed.
 
-        For each set ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed)
-        [deg]. ``chosen`` is the lowest mean on the validation range among those of which no seed failed; none where nothing was validated,
-        or where combinations differ in faults, the mildest of which would win.
+        For each set ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``,
+        half its 95 % interval (NaN for one seed) [deg]. ``chosen`` is the lowest mean on the
+        validation range among those of which no seed failed; none where nothing was validated, or
+        where combinations differ in faults, the mildest of which would win.
         """
         rows = []
-        for number, own in self.jobs.groupby("combination", sort=False):
-            done = own[own["status"] == DONE]
+        for number, jobs in self.jobs.groupby("combination", sort=False):
+            done = jobs[jobs["status"] == DONE]
             row: dict[str, object] = {
                 "combination": number,
-                **{name: own.iloc[0][name] for name in ("title", *self.keys)},
+                **{name: jobs.iloc[0][name] for name in ("title", *self.keys)},
+                "n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan,
+                "n_seeds": len(done),
+                "n_failed": len(jobs) - len(done),
             }
-            row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
-            row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
             for name in self.sets:
                 row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(
                     done[f"{METRIC}.{name}"].to_numpy(dtype=float)
@@ -98,7 +106,9 @@ class SweepArtefacts:
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
+    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was
+    made.
+    """
     part = artefacts.part
     blocks: list[Block] = [
         data_sentence(part),
@@ -119,9 +129,12 @@ def build(artefacts: SweepArtefacts) -> Document:
 
 
 def interval(values: FloatArray) -> tuple[float, float]:
-    """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t distribution with n - 1 degrees of freedom.
+    """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t
+    distribution with n - 1 degrees of freedom.
 
-    Returns:
+    Returns
+    -------
+    tuple[float, float]
         Mean and half interval; NaN where there are no values, half NaN for one value.
     """
     from scipy.stats import t
@@ -136,7 +149,10 @@ def interval(values: FloatArray) -> tuple[float, float]:
 
 
 def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
-    """A summary as a terminal shows it: headers, and rows of cells; the chosen combination has a star."""
+    """A summary as a terminal shows it: headers, and rows of cells.
+
+    The chosen combination has a star.
+    """
     names = short_names(artefacts.keys)
     table = artefacts.table
     header = ["", *(names.values() or ["estimator"]), "parameters", "seeds", *artefacts.sets]
@@ -148,19 +164,22 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
             if row["n_failed"]
             else str(row["n_seeds"])
         )
-        which = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
+        settings = [override_text(row[key]) for key in artefacts.keys] or [str(row["title"])]
         scores = [
             mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name])
             for name in artefacts.sets
         ]
         rows.append(
-            ["*" if row["chosen"] else "", *which, fixed(row["n_parameters"], 0), seeds, *scores]
+            ["*" if row["chosen"] else "", *settings, fixed(row["n_parameters"], 0), seeds, *scores]
         )
     return header, rows
 
 
 def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
-    """A heat map for each set, where two numeric keys vary and any others are booleans; else none."""
+    """A heat map for each set, where two numeric keys vary and any others are booleans.
+
+    Else none.
+    """
     table = artefacts.table
     varied = [key for key in artefacts.keys if table[key].nunique() > 1]
     switches = [
@@ -179,16 +198,18 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
     maps = []
     for name in artefacts.sets:
         panels = []
-        for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
+        for key, rows in table.groupby(switches, sort=False) if switches else [((), table)]:
             title = ", ".join(
-                f"{names[switch]} = {shown_value(value)}"
+                f"{names[switch]} = {override_text(value)}"
                 for switch, value in zip(switches, key, strict=True)
             )
-            panels.append(_panel(own, title, name, numeric, cells))
-        where = _set_in_words(name)
+            panels.append(_panel(rows, title, name, numeric, cells))
+        set_text = _set_in_words(name)
         caption = (
-            f"RMSE(β) on {where} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
-            f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
+            f"RMSE(β) on {set_text} over {across} and {up} ({_kinds(artefacts, name)}). In each "
+            "cell the mean over seeds and, "
+            "below it, half its 95 % confidence interval. The frame marks the combination chosen "
+            "on the validation range."
         )
         ticks = [[str(value) for value in values] for values in cells]
         figure = heat_map(panels, ticks[0], ticks[1], across, up, f"RMSE(β), {name} [deg]")
@@ -204,7 +225,7 @@ def short_names(keys: Sequence[str]) -> dict[str, str]:
     }
 
 
-def shown_value(value: object) -> str:
+def override_text(value: object) -> str:
     """A value as it is typed in an override."""
     return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)
 
@@ -221,10 +242,10 @@ def _panel(
     """Combinations with two numeric keys of these values, across and up."""
     across, up = numeric
     mean, half, chosen = (
-        table.pivot(index=up, columns=across, values=shown)
+        table.pivot(index=up, columns=across, values=column)
         .reindex(index=cells[1], columns=cells[0])
         .to_numpy(dtype=float)
-        for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
+        for column in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
     )
     return title, mean, half, np.argwhere(chosen == 1.0).tolist()
 
@@ -237,7 +258,10 @@ def heat_map(
     row_label: str,
     quantity: str,
 ) -> MatplotlibFigure:
-    """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
+    """Panels, (R, C) each, on one scale of colours, the darker the larger.
+
+    Logarithmic where the largest value is 20 times the smallest.
+    """
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
@@ -248,15 +272,13 @@ def heat_map(
     high = float(finite.max())
     scale = (
         LogNorm(low, high)
-        if low > 0 and high / low > LOGARITHMIC_FROM
+        if low > 0 and high / low > MIN_RATIO_FOR_LOG
         else Normalize(low, high if high > low else low + 1.0)
     )
-    across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
+    across = 1 if len(columns) > MAX_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
     width = (
-        SINGLE_COLUMN
-        if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE
-        else DOUBLE_COLUMN
+        SINGLE_COLUMN if across == 1 and len(columns) <= MAX_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
     )
     with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
@@ -289,7 +311,7 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     axes.pcolormesh(
         *edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8
     )
-    axes.set_facecolor(NO_VALUE)
+    axes.set_facecolor(NO_VALUE_COLOUR)
     for row, column in np.ndindex(means.shape):
         mean = float(means[row, column])
         half = float(halves[row, column])
@@ -330,14 +352,22 @@ def _kinds(artefacts: SweepArtefacts, name: str) -> str:
 
 def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     if any(key.split(".")[0] == "fault" for key in artefacts.keys):
-        return "No combination is chosen: the combinations differ in faults, which are conditions of the evaluation and no settings."
+        return (
+            "No combination is chosen: the combinations differ in faults, which are conditions "
+            "of the evaluation and no settings."
+        )
     table = artefacts.table
     if not table["chosen"].any():
-        return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
+        return (
+            "No combination is chosen: there is no finite error on a validation range, and tests "
+            "choose nothing."
+        )
     row = table[table["chosen"]].iloc[0]
     names = short_names(artefacts.keys)
-    which = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
-    words = f"Chosen on the validation range: **{row['title']}**" + (f" ({which})" if which else "")
+    settings = ", ".join(f"{names[key]} = {override_text(row[key])}" for key in artefacts.keys)
+    words = f"Chosen on the validation range: **{row['title']}**" + (
+        f" ({settings})" if settings else ""
+    )
     figures = [
         f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})"
         for name in artefacts.sets
@@ -348,7 +378,10 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     half = float(row[f"{METRIC}_half.{VALIDATION}"])
     if len(table) > 1 and math.isfinite(half):
         close = int((table[f"{METRIC}.{VALIDATION}"] <= mean + half).sum()) - 1
-        words += f" {close} of the other {len(table) - 1} combinations have a mean on the validation range within its interval."
+        words += (
+            f" {close} of the other {len(table) - 1} combinations have a mean on the validation "
+            "range within its interval."
+        )
     return words
 
 
@@ -375,20 +408,26 @@ def _budget(jobs: pd.DataFrame) -> str:
     done = jobs[jobs["status"] == DONE]
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
-    fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
+    lowest, highest = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
     took = (
-        f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs"
+        f"; training took {lowest if lowest == highest else f'{lowest} to {highest}'} epochs"
         if len(epochs)
         else ""
     )
-    counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
+    counts = (
+        f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: "
+        f"{len(done)} of {len(jobs)} jobs done"
+    )
     return f"Budget: {counts}{took}"
 
 
 INTERVAL_AND_CHOICE = (
-    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
-    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
-    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
+    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ "
+    "s/√n, from Student's t distribution "
+    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what "
+    "another drive or car would",
+    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a "
+    "failed seed. Test data choose nothing",
     "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
 )
 
@@ -409,8 +448,11 @@ def _table(artefacts: SweepArtefacts) -> Table:
     frame = table.assign(chosen=["chosen" if chosen else "" for chosen in table["chosen"]])
     for key in artefacts.keys:
         if not all(_is_number(value) for value in frame[key]):
-            frame[key] = [shown_value(value) for value in frame[key]]
+            frame[key] = [override_text(value) for value in frame[key]]
         else:
             columns[key] = Column(names[key], each=True)
-    caption = "All combinations in the order of the command: mean RMSE(β) over seeds, and half its 95 % confidence interval."
+    caption = (
+        "All combinations in the order of the command: mean RMSE(β) over seeds, and half its 95 "
+        "% confidence interval."
+    )
     return Table("combinations", caption, frame, {**columns, "chosen": Column("on validation")})

@@ -1,6 +1,8 @@
-"""The study of several vehicles, each tested by estimators that have learnt on others: which family carries over from which cars to which.
+"""The study of several vehicles, each tested by estimators that have learnt on others: which family
+carries over from which cars to which.
 
-A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles carry no interval over vehicles.
+A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles
+carry no interval over vehicles.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from vehest.report.style import (
 )
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of, budget_sentence, data_sentence
-from vehest.studies.kit.runs import by_name
+from vehest.studies.kit.runs import titles_of
 from vehest.studies.kit.standing import (
     interval_in_words,
     ranking_of,
@@ -48,9 +50,9 @@ from vehest.studies.kit.warnings import warnings_of
 VERSION = "3"
 TAKES = "parts"
 SHOWS_FAILED = True
-COLUMNS = 4
+MAX_PANEL_COLUMNS = 4
 TITLE_WIDTH = 24
-ROW = 0.16  # in, height of an estimator
+ROW_HEIGHT = 0.16  # in, height of an estimator
 REFERENCES = (
     "zero",
     "static_map",
@@ -60,7 +62,11 @@ REFERENCES = (
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how it was made; raises `DataError`."""
+    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how
+    it was made.
+
+    Raises `DataError`.
+    """
     parts = artefacts.parts
     rankings = {
         (name, test_set): ranking_of(part, test_set)
@@ -69,19 +75,21 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     }
     board = overview(parts, rankings)
     caption = (
-        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an estimator is better than it. The "
-        "vertical line in each row is the static map, whose two numbers are fitted on the same ranges."
+        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, "
+        "an estimator is better than it. The "
+        "vertical line in each row is the static map, whose two numbers are fitted on the same "
+        "ranges."
     )
     blocks: list[Block] = [
         Figure("transfer", caption, _drawn(board)),
         *([artefacts.about] if artefacts.about.strip() else []),
     ]
-    absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
+    missing = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     blocks.append(
         carried_over(board)
         + (
-            f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}."
-            if absent
+            f"\n\nNot here, since nothing could be trained or scored: {listed(missing)}."
+            if missing
             else ""
         )
     )
@@ -97,16 +105,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def overview(
     parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
 ) -> pd.DataFrame:
-    """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its interval [deg], and what it beats."""
+    """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its
+    interval [deg], and what it beats.
+    """
     nothing: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
     nothing |= dict.fromkeys(
         (*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING
     )
     rows = []
     for (part, test_set), ranking in rankings.items():
-        titles = {
-            name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()
-        }
+        titles = titles_of(parts[part].models)
         order = [name for baseline in REFERENCES for name in titles if name[0] == baseline]
         order += [name for name in ranking.order if name not in order] + [
             name for name in titles if name not in ranking.order
@@ -116,26 +124,31 @@ def overview(
                 "part": part,
                 "title": as_text(parts[part].title),
                 "test_set": test_set,
+                "estimator": name[0],
+                "variant": name[1],
+                "estimator_title": titles[name],
+                "rmse_sideslip": ranking.rmse.get(name, math.nan),
+                **(standing_columns(ranking, name) if name in ranking.rmse else nothing),
+                **_with_best_lever(parts[part], name, test_set),
             }
-            row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
-            row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
-            row |= standing_columns(ranking, name) if name in ranking.rmse else nothing
-            row |= _with_best_lever(parts[part], name, test_set)
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str, float]:
-    """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m]; NaN where the point is known."""
+    """Root mean square over seeds of RMSE(β) with the best lever arm [deg], and the arms' mean [m].
+
+    NaN where the point is known.
+    """
     metrics = part.metrics
-    own = metrics[
+    rows = metrics[
         (metrics["condition"] == "best_lever_arm")
         & (metrics["test_set"] == test_set)
         & (metrics["subset"] == "all")
     ]
-    own = own[(own["estimator"] == name[0]) & (own["variant"].fillna("") == name[1])]
+    rows = rows[(rows["estimator"] == name[0]) & (rows["variant"].fillna("") == name[1])]
     errors, arms = (
-        own.loc[own["metric"] == metric, "value"].to_numpy(dtype=float)
+        rows.loc[rows["metric"] == metric, "value"].to_numpy(dtype=float)
         for metric in ("rmse_sideslip", "lever_arm")
     )
     if not len(errors):
@@ -147,27 +160,36 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
 
 
 def carried_over(board: pd.DataFrame) -> str:
-    """Sentences: on which vehicles an estimator is significantly better than zero and the static map."""
+    """Sentences: on which vehicles an estimator is significantly better than zero and the static
+    map.
+    """
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     tested = board[~board["estimator"].isin(BASELINES)]
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
     lines = []
     everywhere = []
-    for title, own in tested.groupby("estimator_title", sort=False):
+    for title, rows in tested.groupby("estimator_title", sort=False):
         names = beaten[beaten["estimator_title"] == title]
-        where = [_place(row, board) for row in names.to_dict("records")]
-        if len(names) == len(own) == len(places):
+        places_beaten = [_place(row, board) for row in names.to_dict("records")]
+        if len(names) == len(rows) == len(places):
             everywhere.append(str(title))
         lines.append(
-            f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}"
+            f"- {title}: {len(names)} of "
+            f"{len(rows)}{f' ({listed(places_beaten)})' if places_beaten else ''}"
         )
     if everywhere:
-        first = f"On every one of {len(places)} tests {listed(everywhere)} are significantly better than zero and the static map."
+        first = (
+            f"On every one of {len(places)} tests {listed(everywhere)} are significantly better "
+            "than zero and the static map."
+        )
     else:
-        first = f"**No estimator is significantly better than both zero and the static map on each of the {len(places)} tests.**"
+        first = (
+            "**No estimator is significantly better than both zero and the static map on each "
+            f"of the {len(places)} tests.**"
+        )
     return (
-        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten significantly:\n\n"
-        + "\n".join(lines)
+        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which "
+        "both are beaten significantly:\n\n" + "\n".join(lines)
     )
 
 
@@ -181,15 +203,17 @@ def _matrix(board: pd.DataFrame) -> Table:
         title: {"estimator": title} for title in board["estimator_title"]
     }
     columns = {"estimator": Column("estimator")}
-    for place, (_, own) in enumerate(board.groupby(["part", "test_set"], sort=False)):
-        found = own.drop_duplicates("estimator_title").to_dict("records")
-        cells = {row["estimator_title"]: _cell(row) for row in found}
-        columns[f"place_{place}"] = Column(_place(found[0], board))
+    for place, (_, rows_of_test) in enumerate(board.groupby(["part", "test_set"], sort=False)):
+        rows_by_title = rows_of_test.drop_duplicates("estimator_title").to_dict("records")
+        cells = {row["estimator_title"]: _cell(row) for row in rows_by_title}
+        columns[f"place_{place}"] = Column(_place(rows_by_title[0], board))
         for title, row in rows.items():
             row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
-        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * significantly better than zero and the "
-        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
+        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. "
+        "* significantly better than zero and the "
+        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite "
+        "error. Inputs may differ from "
         "vehicle to vehicle under one name; they are listed in the pipeline's file."
     )
     return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
@@ -207,7 +231,9 @@ def _cell(row: Mapping[Any, Any]) -> str:
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
-    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the static map as a vertical line."""
+    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the
+    static map as a vertical line.
+    """
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     names = list(
         dict.fromkeys(
@@ -216,26 +242,26 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     )
     names = [name for name in names if name[0] != "zero"]
     lines = lines_of([name[:2] for name in names])
-    columns = min(COLUMNS, len(places))
+    columns = min(MAX_PANEL_COLUMNS, len(places))
     rows = -(-len(places) // columns)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names))) as figure:
+    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW_HEIGHT * len(names))) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)
         for axes, (part, test_set) in zip(grid.flat, places, strict=False):
-            own = board[(board["part"] == part) & (board["test_set"] == test_set)].set_index(
-                ["estimator", "variant"]
-            )
-            nothing = _first(own, "zero")
+            rows_of_test = board[
+                (board["part"] == part) & (board["test_set"] == test_set)
+            ].set_index(["estimator", "variant"])
+            nothing = _first(rows_of_test, "zero")
             for height, name in enumerate(names):
-                if name[:2] not in own.index or not math.isfinite(
-                    own.loc[name[:2], "rmse_sideslip"]
+                if name[:2] not in rows_of_test.index or not math.isfinite(
+                    rows_of_test.loc[name[:2], "rmse_sideslip"]
                 ):
                     continue
                 value, low, high = (
-                    float(own.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
+                    float(rows_of_test.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
                     for end in ("", "_low", "_high")
                 )
                 colour = lines[name[:2]].colour
@@ -249,10 +275,10 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                     )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
             axes.axvline(1.0, color="black", linewidth=0.7)
-            static = _first(own, "static_map") / nothing
+            static = _first(rows_of_test, "static_map") / nothing
             if math.isfinite(static):
                 axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
-            title = str(own["title"].iloc[0])
+            title = str(rows_of_test["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
             lines_of_title = [
                 *textwrap.wrap(title, TITLE_WIDTH),
@@ -270,17 +296,17 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
     return figure
 
 
-def _first(own: pd.DataFrame, estimator: str) -> float:
-    found = own[own.index.get_level_values("estimator") == estimator]["rmse_sideslip"]
-    return float(found.iloc[0]) if len(found) else math.nan
+def _first(rows_of_test: pd.DataFrame, estimator: str) -> float:
+    errors = rows_of_test[rows_of_test.index.get_level_values("estimator") == estimator][
+        "rmse_sideslip"
+    ]
+    return float(errors.iloc[0]) if len(errors) else math.nan
 
 
 def _part(
     name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]
 ) -> list[Block]:
-    titles: dict[Name, str] = {
-        own: as_text(models[0].title) for own, models in by_name(part.models).items()
-    }
+    titles = titles_of(part.models)
     blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
     for test_set in part.split.tests:
         kinds = part.kinds_of(part.split.tests[test_set])
@@ -292,7 +318,7 @@ def _part(
         blocks.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
     blocks.append(budget_sentence(part))
     decimals = decimals_for(board["rmse_sideslip"].tolist())
-    shown = board.assign(
+    table = board.assign(
         interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
     )
     columns: dict[str, Column] = (
@@ -306,14 +332,18 @@ def _part(
         "beats_zero": Column("beats zero"),
         "beats_static_map": Column("beats static map"),
     }
-    caption = f"{as_text(part.title)}: baselines first, then by error. Differences are paired over blocks and seeds, corrected by Holm."
+    caption = (
+        f"{as_text(part.title)}: baselines first, then by error. Differences are paired over "
+        "blocks and seeds, corrected by Holm."
+    )
     if board["rmse_sideslip_best_lever"].notna().any():
         columns |= {
             "rmse_sideslip_best_lever": Column("with the best lever [deg]", decimals=decimals),
             "lever_arm": Column("lever [m]", decimals=2),
         }
         caption += (
-            " Where the reference was measured is not known: the best lever arm, within 0.5 m, takes off the part of an error that is "
+            " Where the reference was measured is not known: the best lever arm, within 0.5 m, "
+            "takes off the part of an error that is "
             "one alone; it is chosen on the test, of each estimator for itself."
         )
-    return [*blocks, Table(f"leaderboard_{name}", caption, shown, columns)]
+    return [*blocks, Table(f"leaderboard_{name}", caption, table, columns)]

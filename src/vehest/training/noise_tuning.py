@@ -108,6 +108,13 @@ class IdentificationSettings(NoiseTuningSettings):
         "what searches, and the choice of an epoch behind a filter, make small: the mean squared error over all samples, or the squared "
         "mean of the recordings' root mean squared errors, which one recording decides less",
     )
+    error_limit: float = setting(
+        0.0,
+        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's loss), in all that error makes small; "
+        "0: none, as in the paper",
+        unit="deg",
+        least=0.0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

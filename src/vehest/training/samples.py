@@ -40,6 +40,12 @@ class SampleSettings(Group):
         "step size, epochs, patience",
     )
     batch_size: int = setting(1024, "samples in a batch", least=1)
+    loss_limit: float = setting(
+        0.0,
+        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's loss); of squared errors only; 0: none",
+        unit="deg",
+        least=0.0,
+    )
     dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 

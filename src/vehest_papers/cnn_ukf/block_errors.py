@@ -123,45 +123,52 @@ def measured_rows(
     perturbed
         Filters with wrong stiffnesses.
     table
-        Of `observability.local`.
+        Of `observability.local`; empty where the smooth filter is not fitted.
     """
-    rows = _rows_among_four(main)
-    by_claim = {
-        ("de_ukf_distrust_grows_with_error", paper.DEEP): measures.distrust_correlations(
-            outputs[paper.DEEP]
-        ),
-        ("cnn_ukf_distrust_grows_with_error", paper.CNN): measures.distrust_correlations(
-            outputs[paper.CNN]
-        ),
-        ("cnn_ukf_distrust_spans_more_decades", paper.CNN): measures.distrust_decades_ratios(
-            outputs[paper.CNN], outputs[paper.DEEP]
-        ),
-        ("yaw_rate_noise_grows_with_sideslip", paper.CNN): measures.yaw_rate_noise_rises(
-            outputs[paper.CNN]
-        ),
-        ("lateral_velocity_noise_grows_with_nonlinearity", paper.CNN): (
-            measures.lateral_velocity_noise_rises(outputs[paper.CNN])
-        ),
-    }
-    conditions = [ManoeuvreErrors(runs) for runs in perturbed.stiffness]
+    rows = _rows_among_four(main) if all(name in main for name in paper.OF_FOUR) else []
+    by_claim = {}
+    if paper.DEEP in outputs:
+        deep = outputs[paper.DEEP]
+        by_claim["de_ukf_distrust_grows_with_error", paper.DEEP] = measures.distrust_correlations(
+            deep
+        )
+    if paper.CNN in outputs:
+        own = outputs[paper.CNN]
+        of_network = {
+            "cnn_ukf_distrust_grows_with_error": measures.distrust_correlations(own),
+            "yaw_rate_noise_grows_with_sideslip": measures.yaw_rate_noise_rises(own),
+            "lateral_velocity_noise_grows_with_nonlinearity": (
+                measures.lateral_velocity_noise_rises(own)
+            ),
+        }
+        if paper.DEEP in outputs:
+            of_network["cnn_ukf_distrust_spans_more_decades"] = measures.distrust_decades_ratios(
+                own, outputs[paper.DEEP]
+            )
+        by_claim |= {(claim, paper.CNN): values for claim, values in of_network.items()}
+    conditions = [ManoeuvreErrors(runs) for runs in perturbed.stiffness if runs]
+    trained = perturbed.stiffness[NOMINAL]
     for claim, candidate, other in (
         ("de_ukf_less_sensitive_to_stiffness_than_model", paper.DEEP, paper.MODEL),
         ("cnn_ukf_less_sensitive_to_stiffness_than_model", paper.CNN, paper.MODEL),
         ("de_ukf_less_sensitive_to_stiffness_than_cnn_ukf", paper.DEEP, paper.CNN),
     ):
-        by_claim[claim, candidate] = measures.stiffness_rise_differences(
-            conditions, conditions[NOMINAL], candidate, other
+        if candidate in trained and other in trained:
+            by_claim[claim, candidate] = measures.stiffness_rise_differences(
+                conditions, conditions[NOMINAL], candidate, other
+            )
+    if all(name in trained for name in paper.HYBRIDS):
+        by_claim["cnn_ukf_below_de_ukf_at_all_stiffnesses", paper.CNN] = (
+            measures.largest_ratios_over_stiffnesses(conditions, paper.CNN, paper.DEEP)
         )
-    by_claim["cnn_ukf_below_de_ukf_at_all_stiffnesses", paper.CNN] = (
-        measures.largest_ratios_over_stiffnesses(conditions, paper.CNN, paper.DEEP)
-    )
     for (claim, candidate), values in by_claim.items():
         head = BlockRow(FULL, candidate, 0, TEST, claim, "", 0.0, 0)
         rows += seed_rows(head, range(len(values)), main.manoeuvres, values)
-    for claim, test_set, is_straight in (
+    turns = (
         ("observable_while_steering", "steady_turns", False),
         ("unobservable_at_zero_steering", "straights", True),
-    ):
+    )
+    for claim, test_set, is_straight in turns if len(table) else ():
         names, values = measures.ranks(table, is_straight)
         head = BlockRow("observability", "-", 0, test_set, claim, "", 0.0, 0)
         rows += seed_rows(head, [0], names, values)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
 from vehest_papers.cnn_ukf.subjects import Prepared, Runs, chosen, line_of
@@ -43,17 +43,7 @@ def figure_4(
                 axes.set_xlabel(label)
         panels[0].set_ylabel("samples")
         legend_above(figure, panels[0], columns=2)
-    sentences = []
-    for name, (sideslip, ay) in driven.items():
-        inside = 100.0 * float(np.mean(np.abs(sideslip) <= 3.0))
-        sentences.append(
-            f"{titles[name]}: {len(ay) / (60.0 * parts[name].protocol.rate_hz):.0f} min, |β| ≤ 3° in {fixed(inside, 1)} % of samples, |β| "
-            f"up to {fixed(float(np.abs(sideslip).max()), 0)}°, |ay| up to {fixed(float(np.abs(ay).max()), 1)} m/s²"
-        )
-    caption = (
-        "Distribution of sideslip angle and lateral acceleration (Figure 4 of the paper), bins of 1° and 1 m/s², training, validation and "
-        f"test together; the test is the same in both, and has all lateral accelerations. {'. '.join(sentences)}. Data: {data}."
-    )
+    caption = f"Sideslip angle and lateral acceleration of all samples (Figure 4 of the paper). Data: {data}."
     return Figure("figure_4", caption, figure)
 
 
@@ -105,13 +95,9 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
         upper.set_xlabel("[deg]")
         upper.margins(y=0.25)
         legend_above(figure, axes, columns=5)
-    shown = "; ".join(
-        f"{candidate} (seed {run.model.seed}) {fixed(found[candidate].mean, 3)} ± {fixed(found[candidate].deviation, 3)}°"
-        for candidate, run in picked.items()
-    )
     caption = (
-        f"Distribution of the sideslip angle's error where |ay| ≥ 4 m/s² (Figure {number} of the paper), {title}, bins of {BIN:g}°; of "
-        f"each method the seed that validation chooses. Above: mean and standard deviation: {shown}. Data: {data}."
+        f"Distribution of errors where |ay| ≥ 4 m/s², {title}, bins of {BIN:g}°; above mean and standard deviation (Figure {number} of the "
+        f"paper). Data: {data}."
     )
     rows = [
         {"candidate": candidate, "from_deg": low, "samples": count}
@@ -177,7 +163,7 @@ def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
         "n": Column("of them", decimals=0),
         **{candidate: Column(candidate) for candidate in of_run},
     }
-    caption = f"MSE_nl [deg²] by group of manoeuvres (Figure 6 of the paper), {title}: median of seeds, lowest and highest. Data: {data}."
+    caption = f"MSE_nl by group of manoeuvres, median and range of seeds (Figure 6 of the paper). Data: {data}."
     return Figure("figure_6", caption, figure), Table(
         "figure_6", caption, pd.DataFrame(rows), columns
     )

@@ -1,25 +1,28 @@
-"""The report: claims and verdicts, Table II with what has to be beaten, ablations; then Table III and the paper's figures as appendices."""
+"""The report: tables, figures and numbers of what is trained, for the places of its hand-written template."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
-from vehest.report.style import listed
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.report.style import MISSING, fixed
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest_papers.cnn_ukf import (
     block_errors,
+    calibration,
     distributions,
+    factorial,
     observability,
     paper,
     perturbed,
-    search,
     tables,
     traces,
 )
@@ -28,14 +31,12 @@ from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
-    CUTOFF_HZ,
     KPIS,
     LARGEST_SIDESLIP,
     TEST,
     Prepared,
     Run,
     Runs,
-    candidate_of,
     chosen,
     filter_of,
     kpi_table,
@@ -44,48 +45,127 @@ from vehest_papers.cnn_ukf.subjects import (
 )
 from vehest_papers.kit import methods
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
-from vehest_papers.kit.claim_files import claims_of
-from vehest_papers.kit.reading import spans_in_words, words_of_kinds
-from vehest_papers.kit.verdict_table import claims_table, one_line
+from vehest_papers.kit.claim_files import Paper, claims_of
+from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
+from vehest_papers.kit.loss_curves import loss_curves, loss_figure
+from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.report_template import fill_template
+from vehest_papers.kit.verdict_table import CLAIMS, claims_table, figure_in_words, one_line
+from vehest_papers.kit.verdicts import VERDICTS
 
 NAME = "cnn_ukf"  # of the paper's package
-FREE = "free"
-NETWORKS = (
-    paper.DATA,
-    paper.Z_SCORES,
-    paper.RECURRENT,
-)  # networks without a filter, in a table of their own
-IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in tables.ORACLES)
-NOTE = (
-    "Seeds 3 and 4 of the hybrids and the limited set were added after the test had been seen, by rules "
-    "fixed before they were trained."
-)
+TEMPLATE = Path(__file__).with_name("report.md.j2")
+NOT_TRAINED = factorial.NOT_TRAINED
+WITH_NETWORK = ("ensemble_ukf", "cnn_ukf")  # estimators
+COMPARED = {
+    "deep": paper.DEEP,
+    "model": paper.MODEL,
+    "data": paper.DATA,
+    "smooth": paper.SMOOTH,
+    "free": paper.FREE,
+}
+"""Place in the template -> with what CNN-UKF is compared there."""
+SHOWN = (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
+SHOWN_FIRST = (paper.CNN, paper.DEEP, paper.DATA, paper.MODEL, paper.SMOOTH, paper.FREE, paper.ZERO)
+FILTERS = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
+ALONE = (paper.DATA, paper.RECURRENT, paper.STATIC_MAP, paper.ZERO)  # without a filter
+
+
+@dataclass
+class Outcome:
+    """What the report is made from: blocks that the template places, tables that are files alone, errors by manoeuvre."""
+
+    blocks: list[Block] = field(default_factory=list)
+    data: dict[str, pd.DataFrame] = field(default_factory=dict)
+    rows: list[BlockRow] = field(default_factory=list)
+
+    def add_files(self, *new: Table) -> None:
+        """Tables that the report links to and does not show."""
+        self.data |= {table.name: table.frame for table in new}
+
+
+@dataclass(frozen=True)
+class Subjects:
+    """Candidates that are trained, with their test manoeuvres as the paper prepares them."""
+
+    artefacts: StudyArtefacts
+    prepared: Mapping[str, Prepared]  # by part
+    parts: Mapping[str, Runs]  # by part
+    runs: Runs  # of all parts on the full set, by unique names
+    main: ManoeuvreErrors  # of `runs`
+    within: Runs  # candidates of part ``full``, each drive until |β| first exceeds 12°
+    kind: str  # of the data
+
+    @property
+    def full(self) -> Prepared:
+        """Test manoeuvres of the full set."""
+        return self.prepared[FULL]
+
+    def among(self, names: Sequence[str]) -> dict[str, Sequence[Run]]:
+        """Those of some candidates that are trained."""
+        return {name: self.runs[name] for name in names if name in self.runs}
+
+    def drawn(self, names: Sequence[str]) -> dict[str, Run]:
+        """Of each the seed that validation chooses."""
+        return {name: chosen(seeds) for name, seeds in self.among(names).items()}
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of the study.
+    """The report of the study; candidates that are not trained yet are named, and claims on them not assessed.
 
-    Raises:
-        DataError: part ``full`` or one of its four methods is missing, or test sets are not called ``test``.
+    Raises
+    ------
+    DataError
+        Part ``full`` is missing or has no model, or a test set is not called ``test``.
     """
-    if FULL not in artefacts.parts:
+    if FULL not in artefacts.parts or not artefacts.parts[FULL].models:
         raise DataError(f"study '{artefacts.study}' needs part '{FULL}'")
     for name, part in artefacts.parts.items():
         if set(part.split.tests) != {TEST}:
             raise DataError(
                 f"study '{artefacts.study}': the test set of part '{name}' must be called {TEST}"
             )
-    prepared = {name: Prepared(part) for name, part in artefacts.parts.items()}
+    subjects = _subjects(artefacts)
+    content = claims_of(NAME)
+    outcome = Outcome()
+    _accuracy(outcome, subjects)
+    _hybrids(outcome, subjects, content)
+    _manoeuvres(outcome, subjects)
+    _files(outcome, subjects)
+    trained = block_errors.training_rows(
+        subjects.parts, content, is_complete=not artefacts.not_trained
+    )
+    claims = claims_table(content, outcome.rows, trained)
+    outcome.blocks.append(_verdicts(claims))
+    outcome.data |= {
+        CLAIMS: claims.frame,
+        BLOCKS: frame(outcome.rows, BlockRow),
+        TRAINING: frame(trained, TrainingRow),
+    }
+    values = _values(subjects, content, trained, sorted(outcome.data))
+    blocks = fill_template(TEMPLATE, values, outcome.blocks)
+    return {REPORT: Document(artefacts.title, blocks, outcome.data)}
+
+
+def _verdicts(claims: Table) -> Table:
+    """How many of the paper's claims, and of those added here, have which verdict."""
+    counts = claims.frame["verdict"].value_counts()
+    rows = [{"verdict": name, "claims": counts[name]} for name in VERDICTS if name in counts]
+    columns = {"verdict": Column("verdict"), "claims": Column("claims", decimals=0)}
+    return Table("verdicts", "Claims by verdict.", pd.DataFrame(rows), columns)
+
+
+def _subjects(artefacts: StudyArtefacts) -> Subjects:
+    read: dict[Path, Recording] = {}
+    prepared = {name: Prepared(part, read=read) for name, part in artefacts.parts.items()}
     parts = {name: runs_of(part, prepared[name]) for name, part in artefacts.parts.items()}
-    missing = [candidate for candidate in paper.OF_FOUR if candidate not in parts[FULL]]
-    if missing:
-        raise DataError(
-            f"study '{artefacts.study}': no {' and no '.join(missing)} among the models of part '{FULL}'; it needs all four"
-        )
     runs = _together(parts)
     runs |= oracles(runs, prepared[FULL])
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
-    return {REPORT: _report(artefacts, parts, runs, prepared)}
+    kind = words_of_kinds(artefacts.parts[FULL]).upper()
+    full = artefacts.parts[FULL]
+    within = runs_of(full, Prepared(full, until_sideslip=LARGEST_SIDESLIP, read=read))
+    return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), within, kind)
 
 
 def _place(candidate: str) -> int:
@@ -98,414 +178,267 @@ def _place(candidate: str) -> int:
 
 def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
     """Candidates of all parts that were trained on the full set, by unique names."""
-    found: dict[str, Sequence[Run]] = {}
-    for name, runs in parts.items():
-        if name not in (LIMITED, DOUBLED) and not search.is_point(name):
-            found |= {name_in(name, candidate): own for candidate, own in runs.items()}
-    return found
+    runs: dict[str, Sequence[Run]] = {}
+    for name, of_part in parts.items():
+        if name not in (LIMITED, DOUBLED):
+            runs |= {name_in(name, candidate): seeds for candidate, seeds in of_part.items()}
+    return runs
 
 
-def _report(
-    artefacts: StudyArtefacts,
-    parts: Mapping[str, Runs],
-    runs: Runs,
-    prepared: Mapping[str, Prepared],
-) -> Document:
-    kind = words_of_kinds(artefacts.parts[FULL])
-    main = ManoeuvreErrors(runs)
-    own = prepared[FULL]
-    filters_with_networks = ("ensemble_ukf", "cnn_ukf")
-    hybrids = [
-        name
-        for name in runs
-        if runs[name][0].model.estimator in filters_with_networks and name != paper.ORACLE_DISTRUST
+def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
+    """Table II, its figures by car, errors within the paper's range, and networks and oracles beside it."""
+    main = subjects.main
+    in_table = subjects.among([name for name in paper.CANDIDATES if name not in tables.ORACLES])
+    training = {
+        name: tables.training_error(run, subjects.full)
+        for name, run in subjects.drawn((*SHOWN, paper.RECURRENT)).items()
+    }
+    caption = f"Table II: ours with 95 % intervals (paper's in brackets). Data: {subjects.kind}."
+    outcome.blocks += [
+        tables.accuracy(
+            ManoeuvreErrors(in_table),
+            paper.TABLE_II,
+            training,
+            "table_2",
+            caption,
+            tuple(KPIS),
+        ),
+        tables.by_car(main, list(subjects.among((*SHOWN, paper.RECURRENT))), subjects.kind),
+        _overview(subjects),
     ]
-    outputs = {name: [outputs_of(run, own) for run in runs[name]] for name in hybrids}
-    shifts = {name: [shift_of(run, own) for run in runs[name]] for name in hybrids}
-    active = tables.activity(outputs, shifts)
-    off = perturbed.perturbed(runs, own)
-    driven = _whole_drives(artefacts)
-    smooth = filter_of(load_model(chosen(runs[paper.SMOOTH]).model.model_folder))
-    assert smooth is not None
-    local = observability.local(smooth)
-    learnt = limited(runs, parts[LIMITED], own) if LIMITED in parts else None
-    content = claims_of(NAME)
+    for name, candidates in (("networks_alone", ALONE), ("oracles", tables.ORACLES)):
+        if among := subjects.among(candidates):
+            outcome.add_files(tables.accuracy(ManoeuvreErrors(among), {}, training, name, ""))
+    outcome.data["within_12_deg"] = kpi_table(subjects.within)
+
+
+def _overview(subjects: Subjects) -> Table:
+    """Errors of what is trained, which the first screen and the terminal show."""
+    within = ManoeuvreErrors(subjects.within)
     rows = [
-        *block_errors.error_rows(parts, learnt, content),
-        *block_errors.measured_rows(main, outputs, off, local),
-    ]
-    trained = block_errors.training_rows(parts, content, is_complete=not artefacts.not_trained)
-    drawn = {
-        name: chosen(seeds)
-        for name, seeds in runs.items()
-        if name in paper.TABLE_II or name in (paper.SMOOTH, paper.FREE)
-    }
-    data = {
-        f"kpis_{name}": kpi_table(seeds)
-        for name, seeds in parts.items()
-        if not search.is_point(name)
-    }
-    data["stiffness"] = perturbed.values(off)
-    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
-    blocks: list[Block] = [
-        *_summary(artefacts, main, driven, one_line(content.recommendation)),
-        *_results(artefacts, main, prepared, active, drawn),
-        "## Claims",
-        claims_table(content, rows, trained),
-        *_appendices(artefacts, runs, prepared, drawn, data),
-        "## Appendix: summary",
-        overview(artefacts, parts, main),
-        "## Appendix: networks and process noise",
-        tables.networks_alone(
-            main,
-            outputs,
-            "networks_full",
-            f"Outputs of the hybrids' networks, and of their filters. Data: {kind.upper()}.",
-        ),
-    ]
-    if learnt is not None:
-        blocks += _limited(artefacts, learnt, prepared[LIMITED], kind)
-    blocks += [
-        *_networks_and_oracles(parts, prepared, main, kind),
-        "## Appendix: robustness to tyres and body",
-        perturbed.figure_14(off, kind.upper()),
-        perturbed.perturbed_table(off, kind.upper()),
-        "## Appendix: observability",
-        observability.observability_table(local),
-        *_all_that_was_driven(driven, kind),
-        *_filters_and_budget(artefacts, parts, runs),
-        *_how_it_was_made(artefacts),
-    ]
-    return Document(artefacts.title, blocks, data)
-
-
-def _summary(
-    artefacts: StudyArtefacts, main: ManoeuvreErrors, driven: ManoeuvreErrors, answer: str
-) -> list[Block]:
-    kind = words_of_kinds(artefacts.parts[FULL]).upper()
-    return [
-        f"**{kind} data**, {len(main.manoeuvres)} held-out test manoeuvres, scored until |β| exceeds 12°: "
-        f"{_cut_in_words(driven)} cut there. The paper's recordings are real, of a BMW 545i, and not public. "
-        f"{artefacts.about}{methods.absent_parts(artefacts)}{methods.not_trained(artefacts)} {NOTE}",
-        f"**{answer}**",
-    ]
-
-
-def _results(
-    artefacts: StudyArtefacts,
-    main: ManoeuvreErrors,
-    prepared: Mapping[str, Prepared],
-    active: pd.DataFrame,
-    drawn: Mapping[str, Run],
-) -> list[Block]:
-    part = artefacts.parts[FULL]
-    own = prepared[FULL]
-    kind = words_of_kinds(part).upper()
-    slalom = traces.manoeuvre_of(part, own, "slalom")
-    four = {name: run for name, run in drawn.items() if name in paper.OF_FOUR}
-    training = {name: tables.training_error(run, own) for name, run in drawn.items()}
-    in_table = {name: seeds for name, seeds in main.runs.items() if name in IN_TABLE_II}
-    caption = (
-        "Table II: ours with 95 % intervals, means over seeds (paper's in brackets). RMSE of validation and training: means over "
-        f"manoeuvres. Data: {kind}."
-    )
-    variants = ManoeuvreErrors({name: main.runs[name] for name in active["candidate"]})
-    return [
-        traces.compared(
-            four, slalom, 7, "Slalom with the largest sideslip angle of those without a spin", kind
-        ),
-        "## Full set",
-        tables.accuracy(ManoeuvreErrors(in_table), paper.TABLE_II, training, "table_2", caption),
-        "## Ablations",
-        tables.ablation(
-            variants,
-            active,
-            "CNN-UKF with one part removed, and how active its parts are: shift of β, lowest to highest seed; deviations: 5, 50 and 95 % of "
-            f"all test samples. Data: {kind}.",
-        ),
-    ]
-
-
-def overview(
-    artefacts: StudyArtefacts,
-    parts: Mapping[str, Runs],
-    main: ManoeuvreErrors,
-) -> Table:
-    """What the terminal shows: both errors of both sets, beside the paper's."""
-    rows = []
-    for name in (FULL, LIMITED):
-        if name not in parts:
-            continue
-        shown = (
-            *paper.TABLE_II,
-            *((paper.SMOOTH, paper.FREE, paper.STATIC_MAP, paper.ZERO) if name == FULL else ()),
-        )
-        for candidate, own in (main.runs if name == FULL else parts[name]).items():
-            if candidate not in shown:
-                continue
-            known = paper.TABLES[name].get(candidate)
-            row: dict[str, object] = {
-                "part": artefacts.titles[name],
-                "candidate": candidate,
-            }
-            for kpi in (MSE, MSE_NL):
-                values = [getattr(run.kpis, kpi) for run in own]
-                row |= {
-                    f"paper_{kpi}": getattr(known, kpi) if known else np.nan,
-                    f"ours_{kpi}": float(np.median(values)),
-                }
-            rows.append(row | {"n_seeds": len(own)})
-    columns = {"part": Column("learnt on"), "candidate": Column("method")}
-    for kpi, header in ((MSE, "MSE"), (MSE_NL, "MSE_nl")):
-        columns |= {
-            f"paper_{kpi}": Column(f"{header}, paper [deg²]", decimals=3),
-            f"ours_{kpi}": Column(f"{header}, ours", decimals=3),
+        {
+            "candidate": name,
+            "mse": subjects.main.text(name, MSE),
+            "mse_nl": subjects.main.text(name, MSE_NL),
+            "within": within.text(name, MSE) if name in within else MISSING,
+            "n_seeds": len(subjects.runs[name]),
         }
-    columns["n_seeds"] = Column("seeds", decimals=0)
-    kind = words_of_kinds(artefacts.parts[FULL]).upper()
-    caption = f"Summary: squared errors of the sideslip angle, ours as medians of seeds. Data: {kind}; the paper's are real."
-    return Table("overview", caption, pd.DataFrame(rows), columns)
-
-
-def _appendices(
-    artefacts: StudyArtefacts,
-    runs: Runs,
-    prepared: Mapping[str, Prepared],
-    drawn: Mapping[str, Run],
-    data: dict[str, pd.DataFrame],
-) -> list[Block]:
-    part = artefacts.parts[FULL]
-    own = prepared[FULL]
-    kind = words_of_kinds(part).upper()
-    title = artefacts.titles[FULL].lower()
-    shown = {
-        name: runs[name] for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE) if name in runs
+        for name in SHOWN_FIRST
+        if name in subjects.runs
+    ]
+    columns = {
+        "candidate": Column("method"),
+        "mse": Column("MSE"),
+        "mse_nl": Column("MSE_nl"),
+        "within": Column("MSE up to 12°"),
+        "n_seeds": Column("seeds", decimals=0),
     }
-    both = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
-    figure, values = distributions.errors_figure(shown, 5, title, kind)
-    data["errors_full"] = values
-    warm_up = part.protocol.warm_up_seconds
-    slalom, spiral, lap = (
-        traces.manoeuvre_of(part, own, group) for group in ("slalom", "spiral", "lap")
-    )
-    constant = tables.process_levels(chosen(runs[paper.DEEP]))
-    return [
-        "## Appendix: the paper's figures, full set",
-        distributions.figure_4(both, prepared, artefacts.titles, kind),
-        figure,
-        *distributions.groups(shown, title, kind),
-        traces.inner_life(drawn, own, warm_up, slalom, constant, kind),
-        traces.compared(
-            drawn, spiral, 9, "Spiral with the largest sideslip angle of those without a spin", kind
-        ),
-        traces.lap(drawn, own, warm_up, lap, kind),
-        tables.consistency(
-            part,
-            {name: own for name, own in runs.items() if name in (*paper.TABLE_II, paper.SMOOTH)},
-            kind,
+    caption = f"Errors [deg²] with 95 % intervals. Data: {subjects.kind}."
+    return Table("overview", caption, pd.DataFrame(rows, columns=list(columns)), columns)
+
+
+def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
+    """What the hybrids' networks do, the factorial, the floor ε, bands, wrong tyres, and the limited set."""
+    main = subjects.main
+    prepared = subjects.full
+    kind = subjects.kind
+    hybrids = {
+        name: seeds
+        for name, seeds in subjects.runs.items()
+        if seeds[0].model.estimator in WITH_NETWORK and name != paper.ORACLE_DISTRUST
+    }
+    outputs = {name: [outputs_of(run, prepared) for run in hybrids[name]] for name in hybrids}
+    shifts = {name: [shift_of(run, prepared) for run in hybrids[name]] for name in hybrids}
+    active = tables.activity(outputs, shifts)
+    off = perturbed.perturbed(subjects.runs, prepared)
+    if hybrids:
+        removed = [name for name in hybrids if "(" not in name and "ε" not in name]
+        outcome.blocks.append(
+            tables.ablation(main, active[active["candidate"].isin(removed)], kind)
+        )
+    part = subjects.artefacts.parts[FULL]
+    outcome.blocks += [
+        factorial.factorial_table(main, kind),
+        factorial.effects_table(main, kind),
+        factorial.floor_table(main, outputs, active, kind),
+        calibration.calibration_table(
+            part, prepared, {name: subjects.parts[FULL][name] for name in _filters(subjects)}, kind
         ),
     ]
+    outcome.add_files(tables.networks_alone(main, outputs, "networks_full", ""))
+    local = pd.DataFrame()
+    if paper.SMOOTH in subjects.runs:
+        smooth = filter_of(load_model(chosen(subjects.runs[paper.SMOOTH]).model.model_folder))
+        assert smooth is not None
+        local = observability.local(smooth)
+        outcome.add_files(observability.observability_table(local))
+    if off.stiffness[perturbed.NOMINAL]:
+        outcome.blocks.append(perturbed.figure_14(off, kind))
+        outcome.add_files(perturbed.perturbed_table(off, kind))
+        outcome.data["stiffness"] = perturbed.values(off)
+    learnt = None
+    if LIMITED in subjects.parts:
+        learnt = limited(subjects.runs, subjects.parts[LIMITED], subjects.prepared[LIMITED])
+        _limited(outcome, subjects, learnt)
+    outcome.rows += block_errors.error_rows(subjects.parts, learnt, content)
+    outcome.rows += block_errors.measured_rows(main, outputs, off, local)
 
 
-def _limited(
-    artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str
-) -> list[Block]:
-    part = artefacts.parts[LIMITED]
-    words = kind.upper()
-    runs = learnt.comparison.runs
-    drawn = {
-        name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH
+def _filters(subjects: Subjects) -> list[str]:
+    return [name for name in FILTERS if name in subjects.parts[FULL]]
+
+
+def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
+    """Table III and Figures 11 to 13."""
+    part = subjects.artefacts.parts[LIMITED]
+    prepared = subjects.prepared[LIMITED]
+    runs = {
+        name: seeds
+        for name, seeds in learnt.comparison.runs.items()
+        if name in paper.TABLE_III or name == paper.SMOOTH
     }
-    picked = {name: chosen(own) for name, own in drawn.items()}
-    hybrids = {name: chosen(learnt.runs[name]) for name in paper.HYBRIDS}
-    turn = traces.manoeuvre_of(part, prepared, "J-turn")
-    figure, _ = distributions.errors_figure(drawn, 11, "limited set", words)
-    what = (
-        "J-turn with the largest sideslip angle of those without a spin, learnt on the limited set"
-    )
-    caption = (
-        "Table III: ours with 95 % intervals, means over seeds (paper's in brackets), learnt up to 7 m/s². What does not learn, "
-        f"and its errors of validation, are those of the full set. Data: {words}."
-    )
     training = {
         name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()
     }
-    of_networks = (
-        "Outputs of the hybrids' networks, and of their filters, learnt on the limited set"
-    )
-    return [
-        "## Appendix: limited set",
+    caption = f"Table III, trained up to 7 m/s²; filters are those of the full set. Data: {subjects.kind}."
+    turn = traces.manoeuvre_of(part, prepared, "J-turn")
+    hybrids = {name: chosen(learnt.runs[name]) for name in paper.HYBRIDS if name in learnt.runs}
+    picked = {name: chosen(seeds) for name, seeds in runs.items()}
+    title = "J-turn, learnt on the limited set"
+    outcome.blocks += [
         tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
-        tables.networks_alone(
-            learnt.comparison, learnt.outputs, "networks_limited", f"{of_networks}. Data: {words}."
-        ),
-        figure,
-        traces.compared(picked, turn, 12, what, words),
-        traces.angles_of_networks(hybrids, prepared, part.protocol.warm_up_seconds, turn, words),
+        distributions.errors_figure(runs, 11, "limited set", subjects.kind)[0],
+        traces.compared(picked, turn, 12, title, subjects.kind),
     ]
-
-
-def _networks_and_oracles(
-    parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str
-) -> list[Block]:
-    words = kind.upper()
-    blocks = list[Block]()
-    if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(
-        map(search.is_point, parts)
-    ):
-        blocks.append("## Appendix: networks without a filter")
-    if len(known) > 1:
-        own = prepared[FULL]
-        training = {
-            name: tables.training_error(chosen(seeds), own) for name, seeds in known.items()
-        }
-        also = {name: main.runs[name] for name in (paper.STATIC_MAP, paper.ZERO) if name in main}
-        caption = f"Networks without a filter on the full set: inputs in [0, 1], as z-scores, and a recurrent network. Data: {words}."
-        blocks.append(
-            tables.accuracy(ManoeuvreErrors(known | also), {}, training, "networks_alone", caption)
+    if hybrids:
+        warm_up = part.protocol.warm_up_seconds
+        outcome.blocks.append(
+            traces.angles_of_networks(hybrids, prepared, warm_up, turn, subjects.kind)
         )
-    if any(map(search.is_point, parts)):
-        blocks.append(search.search_table(parts, parts[FULL], words))
-    oracles_alone = ManoeuvreErrors(
-        {name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}
+    outcome.add_files(
+        tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", "")
     )
-    caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
-    return [
-        *blocks,
-        "## Appendix: oracles",
-        tables.accuracy(oracles_alone, {}, {}, "oracles", caption),
+
+
+def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
+    """Figures 4 to 10 of the paper."""
+    artefacts = subjects.artefacts
+    prepared = subjects.full
+    kind = subjects.kind
+    part = artefacts.parts[FULL]
+    warm_up = part.protocol.warm_up_seconds
+    title = artefacts.titles[FULL].lower()
+    both = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
+    figure_4 = distributions.figure_4(both, subjects.prepared, artefacts.titles, kind)
+    outcome.blocks.append(figure_4)
+    shown = subjects.among(SHOWN)
+    if not shown:
+        return
+    drawn = subjects.drawn(SHOWN)
+    slalom, spiral, lap = (
+        traces.manoeuvre_of(part, prepared, group) for group in ("slalom", "spiral", "lap")
+    )
+    figure_5, outcome.data["errors_full"] = distributions.errors_figure(shown, 5, title, kind)
+    figure_6, by_group = distributions.groups(shown, title, kind)
+    outcome.add_files(by_group)
+    of_four = {name: run for name, run in drawn.items() if name in paper.OF_FOUR} or drawn
+    outcome.blocks += [
+        figure_5,
+        figure_6,
+        traces.compared(of_four, slalom, 7, "Slalom", kind),
+        traces.compared(drawn, spiral, 9, "Spiral", kind),
+        traces.lap(drawn, prepared, warm_up, lap, kind),
     ]
+    if all(name in drawn for name in paper.HYBRIDS):
+        constant = tables.process_levels(drawn[paper.DEEP])
+        outcome.blocks.append(traces.inner_life(drawn, prepared, warm_up, slalom, constant, kind))
 
 
-def _whole_drives(artefacts: StudyArtefacts) -> ManoeuvreErrors:
-    """Candidates on all that was driven, without the limit of 12° of the amendment."""
-    parts = {name: part for name, part in artefacts.parts.items() if name in (FULL, FREE)}
-    runs = _together(
-        {name: runs_of(part, Prepared(part, whole=True)) for name, part in parts.items()}
-    )
-    return ManoeuvreErrors(runs)
-
-
-def _cut_in_words(driven: ManoeuvreErrors) -> str:
-    """Which of the drives slide beyond the limit of the amendment, by their largest sideslip angles."""
-    run = next(iter(driven.runs.values()))[0]
-    largest = [
-        max(float(np.abs(part.sideslip_ref).max()) for part in parts) for parts in run.test.values()
-    ]
-    cut = sorted((np.degrees(angle) for angle in largest if angle > LARGEST_SIDESLIP), reverse=True)
-    angles = listed([f"{angle:.0f}°" for angle in cut])
-    return (
-        f"{len(cut)} of {len(largest)} drives, with up to {angles}, {'is' if len(cut) == 1 else 'are'}"
-        if cut
-        else "no drive is"
-    )
-
-
-def _all_that_was_driven(own: ManoeuvreErrors, kind: str) -> list[Block]:
-    """Indicators without the limit of 12°."""
-    rows = [{"candidate": name, **{kpi: own.text(name, kpi) for kpi in KPIS}} for name in own.runs]
-    columns = {"candidate": Column("method")} | {
-        kpi: Column(header) for kpi, header in KPIS.items()
+def _files(outcome: Outcome, subjects: Subjects) -> None:
+    """Loss curves, and tables on filters and budgets."""
+    artefacts = subjects.artefacts
+    parts = subjects.parts
+    kind = subjects.kind
+    titled = {name: (artefacts.titles[name], runs) for name, runs in parts.items()}
+    models: dict[str, Sequence[EvaluatedModel]] = {
+        name: [run.model for run in seeds]
+        for name, seeds in subjects.runs.items()
+        if name not in tables.ORACLES
     }
-    caption = (
-        f"All that was driven on the test: {_cut_in_words(own)} cut at 12° in the tables above (amendment in docs/cnn_ukf.md). Means over "
-        f"seeds with 95 % intervals. Data: {kind.upper()}."
-    )
-    return [
-        "## Appendix: all that was driven",
-        Table("whole_drives", caption, pd.DataFrame(rows), columns),
-    ]
-
-
-def _filters_and_budget(
-    artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs
-) -> list[Block]:
-    titled = {name: (artefacts.titles[name], own) for name, own in parts.items()}
-    kind = words_of_kinds(artefacts.parts[FULL]).upper()
-    return [
-        "## Appendix: filters and budget",
-        tables.given_as_found(runs),
-        tables.filters([own for name, own in titled.items() if name in (FULL, FREE)], kind),
+    losses = loss_curves(models)
+    outcome.data[LOSS_CURVES] = losses
+    if len(losses):
+        caption = f"Losses of training and validation, the last phase of each candidate's first seed, scaled. Data: {kind}."
+        outcome.blocks.append(loss_figure(losses, caption))
+    outcome.add_files(
+        tables.filters([own for name, own in titled.items() if name in (FULL, "free")], kind),
         tables.scaling(titled, kind),
         tables.budget(
             [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()],
             kind,
         ),
-    ]
-
-
-def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Sentences, of what departs; settings from the trainings, candidate -> as configured."""
-    lines = [
-        "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, by a car with the paper's mass, "
-        "inertia and wheelbase; its tyres, springs and sensors are assumed, each drive has sensors' offsets of its own.",
-        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper has smooth tyres "
-        "of the training only. The same filter alone stands beside it.",
-        f"σ_DD is a standard deviation everywhere, R = σ_DD² + {LEAST_VARIANCE:g} rad², where Eq. 6 has a variance; Eq. 11 scales the "
-        "variance of the networks' angles, in rad², and R is its result.",
-        "Both hybrids have the paper's constant levels of process noise, from which CNN-UKF's heads start; what sensors measure is taken "
-        "for ten times more uncertain than it is, since behind a low-pass of 5 Hz it is alike over ten samples.",
-    ]
-    deep = trainings.get(paper.DEEP)
-    own = trainings.get(paper.CNN)
-    if deep is not None:
-        phase = deep["phase"]
-        assert isinstance(phase, Mapping)
-        lines.append(
-            f"Ensemble: at most {phase['max_epochs']} epochs, the best is kept (paper: {paper.MEMBER_EPOCHS}), of 10 networks (20)."
-        )
-    if own is not None:
-        lines.append(
-            f"End to end, batches are {own['batch_size']} sequences of {own['steps']} samples (paper: batches of {paper.BATCH}), the rate "
-            "falls to zero by a cosine, and the loss is in deg²."
-        )
-    return [
-        *lines,
-        "What the paper leaves open (epochs, patience, hysteresis and factor of the forces' noise): docs/estimators.md. It optimises "
-        "further settings of its networks by Bayesian optimisation which it does not name; here none are.",
-    ]
-
-
-def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    part = artefacts.parts[FULL]
-    warm_up = f"; estimators may start up to {part.protocol.warm_up_seconds:g} s before a {part.protocol.piece}"
-    lines = [
-        f"Command: {as_code(artefacts.command)}, with Optuna installed",
-        methods.scoring(part, warm_up),
-        f"Preprocessing as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz on measurements and reference; "
-        "both look ahead. Indicators are against the low-passed reference.",
-        "MSE over all samples; MSE_nl over those with |ay| ≥ 4 m/s²; ME and ME_nl are the largest absolute error of each manoeuvre, "
-        "averaged over manoeuvres. Drives are scored until |β| first exceeds 12°.",
-        "Figures that show one seed show the one with the lowest mean RMSE of a validation manoeuvre.",
-        *methods.facts_of(artefacts.parts.values()),
-    ]
-    rows = pd.DataFrame(
-        [
-            {
-                "part": artefacts.titles[name],
-                "kind": words_of_kinds(own).upper(),
-                "train": f"{len(own.split.train)} stretches",
-                "validation": f"{len(own.split.validation)} stretches",
-                "test": spans_in_words(own.split.tests[TEST]) if name == FULL else "the same",
-            }
-            for name, own in artefacts.parts.items()
-            if not search.is_point(name)
-        ]
     )
-    columns = {
-        "part": Column("part"),
-        "kind": Column("data"),
-        "train": Column("training"),
-        "validation": Column("validation"),
+    outcome.data |= {f"kpis_{name}": kpi_table(runs) for name, runs in parts.items()}
+
+
+def _values(
+    subjects: Subjects, content: Paper, trained: Sequence[TrainingRow], files: Sequence[str]
+) -> dict[str, object]:
+    """Numbers and names that the template has places for."""
+    main = subjects.main
+    artefacts = subjects.artefacts
+    estimators = tuple(
+        model.estimator for part in artefacts.parts.values() for model in part.models
+    )
+    return {
+        "recommendation": one_line(content.recommendation),
+        "kind": subjects.kind,
+        "manoeuvres": len(main.manoeuvres),
+        "beyond": _number_beyond(main, LARGEST_SIDESLIP),
+        "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
+        "absent_parts": methods.absent_parts(artefacts),
+        "incomplete": _incomplete(artefacts, trained),
+        "difference_of_tyres": fixed(tables.difference_of_tyres(subjects.runs), 1),
+        "command": as_code(artefacts.command),
+        "scoring": methods.scoring(artefacts.parts[FULL]),
+        "facts": [
+            fact
+            for fact in methods.facts_of(artefacts.parts.values())
+            if not fact.startswith(estimators)
+        ],
+        "files": files,
     }
-    trainings = {candidate_of(model): model.training for model in part.models}
+
+
+def _ratio(main: ManoeuvreErrors, other: str, kpi: str) -> str:
+    """An indicator of CNN-UKF over that of another with its interval."""
+    if paper.CNN not in main or other not in main:
+        return NOT_TRAINED
+    return figure_in_words(main.ratio(paper.CNN, other, kpi))
+
+
+def _number_beyond(main: ManoeuvreErrors, sideslip: float) -> int:
+    """Test manoeuvres in which |β| exceeds an angle [rad]."""
+    run = next(iter(main.runs.values()))[0]
+    largest = [
+        max(float(np.abs(part.sideslip_ref).max()) for part in parts) for parts in run.test.values()
+    ]
+    return int(np.count_nonzero(np.array(largest) > sideslip))
+
+
+def _incomplete(
+    artefacts: StudyArtefacts, trained: Sequence[TrainingRow]
+) -> list[dict[str, object]]:
+    """What the template says of trainings that are planned and not done: one entry, or none."""
+    number = sum(len(names) for names in artefacts.not_trained.values())
+    if not number:
+        return []
+    absent = [row.candidate for row in trained if row.training == "not trained"]
+    parts = [as_code(name) for name, names in artefacts.not_trained.items() if names]
     return [
-        methods.how_it_was_made(lines),
-        Table(
-            "data",
-            "What was used for what; points of a search as the full set.",
-            rows,
-            columns | {"test": Column("test")},
-        ),
-        methods.bullets("### What departs from the paper", departures(trainings)),
+        {
+            "number": number,
+            "candidates": "; ".join(absent) or MISSING,
+            "parts": ", ".join(parts),
+        }
     ]

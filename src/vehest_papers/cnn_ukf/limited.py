@@ -6,7 +6,6 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vehest.data.errors import DataError
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
 from vehest_papers.cnn_ukf import paper
@@ -36,31 +35,24 @@ class Limited:
 
 
 def limited(full: Runs, trained: Runs, prepared: Prepared) -> Limited:
-    """Combine what was trained on the limited set with the filters of the full set; the test of both is the same.
-
-    Raises
-    ------
-    DataError
-        One of the three methods that learn is missing.
-    """
-    missing = [name for name in (paper.DATA, *paper.HYBRIDS) if name not in trained]
-    if missing:
-        raise DataError(
-            f"no {' and no '.join(missing)} among the models of part 'limited'; it needs all three methods that learn"
-        )
+    """Combine what was trained on the limited set with the filters of the full set; the test of both is the same."""
     filters = {
         name: full[name]
         for name in (paper.MODEL, paper.SMOOTH, paper.ZERO, paper.STATIC_MAP)
         if name in full
     }
-    of_full = {run.model.seed: run for run in full[paper.DEEP]}
+    of_full = {run.model.seed: run for run in full.get(paper.DEEP, ())}
     return Limited(
         ManoeuvreErrors({**filters, **trained}),
         trained,
-        {name: [outputs_of(run, prepared) for run in trained[name]] for name in paper.HYBRIDS},
+        {
+            name: [outputs_of(run, prepared) for run in trained[name]]
+            for name in paper.HYBRIDS
+            if name in trained
+        },
         [
             _with_scaling_of(of_full[run.model.seed], run, prepared)
-            for run in trained[paper.DEEP]
+            for run in trained.get(paper.DEEP, ())
             if run.model.seed in of_full
         ],
     )

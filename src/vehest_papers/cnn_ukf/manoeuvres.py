@@ -29,6 +29,9 @@ GROUPS = {
 }
 """Part of a recording's name -> the group of manoeuvres of the recording."""
 
+CARS = {"standard": "as in training", "laden": "laden", "soft": "softer tyres"}
+"""Start of a recording's name -> which car is driven; others are as in training."""
+
 BIN = 0.25  # deg, of Figs. 5 and 11
 
 
@@ -70,6 +73,11 @@ def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, l
 def group_of(recording: str) -> str:
     """The group of manoeuvres that a recording's name tells of; ``other`` if it tells of none."""
     return next((group for part, group in GROUPS.items() if part in recording), "other")
+
+
+def car_of(recording: str) -> str:
+    """The car that a recording's name begins with."""
+    return CARS.get(recording.partition("_")[0], CARS["standard"])
 
 
 def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:

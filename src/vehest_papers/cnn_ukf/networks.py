@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData
+from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
@@ -83,9 +83,9 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
 
 
 def filtered_with(
-    fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]
+    fitted: DugoffUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement] | None
 ) -> list[FloatArray]:
-    """β of a hybrid's filter given other outputs of its network, drive by drive [rad]."""
+    """β of a filter given these outputs of its network, or none, drive by drive [rad]."""
     found: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
         mean = steps.filtered.mean.numpy()
@@ -93,6 +93,25 @@ def filtered_with(
             vx = drives[row]["vx"]
             found[row] = np.arctan2(mean[place, : len(vx), 0], vx)
     return [found[row] for row in range(len(drives))]
+
+
+def filtered_run(
+    estimator: Estimator,
+    run: Run,
+    prepared: Prepared,
+    pseudo: Sequence[PseudoMeasurement] | None,
+    candidate: str = "",
+) -> Run:
+    """A run whose test is filtered anew by a changed filter, given the outputs of its network."""
+    assert isinstance(estimator, DugoffUkf)
+    drives = prepared.seen(TEST)
+    test = {}
+    for drive, span, sideslip in zip(
+        drives, prepared.spans(TEST), filtered_with(estimator, drives, pseudo), strict=True
+    ):
+        (part,) = run.test[span.recording]
+        test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
+    return Run(candidate or run.candidate, run.model, run.validation, test)
 
 
 def shift_of(run: Run, prepared: Prepared) -> float:
@@ -128,13 +147,7 @@ def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
         )
         error = own.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
         pseudo.append(own._replace(variance=fitted.least_variance + np.square(error)))
-    test = {}
-    for drive, span, sideslip in zip(
-        drives, spans, filtered_with(fitted, drives, pseudo), strict=True
-    ):
-        (part,) = run.test[span.recording]
-        test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
-    return Run(candidate, run.model, run.validation, test)
+    return filtered_run(fitted, run, prepared, pseudo, candidate)
 
 
 def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
@@ -142,9 +155,10 @@ def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
     found: dict[str, list[Run]] = {}
     if paper.FREE in runs:
         found[paper.ORACLE_FILTER] = [_fitted_to_the_test(runs[paper.FREE][0], prepared)]
-    found[paper.ORACLE_DISTRUST] = [
-        with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]
-    ]
+    if paper.CNN in runs:
+        found[paper.ORACLE_DISTRUST] = [
+            with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]
+        ]
     return found
 
 

@@ -75,8 +75,4 @@ def observability_table(found: pd.DataFrame) -> Table:
         "rank": Column("rank", decimals=0),
         "deviation": Column("deviation of V_y from 10 samples [m/s]", decimals=4),
     }
-    caption = (
-        "Local observability of the smooth-tyre model in steady turns (Section III-B): rank of the matrix of two samples, and how well ten "
-        "samples with the sensors' levels of noise alone determine the lateral velocity. Computed, no recording."
-    )
-    return Table("observability", caption, found, columns)
+    return Table("observability", "Local observability in steady turns", found, columns)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from vehest.data.store import read_recording
 from vehest.data.transforms import LowPass, RemoveOutliers
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import DugoffUkf
-from vehest.evaluation.metrics import Scored, score_all
+from vehest.evaluation.metrics import Scored, pieces_of, score, score_all
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.cnn_ukf import paper
@@ -26,7 +27,7 @@ from vehest_papers.kit.reading import models_by_candidate, sideslip_error
 
 TEST = "test"
 CUTOFF_HZ = 5.0
-LARGEST_SIDESLIP = 0.21  # rad, 12°: that of training and validation in the split, beyond which no drive of the paper goes
+LARGEST_SIDESLIP = 0.21  # rad, 12°: beyond it no drive of the paper goes
 OFFLINE = (
     RemoveOutliers(),
     LowPass(CUTOFF_HZ, design="fir"),
@@ -197,7 +198,7 @@ def kpi_table(runs: Runs) -> pd.DataFrame:
 
 
 def until(part: Scored, sideslip: float) -> Scored:
-    """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least."""
+    """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least; errors alone."""
     beyond = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
     last = max(int(beyond[0]), 1) if len(beyond) else len(part.time)
     return part.at(slice(last))
@@ -209,14 +210,24 @@ class Prepared:
     The evaluation scores against the reference as it was measured. The paper's is low-passed as the measurements are, and whether a
     sample counts as non-linear is a matter of the low-passed lateral acceleration.
 
-    Args:
-        whole: whether drives are scored beyond the moment in which |β| first exceeds 12°.
+    Parameters
+    ----------
+    until_sideslip
+        Each drive is scored until |β| first exceeds this angle [rad]; by default whole.
+    read
+        Prepared recordings by file, shared by parts that have the same.
     """
 
-    def __init__(self, part: PartArtefacts, *, whole: bool = False) -> None:
+    def __init__(
+        self,
+        part: PartArtefacts,
+        *,
+        until_sideslip: float = np.inf,
+        read: dict[Path, Recording] | None = None,
+    ) -> None:
         self._part = part
-        self._whole = whole
-        self._read: dict[tuple[str, str], Recording] = {}
+        self._until_sideslip = until_sideslip
+        self._read = {} if read is None else read
 
     def spans(self, test: str) -> Sequence[Span]:
         """Ranges of a test set, or of the validation."""
@@ -224,13 +235,13 @@ class Prepared:
 
     def recording(self, dataset: str, recording: str) -> Recording:
         """All of a recording."""
-        key = dataset, recording
-        if key not in self._read:
-            prepared = read_recording(self._part.references[key])
+        path = self._part.references[dataset, recording]
+        if path not in self._read:
+            prepared = read_recording(path)
             for transform in OFFLINE:
                 prepared = transform(prepared)
-            self._read[key] = prepared
-        return self._read[key]
+            self._read[path] = prepared
+        return self._read[path]
 
     def seen(self, test: str) -> list[Recording]:
         """What an estimator saw of each range of a test set, if it was prepared offline: with its warm-up, without references."""
@@ -274,4 +285,13 @@ class Prepared:
             lambda span: self.recording(span.dataset, span.recording),
             self._part.protocol,
         )
-        return list(parts) if self._whole else [until(part, LARGEST_SIDESLIP) for part in parts]
+        return [until(part, self._until_sideslip) for part in parts]
+
+    def with_covariances(self, model: EvaluatedModel, test: str) -> Iterator[Scored]:
+        """Whole ranges of a test set with the covariances of the estimates, one in memory at a time."""
+        protocol = self._part.protocol
+        pieces = pieces_of(
+            self.spans(test), lambda span: self.recording(span.dataset, span.recording), protocol
+        )
+        for position, (reference, piece) in enumerate(pieces):
+            yield score(model.estimate(test, position), reference, piece, protocol)

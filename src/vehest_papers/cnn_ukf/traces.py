@@ -14,7 +14,7 @@ from vehest.data.splits import Span
 from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
@@ -62,7 +62,7 @@ def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: 
         for axes in (upper, lower):
             axes.margins(x=0.0)
         legend_above(figure, upper, columns=4)
-    caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. {_squares(runs, parts)} Data: {data}."
+    caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}."
     return Figure(f"figure_{number}", caption, figure)
 
 
@@ -130,9 +130,7 @@ def inner_life(
             axes.set_xlabel("time [s]")
         legend_above(figure, grid[0, 0], columns=3)
     caption = (
-        f"The slalom of Figure 7, hybrids (Figure 8 of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, "
-        "(b) and (d) deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a "
-        f"measurement. DE-UKF's process noise is constant. Data: {data}."
+        f"Networks of the hybrids in the slalom of Figure 7 (Figure 8 of the paper). Data: {data}."
     )
     return Figure("figure_8", caption, figure)
 
@@ -159,7 +157,7 @@ def angles_of_networks(
         legend_above(figure, axes, columns=5)
     return Figure(
         "figure_13",
-        f"The same J-turn (Figure 13 of the paper), {as_code(span.recording)}. Data: {data}.",
+        f"Networks of the hybrids in the same J-turn (Figure 13 of the paper). Data: {data}.",
         figure,
     )
 
@@ -201,11 +199,7 @@ def lap(
         for axes in grid:
             axes.margins(x=0.0)
         legend_above(figure, grid[0], grid[1], columns=5)
-    caption = (
-        f"Part of a lap (Figure 10 of the paper), the {fixed(window[1] - window[0], 0)} s of {as_code(span.recording)} with the largest "
-        "mean |ay|: sideslip angle, accelerations (full and dashed: lateral and longitudinal), and the deviation of the networks' angle as "
-        f"filters take it. {_squares(runs, parts)} Data: {data}."
-    )
+    caption = f"Part of a lap (Figure 10 of the paper), {as_code(span.recording)}. Data: {data}."
     return Figure("figure_10", caption, figure)
 
 
@@ -276,11 +270,3 @@ def _deviations(axes: Any) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _squares(runs: Mapping[str, Run], parts: Mapping[str, Scored]) -> str:
-    shown = [
-        f"{candidate} (seed {runs[candidate].model.seed}) {fixed(float(np.mean(np.square(sideslip_error(part)))), 3)}"
-        for candidate, part in parts.items()
-    ]
-    return f"MSE of what is drawn [deg²], of each method the seed that validation chooses: {'; '.join(shown)}."

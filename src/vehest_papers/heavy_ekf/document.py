@@ -1,40 +1,39 @@
-"""The report: headline, how it was made, Figures 3 and 5 to 11 and Table 3, then what the paper does not have."""
+"""The report: the paper's orders by condition, the map of rear slip and stiffness error, and the claims."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
-from vehest.data.derived import SpeedFromWheels
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
-from vehest.report.document import REPORT, Block, Column, Document, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Document, as_code
+from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest_papers.heavy_ekf import (
-    accuracy,
-    block_errors,
-    draws,
-    laps,
-    paper,
-    tables,
-    twin_report,
-    tyres,
-    vehicle,
-    watching,
+from vehest_papers.heavy_ekf import block_errors, conditions, laps, paper, region_map, tyres
+from vehest_papers.heavy_ekf.candidates import FILTERS, MIN_SPEED, Tuned
+from vehest_papers.heavy_ekf.cross_validation import CrossValidation, cross_validated
+from vehest_papers.heavy_ekf.drawn import (
+    CONDITIONS,
+    MATCHED,
+    TUNED_ON_ALL,
+    TUNINGS,
+    UNMATCHED,
+    DrawnTrucks,
+    drawn_trucks,
+    rear_slip,
 )
 from vehest_papers.heavy_ekf.factorial import Factorial, every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import (
     TYRES,
-    Filter,
-    baseline_errors,
-    curves_of,
     filters_of,
-    rmse_of,
+    in_drawing_order,
     titles_of,
-    validation_drives,
     whole_drive,
 )
 from vehest_papers.kit import methods
@@ -47,304 +46,211 @@ from vehest_papers.kit.block_rows import (
     frame,
 )
 from vehest_papers.kit.claim_files import claims_of
-from vehest_papers.kit.reading import spans_in_words, words_of_kinds
-from vehest_papers.kit.verdict_table import claims_table
+from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.report_template import fill_template
+from vehest_papers.kit.verdict_table import CLAIMS, claims_table, decided_claims, one_line
 
+NAME = "heavy_ekf"
+TEMPLATE = Path(__file__).with_name("report.md.j2")
 TRUCK = "truck"
-DRAWS = "seeds"
+DRAWN = "drawn"
 FERRARI = "ferrari"
 WHEELED = "av21"
-WHEELS = SpeedFromWheels(
-    wheel_radius=0.48, track_front=2.08, track_rear=2.08
-)  # as in conf/vehicle/heavy_truck.yaml
-NOMINAL = "nominal_laps"
+DRIVES = ("laps", "fast")
+LAPS = "nominal_laps"
+FAST = "nominal_fast"
+FIGURE_8 = "Cornering stiffnesses, LINT filter (Figure 8 of the paper), three laps, SIMULATED."
+FIGURE_9 = "Parameters of the rational tyre, RATTE filter (Figure 9), three laps, SIMULATED."
+FIGURE_10 = "Sideslip angle during a fast lap (Figure 10 of the paper) and the errors, SIMULATED."
+FERRARI_FIGURE = (
+    "Sideslip angle on the real Ferrari, REAL, and the errors: each fifth of the 550 s is estimated with "
+    "tyre curves and noise levels from the others."
+)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
-    Raises:
-        DataError: the part ``truck``, one of its test sets or one of the paper's filters is missing.
+    Raises
+    ------
+    DataError
+        A part that the study needs is missing, or one of its test sets or filters.
     """
-    if TRUCK not in artefacts.parts:
-        raise DataError(f"study '{artefacts.study}' needs part '{TRUCK}'")
-    truck = artefacts.parts[TRUCK]
-    tests = [f"{kind}_{drive}" for kind in TYRES for drive in tables.DRIVES]
-    if set(truck.split.tests) != set(tests):
-        raise DataError(
-            f"study '{artefacts.study}': the test sets of part '{TRUCK}' must be called {', '.join(tests)}"
-        )
-    filters = filters_of(truck)
-    rmse = rmse_of(truck, filters)
-    real = artefacts.parts.get(FERRARI)
-    real_filters = filters_of(real) if real else {}
-    real_rmse = rmse_of(real, real_filters) if real else {}
-    drives = {test: whole_drive(truck, test) for test in tests}
-    shown = {name: own for name, own in filters.items() if name in (*paper.ORDER, paper.HELD)}
-    estimates = {
-        test: {name: own.of(drive) for name, own in shown.items()} for test, drive in drives.items()
-    }
-    traces, of_ferrari = _ferrari(real, real_filters, real_rmse) if real else ([], [])
-    errors = {**rmse, **baseline_errors(truck)}
-    real_errors = {**real_rmse, **baseline_errors(real)} if real else {}
+    truck = _part(artefacts, TRUCK, [f"{kind}_{drive}" for kind in TYRES for drive in DRIVES])
+    drawn_part = _part(artefacts, DRAWN, CONDITIONS)
+    parts = artefacts.parts
+    content = claims_of(NAME)
+    drives = {test: whole_drive(truck, test) for test in truck.split.tests}
+    estimates = _estimates(truck, drives)
+    trucks = drawn_trucks(drawn_part)
     twin = factorial()
-    twin_front, twin_data, twin_appendix = twin_report.twin_blocks(twin)
-    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
-    car = filters[paper.RATTE].fitted.settings.car
-    rows = _error_rows(artefacts, twin)
-    rows += block_errors.measured_rows(TRUCK, drives, _with_baselines(truck, estimates), slowest)
-    trained = block_errors.training_rows()
-    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
-    warned = methods.warnings_in_words(
-        {
-            as_text(artefacts.titles[name]): part
-            for name, part in artefacts.parts.items()
-            if name not in (WHEELED, DRAWS)
-        }
-    )
-    blocks: list[Block] = [
-        *_asked(artefacts),
-        claims_table(claims_of("heavy_ekf"), rows, trained, kinds),
-        *traces,
-        tables.overview(
-            errors,
-            real_errors,
-            [
-                *filters,
-                *(title for title, test in baseline_errors(truck) if test == NOMINAL),
-            ],
-        ),
-        *twin_front,
-        *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
-        *twin_appendix,
-        *(
-            draws.draws_blocks(artefacts.parts[DRAWS], float(car.cg_to_rear_axle))
-            if DRAWS in artefacts.parts
-            else []
-        ),
-        *_lap_by_lap(drives, estimates, slowest),
-        "## Appendix: the vehicle",
-        vehicle.table_2(car),
-        vehicle.eigenvalues_table(car),
-        *(vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else []),
-        *_truck(truck, filters, rmse, drives, estimates),
-        *of_ferrari,
-        *_how_it_was_made(artefacts),
+    ferrari = cross_validated(FERRARI, parts[FERRARI]) if FERRARI in parts else None
+    rows = [
+        *trucks.rows,
+        *block_errors.drive_rows(TRUCK, truck),
+        *block_errors.measured_rows(TRUCK, drives, estimates, MIN_SPEED),
+        *block_errors.twin_rows(twin),
+        *(ferrari.rows if ferrari else []),
+        *(block_errors.wheel_rows(WHEELED, parts[WHEELED]) if WHEELED in parts else []),
     ]
+    trained = block_errors.training_rows()
+    slips = {test: rear_slip([drive]) for test, drive in drives.items()} | trucks.pooled_slips
+    orders, tuning, by_condition = conditions.orders_tables(content, rows, trained)
+    kinds = dict(content.parts) | {name: words_of_kinds(part) for name, part in parts.items()}
+    claims = claims_table(content, rows, trained, kinds)
+    placed: list[Block] = [
+        orders,
+        tuning,
+        conditions.overview_table(rows, slips),
+        region_map.map_figure(twin),
+        region_map.regions_table(twin),
+        decided_claims(claims),
+        *_figures(drives, estimates, trucks, ferrari),
+    ]
+    values = _values(artefacts, by_condition, trucks, one_line(content.recommendation))
     data = {
-        **twin_data,
+        CLAIMS: claims.frame,
+        "orders_by_condition": by_condition,
+        "twin_map_cells": region_map.map_cells(twin),
         "twin_cells": every_cell(twin),
+        "noise_levels": _noise_levels(trucks, twin),
+        "rear_slip": _slips_by_truck(trucks),
+        "ranges": methods.ranges_table(artefacts, "ranges", "", {}).frame,
         BLOCKS: frame(rows, BlockRow),
         TRAINING: frame(trained, TrainingRow),
     }
-    return {REPORT: Document(artefacts.title, blocks, data)}
+    return {REPORT: Document(artefacts.title, fill_template(TEMPLATE, values, placed), data)}
 
 
-def _error_rows(artefacts: StudyArtefacts, twin: Factorial) -> list[BlockRow]:
-    """Errors by block of all parts and of the twin."""
-    parts = artefacts.parts
-    rows = [*block_errors.drive_rows(TRUCK, parts[TRUCK]), *block_errors.twin_rows(twin)]
-    if FERRARI in parts:
-        rows += block_errors.drive_rows(FERRARI, parts[FERRARI])
-    if DRAWS in parts:
-        rows += block_errors.draw_rows(DRAWS, parts[DRAWS])
-    if WHEELED in parts:
-        rows += block_errors.wheel_rows(WHEELED, parts[WHEELED])
-    return rows
+def _part(
+    artefacts: StudyArtefacts, name: str, tests: list[str] | tuple[str, ...]
+) -> PartArtefacts:
+    """A part that the study needs, with its test sets."""
+    if name not in artefacts.parts:
+        raise DataError(f"study '{artefacts.study}' needs part '{name}'")
+    part = artefacts.parts[name]
+    if set(part.split.tests) != set(tests):
+        raise DataError(
+            f"study '{artefacts.study}': the test sets of part '{name}' must be called "
+            f"{', '.join(tests)}"
+        )
+    return part
 
 
-def _with_baselines(
-    truck: PartArtefacts, estimates: Mapping[str, Mapping[str, Estimate]]
+def _estimates(
+    truck: PartArtefacts, drives: Mapping[str, Recording]
 ) -> dict[str, dict[str, Estimate]]:
-    """Estimates on the nominal laps with those of the baselines that claims name."""
-    found = {test: dict(own) for test, own in estimates.items()}
-    seen = whole_drive(truck, NOMINAL).without_references()
+    """Test set -> candidate -> estimate of the whole drive, of filters and baselines."""
+    filters = filters_of(truck)
     titles = titles_of(truck)
-    for model in truck.models:
-        if titles[model.name] in BASELINE_NAMES:
-            found[NOMINAL][titles[model.name]] = load_model(model.model_folder).estimate([seen])[0]
-    return found
-
-
-def _lap_by_lap(
-    drives: Mapping[str, Recording],
-    estimates: Mapping[str, Mapping[str, Estimate]],
-    slowest: float,
-) -> list[Block]:
-    """Errors a lap, underestimation and the stop."""
-    return [
-        "## Appendix: lap by lap, underestimation, and the stop",
-        accuracy.per_lap_table(drives, estimates, paper.ORDER, slowest),
-        accuracy.underestimation_table(drives, estimates, paper.ORDER),
-        accuracy.stop_table(drives, estimates, paper.ORDER),
-    ]
-
-
-def _asked(artefacts: StudyArtefacts) -> list[Block]:
-    kinds = methods.kinds_of_parts(artefacts, artefacts.parts)
-    absent = methods.absent_parts(artefacts)
-    return [
-        f"{kinds}. The paper's recordings are real, of another vehicle, and not public.{absent}",
-        artefacts.about,
-    ]
-
-
-def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    lines = [
-        f"Command: {as_code(artefacts.command)}",
-        methods.scoring(artefacts.parts[TRUCK]),
-        "RMSE(β) is over β = atan2(v, u) with the measured u, Equation 65; of the truck at 2 m/s and more, since below "
-        "β means little and the paper's sensor diverges as well.",
-        "Axle curves are fitted by least squares to training drives, the truck's to those on nominal tyres; levels of noise are those with "
-        "the smallest error on all training drives, the truck's on nominal and on worn tyres, since a filter that is to adapt has to be "
-        "tuned where there is something to adapt to. The tests are other drives, and choose nothing.",
-        _limits_in_words(artefacts),
-        *methods.facts_of(artefacts.parts.values()),
-    ]
-    departures = (
-        "Where we differ from the paper: tyre parameters are states as logarithms over their fitted values, so that they stay positive and "
-        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 rad "
-        "of sideslip the filter begins anew, tyres included; axle forces for the fit come from accelerations instead of TRICK, and where "
-        "they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are tuned, since "
-        f"there is no data sheet; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction are not in the "
-        "paper; the unscented filter takes the levels that were found through the extended one."
-    )
-    ranges = methods.ranges_table(artefacts, "ranges", "What was used for what.", {})
-    return [methods.how_it_was_made(lines), departures, ranges]
-
-
-def _limits_in_words(artefacts: StudyArtefacts) -> str:
-    """Which searches for levels of noise ended on a limit of their box."""
-    found = [
-        f"{artefacts.titles[name]}, {paper.VARIANTS.get(model.variant, model.variant)} ({model.fit_metrics()['levels_at_limits']:g} level)"
-        for name, part in artefacts.parts.items()
-        for model in part.models
-        if model.fit_metrics().get("levels_at_limits", 0.0) > 0.0
-    ]
-    return f"Searches for levels of noise that ended on a limit of their box, six to nine decades wide: {'; '.join(found) or 'none'}."
-
-
-def _truck(
-    part: PartArtefacts,
-    filters: Mapping[str, Filter],
-    rmse: tables.Rmse,
-    drives: Mapping[str, Recording],
-    estimates: Mapping[str, Mapping[str, Estimate]],
-) -> list[Block]:
-    data = words_of_kinds(part).upper()
-    settings = filters[paper.RATTE].fitted.settings
-    car = settings.car
-    slowest = settings.minimum_speed
-    sound = validation_drives(part)
-    own = {
-        kind: tyres.OwnCurves.of(
-            [drives[f"{kind}_{drive}"] for drive in tables.DRIVES], car, slowest
-        )
-        for kind in TYRES
+    models = {
+        titles[model.name]: load_model(model.model_folder)
+        for model in truck.models
+        if titles[model.name] in BASELINE_NAMES
     }
-    three = drives[NOMINAL]
-    fast = drives["nominal_fast"]
-    fit = curves_of(
-        filters[paper.RATTE].fitted, [drive for drive in sound if drive.vehicle == three.vehicle]
-    )
+    estimates: dict[str, dict[str, Estimate]] = {}
+    for test, drive in drives.items():
+        estimates[test] = {name: of_truck.of(drive) for name, of_truck in filters.items()}
+        inputs = [drive.without_references()]
+        estimates[test] |= {name: model.estimate(inputs)[0] for name, model in models.items()}
+    return estimates
+
+
+def _figures(
+    drives: Mapping[str, Recording],
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    trucks: DrawnTrucks,
+    ferrari: CrossValidation | None,
+) -> list[Block]:
+    """Figures 3, 6 and 8 to 10 of the paper, and the Ferrari's."""
     by_tyres = {kind: drives[f"{kind}_laps"] for kind in TYRES}
-    adaptive = [name for name in (paper.LINT, paper.RATTE, paper.HELD) if name in filters]
-    errors = tables.errors_table(
-        drives, estimates, [name for name in (*paper.ORDER, paper.HELD) if name in filters], slowest
-    )
-    blocks: list[Block] = [
-        "## Appendix: tyres",
-        tyres.figure_3(fit, own["nominal"], "figure_3", data),
-        tyres.table_1(fit, own["nominal"], "table_1", data),
-        "## Appendix: speed from the wheels",
-        laps.figure_5(three, WHEELS, data),
-        "## Appendix: three laps",
-        laps.figure_6(three, laps.drawn(estimates[NOMINAL]), slowest, data),
-        laps.speed_and_acceleration(three, 7, "three laps at constant speed", data),
-        tables.table_3(rmse, list(filters), data),
-        tables.gains_table(rmse),
-        errors,
-        tables.order_in_words(
-            rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.values["tyres"]
-        ),
-        "## Appendix: tyre parameters over time",
-    ]
-    for name, number in ((paper.LINT, 8), (paper.RATTE, 9)):
-        what = (
-            "Cornering stiffness values" if name == paper.LINT else "Rational tyre model parameters"
-        )
-        caption = (
-            f"{what}, {name} filter (Figure {number} of the paper), three laps, {data}. Dashed: what fits the plant's own tyre forces on "
-            "these tyres; left out where it lies far off the axis."
-        )
-        of = {kind: estimates[f"{kind}_laps"][name] for kind in TYRES}
-        blocks.append(tyres.parameters_figure(by_tyres, of, own, name, f"figure_{number}", caption))
-    if paper.HELD in filters:
-        above = filters[paper.HELD].fitted.settings.adapt_above
-        caption = f"The same of {paper.HELD}: parameters are held while |u r| is below {above:g} m/s², three laps, {data}. Dashed as above."
-        of = {kind: estimates[f"{kind}_laps"][paper.HELD] for kind in TYRES}
-        blocks.append(
-            tyres.parameters_figure(by_tyres, of, own, paper.HELD, "figure_9_held", caption)
-        )
-    caption = f"Measured and estimated sideslip angle during a high-speed lap (Figure 10 of the paper), {data}, '{fast.id}'."
-    blocks += [
-        tyres.convergence_table(drives, estimates, own, adaptive),
-        "## Appendix: the fast lap",
+    figures: list[Block] = [
+        tyres.figure_3(trucks.fit),
+        laps.figure_6(drives[LAPS], in_drawing_order(estimates[LAPS]), MIN_SPEED),
         laps.sideslip_figure(
-            fast, laps.drawn(estimates["nominal_fast"]), slowest, "figure_10", caption
-        ),
-        laps.speed_and_acceleration(fast, 11, "the high-speed lap", data),
-    ]
-    watched = {name: filters[name] for name in reversed(paper.ORDER)}
-    blocks += [
-        "## Appendix: where the parameters can move",
-        *watching.observability_blocks(watched, three, slowest, data),
-    ]
-    blocks += [
-        "## Appendix: bad input",
-        *watching.bad_input_table(watched, three, sound, WHEELS, slowest, data),
-    ]
-    return blocks
-
-
-def _ferrari(
-    part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse
-) -> tuple[list[Block], list[Block]]:
-    """The sideslip angle, which stands on the first page, and an appendix."""
-    data = words_of_kinds(part).upper()
-    span = part.split.tests["test"][0]
-    drive = whole_drive(part, "test").cut(span.start - part.protocol.warm_up_seconds, span.stop)
-    estimates = {name: own.of(drive) for name, own in filters.items()}
-    fit = curves_of(filters[paper.RATTE].fitted, validation_drives(part))
-    rows = pd.DataFrame(
-        [
-            {"filter": name, "rmse": rmse[name, "test"], "validation": rmse[name, "validation"]}
-            for name in filters
-        ]
-    )
-    columns = {"filter": Column("filter"), "rmse": Column("RMSE(β), test [deg]", decimals=3)}
-    columns["validation"] = Column("RMSE(β), validation [deg]", decimals=3)
-    learnt = spans_in_words(part.split.train)
-    tested = spans_in_words(part.split.tests["test"])
-    caption = f"The real Ferrari at 20 Hz, {data}: learnt on {learnt}, tested on {tested}."
-    trace = f"Measured and estimated sideslip angle on the test range and the seconds before it, {data}, '{drive.id}'."
-    wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
-    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
-    return [
-        laps.sideslip_figure(drive, laps.drawn(estimates), slowest, "sideslip_ferrari", trace)
-    ], [
-        "## Appendix: the same filters on a real car",
-        "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; the first page "
-        "compares them and shows the sideslip angle.",
-        Table("ferrari", caption, rows, columns),
-        tyres.figure_3(fit, None, "figure_3_ferrari", data),
-        tyres.table_1(fit, None, "table_1_ferrari", data),
-        tyres.parameters_figure(
-            {"as it is": drive},
-            {"as it is": estimates[paper.RATTE]},
-            {},
-            paper.RATTE,
-            "parameters_ferrari",
-            wander,
+            drives[FAST], in_drawing_order(estimates[FAST]), MIN_SPEED, "figure_10", FIGURE_10
         ),
     ]
+    for name, figure, caption in (
+        (paper.LINT, "figure_8", FIGURE_8),
+        (paper.RATTE, "figure_9", FIGURE_9),
+    ):
+        of_tyres = {kind: estimates[f"{kind}_laps"][name] for kind in TYRES}
+        figures.append(tyres.parameters_figure(by_tyres, of_tyres, name, figure, caption))
+    if ferrari:
+        shown = in_drawing_order(ferrari.estimates)
+        figures.append(
+            laps.sideslip_figure(
+                ferrari.drive, shown, MIN_SPEED, "sideslip_ferrari", FERRARI_FIGURE
+            )
+        )
+    return figures
+
+
+def _values(
+    artefacts: StudyArtefacts,
+    by_condition: pd.DataFrame,
+    trucks: DrawnTrucks,
+    recommendation: str,
+) -> dict[str, object]:
+    """Numbers and names that the template has places for."""
+    by_pair = {
+        (row["first"], row["second"], row["condition"]): row
+        for row in by_condition.to_dict("records")
+    }
+
+    def ratio(first: str, second: str, condition: str) -> str:
+        row = by_pair.get((first, second, condition))
+        if row is None:
+            return "–"
+        low, high = fixed(row["low"], 2), fixed(row["high"], 2)
+        return f"{fixed(row['ratio'], 2)} [{low}, {high}]"
+
+    not_different = by_condition[by_condition["outcome"] == "n.s."]
+    return {
+        "recommendation": recommendation,
+        "ratio": ratio,
+        "min_slip": fixed(min(trucks.pooled_slips.values()), 1),
+        "max_slip": fixed(max(trucks.pooled_slips.values()), 1),
+        "n_not_different": len(not_different),
+        "n_with_power": int((not_different["power"] >= 0.8).sum()),
+        "n_orders": len(by_condition),
+        "all": TUNINGS[TUNED_ON_ALL],
+        "matched": TUNINGS[MATCHED],
+        "unmatched": TUNINGS[UNMATCHED],
+        "absent_parts": methods.absent_parts(artefacts),
+        "command": as_code(artefacts.command),
+    }
+
+
+def _noise_levels(trucks: DrawnTrucks, twin: Factorial) -> pd.DataFrame:
+    """Tuned noise levels of every filter, truck and twin."""
+    rows = []
+    for part in (TUNED_ON_ALL, MATCHED):
+        for condition in CONDITIONS if part == MATCHED else CONDITIONS[:1]:
+            tuned_on = condition if part == MATCHED else TUNINGS[part]
+            rows += [
+                _level_row("trucks", tuned_on, name, trucks.tuned[part][condition][name])
+                for name in FILTERS
+            ]
+    for tuned_on, of_filters in twin.tuned.items():
+        rows += [_level_row("twin", tuned_on, *of_filter) for of_filter in of_filters.items()]
+    return pd.DataFrame(rows)
+
+
+def _level_row(where: str, tuned_on: str, name: str, tuned: Tuned) -> dict[str, object]:
+    return {
+        "data": where,
+        "tuned_on": tuned_on,
+        "filter": name,
+        "ay": tuned.levels.ay,
+        "steer": tuned.levels.steer,
+        "tyres": tuned.levels.tyres if name.split(",")[0] != paper.RATT else np.nan,
+        "rmse_deg": tuned.cost,
+        "evaluations": tuned.evaluations,
+    }
+
+
+def _slips_by_truck(trucks: DrawnTrucks) -> pd.DataFrame:
+    """99th percentile of the rear slip of each truck [deg], a column a condition."""
+    return pd.DataFrame(trucks.slips)

@@ -114,13 +114,6 @@ class Plant:
             self.car.mass
         )
 
-    def curves(self, friction: float) -> FloatArray:
-        """c₁ and c₂ of the front, then of the rear axle as a filter that takes the friction for 1 sees them, (4,)."""
-        loads = np.array([self.load_front, self.load_rear])
-        return np.stack(
-            [0.5 * (friction + 1.0) * CURVES[::2], friction * loads * CURVES[1::2]], axis=1
-        ).ravel()
-
 
 @dataclass(frozen=True, eq=False)
 class Course:

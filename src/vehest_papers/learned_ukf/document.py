@@ -23,6 +23,8 @@ from vehest_papers.kit.block_rows import (
     frame,
 )
 from vehest_papers.kit.claim_files import Paper, claims_of
+from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
+from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.report_template import fill_template
@@ -181,8 +183,7 @@ def _incomplete(
             "number": number,
             "fewer": "; ".join(fewer) or MISSING,
             "candidates": "; ".join(absent) or MISSING,
-            "parts": ", ".join(f"`{name}`" for name in parts if name in artefacts.not_trained)
-            or MISSING,
+            "parts": sum(name in artefacts.not_trained for name in parts),
         }
     ]
 
@@ -217,6 +218,13 @@ def _outcome(
         figure, drawn = traces.hard_sequence(part, shown, "tyre_d", name, where)
         data[f"traces_{name}"] = drawn
         own.front.append(figure)
+    losses = loss_curves(groups)
+    data[LOSS_CURVES] = losses
+    if len(losses):
+        caption = (
+            f"Losses of the last phase of each method's first seed, scaled. Data: {kind.upper()}."
+        )
+        own.appendix += ["## Appendix: loss curves", loss_figure(losses, caption)]
     own.appendix += appendix_of_part(name, part, runs, where, data)
     return own
 

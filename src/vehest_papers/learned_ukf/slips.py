@@ -69,7 +69,7 @@ def distribution(
         legend_above(figure, axes)
     caption = (
         f"Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. Data: {data}. Samples with v_x of "
-        f"{LEAST_SPEED:g} m/s and more; angles beyond {LIMIT:g}° count in the outermost bins. {note}"
+        f"{LEAST_SPEED:g} m/s and more. {note}"
     )
     rows = [
         {

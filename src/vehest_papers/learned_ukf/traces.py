@@ -79,7 +79,7 @@ def hard_sequence(
     )
     caption = (
         f"Estimates over a hard sequence of {_where(piece)}, Figure 4 of the paper. Of {len(pieces)} sequences it is the one on which the "
-        f"candidates shown err most together; of each the seed that validation chooses. MSE (weighted) here: {shown}. Grey: not scored. "
+        f"candidates shown err most together. MSE (weighted) here: {shown}. Grey: not scored. "
         f"Bands: one standard deviation of the friction by the filter itself; dotted: the paper's nominal friction of that tyre, "
         f"{paper.NOMINAL_FRICTION[test]:g}. Data: {data}."
     )

@@ -385,7 +385,8 @@ def _ask_for_second_evidence(
 
     Pieces are the relation ay ≈ vx·yaw_rate, a relation to another channel, a second measurement,
     the unit of the header and the name. yaw_rate ≈ steer·vx/wheelbase and a lateral velocity
-    follow a turn alike.
+    follow a turn alike. Where speed or yaw rate is left out, so is what was compared with them, if
+    it has a question.
     """
     is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR_MISMATCH
     sure = {name for name, proposal in channels.items() if not proposal.question}
@@ -401,6 +402,16 @@ def _ask_for_second_evidence(
         evidence += [bool(column.unit), role in column.hints]
         if sum(evidence) < 2:
             checked[name] = replace(proposal.questioned(SINGLE_EVIDENCE), is_weak=True)
+    channels_of_turn = [name for name in channels if channels[name].column in columns]
+    if any(checked[name].is_weak for name in ("vx", "yaw_rate") if name in checked):
+        checked = {
+            name: replace(
+                proposal,
+                is_weak=proposal.is_weak
+                or (bool(proposal.question) and name not in channels_of_turn),
+            )
+            for name, proposal in checked.items()
+        }
     return checked
 
 
@@ -517,7 +528,7 @@ def _ask_about_world_axes(
     """Question velocities where the speed is the derivative of a coordinate of a position."""
     speed = proposals.by_channel.get("vx")
     positions = [_first_named(columns, role) for role in ("position_x", "position_y")]
-    if speed is None or speed.question or None in positions:
+    if speed is None or None in positions:
         return proposals
     along, across = (np.gradient(column.slow) for column in positions if column is not None)
     by_name = {column.name: column for column in columns}
@@ -533,7 +544,7 @@ def _ask_about_world_axes(
     )
     return proposals.changed(
         {
-            proposal.channel: replace(proposal.questioned(question), is_weak=True)
+            proposal.channel: replace(proposal, question=question, is_weak=True)
             for proposal in proposals.channels
             if proposal.channel in ("vx", "vy_ref")
         }

@@ -24,6 +24,7 @@ STRAY_DISTANCE = 20.0  # times the spread of nearly all samples; beyond lies no 
 MAX_STRAY_SHARE = 0.002
 MIN_CLOCK_SAMPLES = 1000  # samples
 HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
+ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -138,7 +139,7 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     for family in families.values():
         roles = {role for column in family for role in column.hints}
         for column in family if len(family) == 3 else ():
-            named_roles = dict.fromkeys(column.hints, HINT_OF_LETTER)
+            named_roles = dict.fromkeys(set(column.hints) - ROLES_OF_AXES, HINT_OF_LETTER)
             roles_of_motion = {"yaw_rate", "ax", "ay", "vx", "vy_ref"} & roles
             changed[column.name] = replace(
                 column, hints={**dict.fromkeys(roles_of_motion, WEAK), **named_roles}

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
@@ -58,6 +59,8 @@ TYPICAL_LENGTHS = {"steer": 2.7, "handwheel": 43.0}  # m
 MIN_MODEL_WHEELBASE = 0.08  # m, wheelbase of the smallest model
 MAX_MODEL_SPEED = 20.0  # m/s
 MIN_CALM_SAMPLES = 100  # samples
+# of a length by half of the slow corners from that by all; a lane change at one speed has more
+MAX_HALF_DIFFERENCE = 0.2
 
 
 class Offer(NamedTuple):
@@ -92,6 +95,7 @@ class Angle(NamedTuple):
     unit: str  # of the column
     length: float  # wheelbase, or that times the steering ratio, by slow cornering [m]
     largest: float  # angle, straight ahead taken off [rad]
+    is_repeatable: bool  # whether both halves of the slow corners give nearly this length
 
 
 def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ...]]:
@@ -217,7 +221,7 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     score = _score(best.strength, CLEAR_CORRELATION, hint)
     if score <= 0.0:
         return None
-    slope, straight = _regressed(search.motion, column, _driven(search.motion))
+    slope, straight = _regressed(search.motion, column, np.flatnonzero(_driven(search.motion)))
     sign = best.sign if best.strength else (-1 if slope < 0.0 else 1)
     text = best.text or f"{column.name} vs. yaw_rate/vx: sign {sign:+d}"
     evidence = (text, *_name_evidence(column, "steer", "handwheel"))
@@ -248,7 +252,7 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
             column,
             Proposal(column.name, "steer", unit, sign, evidence, question, offset=offset),
         )
-    _, channel, unit, length, largest_angle = min(possible)
+    _, channel, unit, length, largest_angle, is_repeatable = min(possible)
     rival_angles = sorted({(angle.channel, angle.unit) for angle in possible} - {(channel, unit)})
     alternatives = tuple(" ".join(pair) for pair in rival_angles)
     if alternatives:
@@ -256,7 +260,7 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
             f"{' or '.join(' in '.join(pair) for pair in rival_angles)} would fit equally well"
         )
     text = f"up to {math.degrees(largest_angle):.3g}°"
-    if (
+    if is_repeatable and (
         USUAL_LENGTHS[channel][0] <= length <= USUAL_LENGTHS[channel][1]
         or float(np.quantile(search.motion.vx, 0.99)) < MAX_MODEL_SPEED
     ):
@@ -432,9 +436,10 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
     ay = motion.channels.get("ay", motion.turning)
     driven = _driven(motion)
     calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
-    slope, offset = _regressed(
-        motion, column, calm if calm.sum() >= MIN_CALM_SAMPLES else driven, ay
-    )
+    rows = np.flatnonzero(calm if calm.sum() >= MIN_CALM_SAMPLES else driven)
+    slope, offset = _regressed(motion, column, rows, ay)
+    of_halves = [_regressed(motion, column, half, ay)[0] for half in np.array_split(rows, 2)]
+    is_repeatable = max(abs(half / slope - 1.0) for half in of_halves) <= MAX_HALF_DIFFERENCE
     largest_angle = float(np.quantile(np.abs(column.values - offset), 0.995))
     is_model = float(np.quantile(motion.vx, 0.99)) < MAX_MODEL_SPEED
     possible = []
@@ -456,6 +461,7 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
                         unit,
                         length,
                         largest_angle * factor,
+                        is_repeatable,
                     )
                 )
     return possible
@@ -466,7 +472,7 @@ def _driven(motion: Motion) -> BoolArray:
 
 
 def _regressed(
-    motion: Motion, column: Candidate, selected: BoolArray, *regressors: FloatArray
+    motion: Motion, column: Candidate, selected: NDArray[np.int64], *regressors: FloatArray
 ) -> tuple[float, float]:
     """Change of a column by yaw_rate/vx [its unit · m], and its value straight ahead.
 
@@ -475,7 +481,7 @@ def _regressed(
     rows = [
         motion["yaw_rate"][selected] / motion.vx[selected],
         *(samples[selected] for samples in regressors),
-        np.ones(int(selected.sum())),
+        np.ones(len(selected)),
     ]
     slope, *_, offset = np.linalg.lstsq(
         np.stack(rows, axis=1), column.values[selected], rcond=None

@@ -15,9 +15,9 @@ _STRONG = {  # over the name without blanks
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc|"
     r"crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$",
     "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
-    r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
+    r"angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|"
-    r"quera(?!bw)|accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
+    r"quera(?!bw)|accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right",
     "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle|accel?forward",
     "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
@@ -32,7 +32,7 @@ _STRONG = {  # over the name without blanks
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
     r"velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
-    "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
+    "roll_rate": r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
@@ -86,6 +86,7 @@ _EXPLAINED = {
     "vy_ref": ("vx", "ay", "pitch_rate", "position_y"),
     "sideslip_ref": ("vx",),
     "ay": ("latitude", "vx", "vy_ref", "pitch_rate", "position_y"),
+    "latitude": ("ay",),
     "ax": ("longitude", "vx", "roll_rate", "position_x"),
     "roll_rate": ("roll", "vx"),
     "pitch_rate": ("pitch", "vx"),
@@ -96,7 +97,10 @@ _EXPLAINED = {
 _QUANTITIES = {
     **dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"),
     **dict.fromkeys(("m/s²", "g"), "acc"),
+    **dict.fromkeys(("rad/s", "deg/s"), "rate"),
 }
+_NO_QUANTITY = ("heading", "latitude", "longitude", "position_x", "position_y")
+"""Roles of angles and positions, which are in none of these units."""
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2|radps|rads|degps|degs|dps)$")
 _PLAIN = str.maketrans(
     {
@@ -158,9 +162,11 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
         for role, pattern in _STRONG.items()
         if re.search(pattern, texts, re.MULTILINE) or role in words.split()
     }
+    if unit in _QUANTITIES:
+        roles = {role: strength for role, strength in roles.items() if role not in _NO_QUANTITY}
     strong = {role for role, strength in roles.items() if strength == STRONG}
     is_in_world = _WORLD_FRAME.search(words) and {"vx", "vy_ref", "ax", "ay"} & set(roles)
-    if is_in_world or _WORLD_AXIS.search(words):
+    if is_in_world or (_WORLD_AXIS.search(words) and "yaw_rate" not in strong):
         return {"other": STRONG}
     is_other = "other" in strong and not strong & {
         "yaw_rate",
@@ -176,17 +182,9 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
         part
         for role in strong
         for part in _EXPLAINED.get(role, ())
-        if role != "vx" or part not in strong
+        if role not in ("vx", "latitude") or part not in strong
     }
-    parts |= {
-        "other",
-        *(
-            ("heading", "latitude", "longitude", "position_x", "position_y")
-            if unit in _QUANTITIES
-            else ()
-        ),
-    }
-    return {role: strength for role, strength in roles.items() if role not in parts}
+    return {role: strength for role, strength in roles.items() if role not in {*parts, "other"}}
 
 
 def _corner(words: str) -> str:

@@ -41,6 +41,7 @@ from vehest.estimators.networks.sample_network import reference_sideslip
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered
 from vehest.filters.unscented_scan import UnscentedStepper
+from vehest.training.robust import robust_squares_of_array
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
 Inputs = Literal["full", "imu"]
@@ -171,9 +172,10 @@ class DugoffFilter(SigmaPointEstimator):
         levels: Mapping[str, float] | None = None,
         over: Over = "samples",
         pseudo: Sequence[PseudoMeasurement] | None = None,
+        limit: float = 0.0,
     ) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model; see
-        `error_over`.
+        `error_over`, and `robust_squares` for the limit [deg].
         """
         skip = round(skip_seconds * self.rate_hz)
         sums: list[tuple[float, int]] = []
@@ -184,7 +186,8 @@ class DugoffFilter(SigmaPointEstimator):
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
                 is_counted = (vx >= self.minimum_speed) & np.isfinite(reference)
                 is_counted[:skip] = False
-                sums.append((float(np.square(error[is_counted]).sum()), int(is_counted.sum())))
+                squares = robust_squares_of_array(error[is_counted], math.radians(limit))
+                sums.append((float(squares.sum()), int(is_counted.sum())))
         return error_over(sums, over)
 
     def _estimate_all(

@@ -136,7 +136,7 @@ def search_levels(
     def cost(powers: FloatArray) -> float:
         levels = estimator.levels | dict(zip(names, (10.0**powers).tolist(), strict=True))
         return estimator.mean_squared_error(
-            recordings, training.skip_seconds, levels, training.error
+            recordings, training.skip_seconds, levels, training.error, limit=training.error_limit
         )
 
     limits = BOXES | {

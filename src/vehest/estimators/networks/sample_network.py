@@ -4,6 +4,7 @@ network, its samples, its weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from vehest.estimators.base import FitData, FitRecord, require_learnable
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of, squared_error
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
+from vehest.training.robust import robust_criterion
 from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
 from vehest.training.sequences import record_of_phases, train_phases
 
@@ -93,6 +95,8 @@ class SampleNetworkEstimator(Network):
         """
         network, train, validation = self.prepare_network(data, training, seeds, minimum_speed)
         unit = network.unit**2 if criterion is squared_error else 1.0
+        if training.loss_limit:
+            criterion = robust_criterion(math.radians(training.loss_limit) / float(network.unit))
         phase = sample_phase(
             "samples",
             network,

@@ -24,6 +24,7 @@ from vehest.estimators.base import FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.networks.recurrent import HiddenStateEstimator
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
+from vehest.training.robust import robust_squares
 from vehest.training.sequences import (
     Phase,
     PhaseSettings,
@@ -81,6 +82,11 @@ class SequenceSettings(Group):
         most=1.0,
     )
     batch_size: int = setting(4, "sequences in a batch", least=1)
+    loss_limit: float = setting(
+        0.0,
+        "error of each output beyond which its square is continued by its tangent (Huber's loss), in the output's unit; 0: none",
+        least=0.0,
+    )
     weight_vx: float = setting(0.2225, "of the squared error of vx in the loss", least=0.0)
     weight_vy: float = setting(0.5064, "of vy", least=0.0)
     weight_yaw_rate: float = setting(0.1566, "of the yaw rate", least=0.0)
@@ -438,7 +444,9 @@ def _phase(
             batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask
         )
         carried[:] = [tuple(part.detach() for part in state)]
-        weighted: Tensor = (outputs - batch.targets)[:, dropped:].square() @ weights
+        weighted: Tensor = (
+            robust_squares((outputs - batch.targets)[:, dropped:], training.loss_limit) @ weights
+        )
         return weighted
 
     def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:

@@ -25,7 +25,10 @@ LAUNCHERS = ("local", "ray", "slurm")
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a command that runs stages: as `vehest run --help` describes them; no ``jobs`` is one a core, ``track`` logs runs."""
+    """Options of a command that runs stages: as `vehest run --help` describes them.
+
+    No ``jobs`` is one a core, ``track`` logs runs.
+    """
 
     force: bool = False
     dry_run: bool = False
@@ -42,7 +45,11 @@ class RunOptions:
 
 
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
-    """A command's launcher; without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or `MissingError`."""
+    """A command's launcher.
+
+    Without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or
+    `MissingError`.
+    """
     name = options.launcher
     address = options.address
     jobs = options.jobs
@@ -60,13 +67,15 @@ def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> La
 
     if name == "slurm" and address not in (None, "local"):
         raise ConfigurationError(
-            f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{address}'"
+            "--address must be left out for --launcher slurm, or be 'local' to try it here, not "
+            f"'{address}'"
         )
     parameters = slurm_parameters(options.slurm)
     package = "submitit" if name == "slurm" else "ray"
     if importlib.util.find_spec(package) is None:
         raise MissingError(
-            f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'"
+            f"--launcher {name} needs {package}, which is not installed: pip install "
+            f"'vehest[{name}]'"
         )
     if name == "slurm":
         return SlurmLauncher(address or "slurm", jobs, parameters, output, messages)

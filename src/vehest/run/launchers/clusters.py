@@ -1,9 +1,12 @@
-"""Groups as tasks of a Ray cluster, or as jobs of a SLURM queue through submitit; each can also be tried on this machine alone.
+"""Groups as tasks of a Ray cluster, or as jobs of a SLURM queue through submitit; each can also be
+tried on this machine alone.
 
-Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts in the driver's output root
+Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts
+in the driver's output root
 
-Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine, submitit a job whose time is up; both go
-on from the last checkpoint. Machines that do not share the output root get inputs through Ray's object store and return artefacts.
+Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine,
+submitit a job whose time is up; both go on from the last checkpoint. Machines that do not share the
+output root get inputs through Ray's object store and return artefacts.
 """
 
 from __future__ import annotations
@@ -35,11 +38,11 @@ from vehest.run.launchers.local import POLL_SECONDS, Done, Files, Reporter, defa
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
-TIMES = 3  # that a group is tried, if its tasks end without a report
+MAX_ATTEMPTS = 3  # that a group is tried, if its tasks end without a report
 ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 ENVIRONMENT |= {
     "RAY_worker_niceness": "0",
-    "RAY_task_oom_retries": str(TIMES - 1),
+    "RAY_task_oom_retries": str(MAX_ATTEMPTS - 1),
 }  # by default 15, and without end
 """Of Ray, unless it is set otherwise."""
 QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
@@ -60,7 +63,10 @@ class NotShared(Exception):
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A group with the driver's paths, relative ones by ``folder``; a machine that sees ``mark`` shares the output root."""
+    """A group with the driver's paths, relative ones by ``folder``.
+
+    A machine that sees ``mark`` shares the output root.
+    """
 
     position: int
     group: Group
@@ -90,19 +96,26 @@ def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
 
 
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
-    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where machines share the output root.
+    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where
+    machines share the output root.
 
-    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
+    Raises
+    ------
+    MissingError
+        The machine has other versions, or copies cannot be written.
+    NotShared
+        There is neither a shared output root nor copies.
     """
-    here = versions_here()
+    versions = versions_here()
     unlike = [
-        f"{name} {here.get(name, 'missing')} instead of {own}"
-        for name, own in spec.versions.items()
-        if here.get(name) != own
+        f"{name} {versions.get(name, 'missing')} instead of {version}"
+        for name, version in spec.versions.items()
+        if versions.get(name) != version
     ]
     if unlike:
         raise MissingError(
-            f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine"
+            f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every "
+            "machine"
         )
     shared = spec.mark.is_dir()
     if not shared and copies is None:
@@ -112,12 +125,12 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
         if not shared:
             unpack(copies or {})
         outcome = guarded(spec.group.run, should_stop, lambda _: None)
-        made = (
+        files = (
             {}
             if shared or isinstance(outcome, Failure)
             else pack(folders_of(outcome).difference(copies or ()))
         )
-    return Done(spec.position, outcome, made)
+    return Done(spec.position, outcome, files)
 
 
 def versions_here() -> dict[str, str]:
@@ -137,30 +150,33 @@ def inputs_of(group: Group) -> set[Path]:
     starts = {Path(start) for job in group.jobs if (start := job.training.get("start_from"))}
     return (
         folders_of(existing(group))
-        | {artefact.folder for own in data for artefact in own.values()}
+        | {artefact.folder for artefacts in data for artefact in artefacts.values()}
         | starts
     )
 
 
 def folders_of(members: Sequence[Member]) -> set[Path]:
     """Folders of the artefacts of members."""
-    return {own.folder for member in members for own in member.made}
+    return {artefact.folder for member in members for artefact in member.made}
 
 
 def pack(folders: set[Path]) -> Files:
     """The files of artefacts, their manifests included."""
     return {
-        own: {
-            file.relative_to(own).as_posix(): file.read_bytes()
-            for file in own.rglob("*")
+        folder: {
+            file.relative_to(folder).as_posix(): file.read_bytes()
+            for file in folder.rglob("*")
             if file.is_file()
         }
-        for own in folders
+        for folder in folders
     }
 
 
 def unpack(packed: Files) -> None:
-    """Put artefacts in their places, each whole or not at all, unless they are there; raises `DataError` or `MissingError`."""
+    """Put artefacts in their places, each whole or not at all, unless they are there.
+
+    Raises `DataError` or `MissingError`.
+    """
     for folder, files in packed.items():
         if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
             remove_leftovers(folder.parent)
@@ -172,7 +188,10 @@ def unpack(packed: Files) -> None:
 
 
 class RayLauncher:
-    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default ``RAY_ADDRESS``, else a Ray of its own."""
+    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's.
+
+    By default ``RAY_ADDRESS``, else a Ray of its own.
+    """
 
     def __init__(
         self, address: str | None, jobs: int | None, output: Path, messages: Messages
@@ -191,8 +210,8 @@ class RayLauncher:
     @property
     def cores(self) -> int:
         """Cores of the cluster as it is now, ``jobs`` at most; 1 before it is connected."""
-        there = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
-        return min(there, self._jobs or there)
+        n_cores = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
+        return min(n_cores, self._jobs or n_cores)
 
     def launch(
         self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
@@ -234,17 +253,21 @@ class RayLauncher:
         os.environ.update(ENVIRONMENT | os.environ)
         import ray
 
-        own: dict[str, Any] = (
+        options: dict[str, Any] = (
             {"num_cpus": self._jobs, "include_dashboard": False} if self._address == "local" else {}
         )
         handler = signal.getsignal(signal.SIGTERM)
         try:
             ray.init(
-                address=self._address, log_to_driver=False, logging_level=logging.CRITICAL, **own
+                address=self._address,
+                log_to_driver=False,
+                logging_level=logging.CRITICAL,
+                **options,
             )
         except Exception as error:  # ConnectionError, RuntimeError, ValueError, … by what is wrong
             raise MissingError(
-                f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one"
+                f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head "
+                "starts one"
             ) from error
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
@@ -253,7 +276,7 @@ class RayLauncher:
             "again", "ray", data["lines"][0].partition("\n")[0]
         )
         self._ray, self._mark = ray, new_mark(self._output)
-        self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
+        self._task = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
         machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
@@ -291,7 +314,9 @@ class RayLauncher:
         except errors.RayError as error:
             return Done(
                 position,
-                Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"),
+                Failure(
+                    f"{_line(error)} ({MAX_ATTEMPTS} times; --launcher local shows what ends it)"
+                ),
             )
         unpack(done.made)
         return done
@@ -312,18 +337,29 @@ def _line(error: BaseException) -> str:
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """What jobs ask the queue for; raises `ConfigurationError` unless each is NAME=VALUE of `PARAMETERS`, positive where it must be."""
-    found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
+    """What jobs ask the queue for.
+
+    Raises
+    ------
+    ConfigurationError
+        Unless each is NAME=VALUE of `PARAMETERS`, positive where it must be.
+    """
+    parameters: dict[str, Any] = {
+        "mem_gb": 2.0,
+        "timeout_min": 60,
+        "cpus_per_task": 1,
+        "name": "vehest",
+    }
     for word in words:
         name, _, value = word.partition("=")
         if name not in PARAMETERS or not value:
             raise ConfigurationError(
                 f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}"
             )
-        found[PARAMETERS[name]] = (
+        parameters[PARAMETERS[name]] = (
             _positive(name, value) if name in ("memory_gb", "minutes") else value
         )
-    return {**found, "timeout_min": max(round(found["timeout_min"]), 1)}
+    return {**parameters, "timeout_min": max(round(parameters["timeout_min"]), 1)}
 
 
 def _positive(name: str, text: str) -> float:
@@ -334,7 +370,10 @@ def _positive(name: str, text: str) -> float:
 
 
 class SlurmTask:
-    """A job; submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again."""
+    """A job.
+
+    Submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again.
+    """
 
     def __call__(self, spec: TaskSpec) -> Done:
         """Run a group until it is done or the driver asks for its end."""
@@ -348,7 +387,9 @@ class SlurmTask:
 
 
 class SlurmLauncher:
-    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of this machine."""
+    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of
+    this machine.
+    """
 
     def __init__(
         self,
@@ -360,7 +401,8 @@ class SlurmLauncher:
     ) -> None:
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise MissingError(
-                "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local"
+                "there is no SLURM here (no sbatch); run this where jobs are submitted, or try it "
+                "with --address local"
             )
         self._cluster = cluster
         self._parameters = parameters
@@ -448,8 +490,8 @@ class SlurmLauncher:
             self._lost[name] += 1
             if not job.paths.result_pickle.exists():
                 why = f"its job ended without an outcome ({str(job.state).lower()}); {log}"
-                if self._lost[name] == TIMES:
-                    return Done(position, Failure(f"{why} ({TIMES} times)"))
+                if self._lost[name] == MAX_ATTEMPTS:
+                    return Done(position, Failure(f"{why} ({MAX_ATTEMPTS} times)"))
                 self._messages.line("again", "train", name, why)
                 return None
             lines = str(error).splitlines()

@@ -1,4 +1,7 @@
-"""Runs functions in processes of this machine; what one raises is returned as a value, and the others go on."""
+"""Runs functions in processes of this machine.
+
+What one raises is returned as a value, and the others go on.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,9 @@ Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> it
 
 @dataclass(frozen=True)
 class Done:
-    """What a task returned, or why it failed, and what it made that is not in the output root yet."""
+    """What a task returned, or why it failed, and what it made that is not in the output root
+    yet.
+    """
 
     position: int
     outcome: Any
@@ -56,9 +61,13 @@ class LocalLauncher:
     def launch(
         self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
     ) -> Iterator[Done]:
-        """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
+        """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin
+        of a group is reported.
 
-        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines cannot run them.
+        Raises
+        ------
+        MissingError
+            There is no cluster, it takes no tasks, or one of its machines cannot run them.
         """
         return launch([group.run for group in groups], self.cores, stop, report)
 
@@ -71,10 +80,16 @@ def launch(
 ) -> Iterator[Done]:
     """Run tasks in their order, as many at a time as ``jobs`` says, and yield them as they end.
 
-    Args:
-        jobs: processes; 1 runs everything in this one.
-        stop: when a signal came or the time is up, running tasks are asked to end and no other is started.
-        report: called with the task's position and its progress (None when it starts), or what it waits for.
+    Parameters
+    ----------
+    jobs : int
+        Processes; 1 runs everything in this one.
+    stop : StopSignals or TimeLimit
+        When a signal came or the time is up, running tasks are asked to end and no other is
+        started.
+    report : Reporter
+        Called with the task's position and its progress (None when it starts), or what it waits
+        for.
     """
     if min(jobs, len(tasks)) > 1 and not stop.requested():
         yield from _launch_in_processes(tasks, min(jobs, len(tasks)), stop, report)
@@ -139,7 +154,10 @@ def _launch_in_processes(
 
 
 class _Worker:
-    """A process that runs one task at a time; each has a pipe of its own, so that no lock is shared with one that is killed."""
+    """A process that runs one task at a time.
+
+    Each has a pipe of its own, so that no lock is shared with one that is killed.
+    """
 
     def __init__(self, position: int, task: Task) -> None:
         context = get_context("spawn")
@@ -161,7 +179,10 @@ class _Worker:
             self.connection.send(task)
 
     def receive(self) -> Done | Progress | Waiting | None:
-        """The next message: None when a task begins, its progress, its end; a dead worker fails the task that it had."""
+        """The next message: None when a task begins, its progress, its end.
+
+        A dead worker fails the task that it had.
+        """
         try:
             kind, value = self.connection.recv()
         except (EOFError, ConnectionError):
@@ -179,7 +200,10 @@ class _Worker:
         return progress if kind == PROGRESS else Done(self.position, value)
 
     def stop(self) -> bool:
-        """Ask the task to end soon; False where it had not begun, and the process was ended instead."""
+        """Ask the task to end soon.
+
+        False where it had not begun, and the process was ended instead.
+        """
         if self._task is not None:
             self.kill()
             return False
@@ -190,7 +214,10 @@ class _Worker:
         return True
 
     def end(self) -> None:
-        """Let a worker without a task go; told so, as one that was forked has the other end of the pipe as well."""
+        """Let a worker without a task go.
+
+        Told so, as one that was forked has the other end of the pipe as well.
+        """
         with suppress(OSError):  # it was killed
             self.connection.send(None)
         self.connection.close()

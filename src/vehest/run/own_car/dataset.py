@@ -41,7 +41,7 @@ POLICIES = {
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
 MIN_GAP_SECONDS = 0.05  # s
-GAPS = "it has missing samples, which are interpolated, or cut out beyond one second, only in a table with a time column"
+GAPS = "it has missing samples, which are interpolated, or cut out beyond one second, only in a log with times"
 CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
 CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
@@ -318,6 +318,10 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         )
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
     dataset["clock"] = "strict"
+    if log.source == "vbo" and any(
+        np.isnan(columns[proposal.column].values).any() for proposal in proposals.channels
+    ):
+        dataset.setdefault("max_gap", MAX_GAP)
     if log.source in TABLES:
         gaps = {
             surveyed.file.stem: np.array(
@@ -421,9 +425,7 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
             log.clock is None and bool(_gaps(examined, log, column).max() > MAX_BRIDGED_SECONDS)
         )
     if log.source != "rosbag" or signal.stamps is None or not len(measured_rows):
-        return not len(measured_rows) or (
-            log.source != "mdf" and len(measured_rows) < len(signal.values)
-        )
+        return not len(measured_rows)
     measured = signal.stamps[measured_rows]
     ends = signal.stamps[[0, -1]] == measured[[0, -1]]
     return not ends.all() or bool(

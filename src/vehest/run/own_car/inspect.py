@@ -27,7 +27,7 @@ from vehest.data.recording import Kind
 from vehest.data.splits import check_name
 from vehest.run.printing import counted
 from vehest.sources.base import source_names
-from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate
+from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, typical_step
 from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.unit_spellings import plain_unit
@@ -58,6 +58,8 @@ VEHICLE = {
     "steering_ratio": "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)",
 }
 """Values of the car that no log holds, as questions."""
+IMU_PLACE = "imu_to_rear_axle"
+"""Another one, asked in any case: the distance of the inertial unit from the rear axle, negative behind it [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class Examined:
     proposals: Proposals  # for all logs
     place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
     rate_hz: float | None  # sampling rate of logs without times; else None
-    vehicle: Mapping[str, float | None]  # values of `VEHICLE`, None where unknown
+    vehicle: Mapping[str, float | None]  # values of `VEHICLE` and `IMU_PLACE`, None where unknown
     kind: Kind = "real"  # whether a real car or a simulation wrote the logs
 
     @property
@@ -213,7 +215,7 @@ def inspect(
         proposals,
         place,
         rate,
-        dict.fromkeys(VEHICLE) | dict(vehicle or {}),
+        dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
 
 
@@ -227,8 +229,8 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
 
 
 def rate_of(stamps: FloatArray) -> float:
-    """Median rate of time stamps [Hz]."""
-    return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
+    """Rate of time stamps [Hz]."""
+    return 1.0 / max(typical_step(stamps), 1e-6)
 
 
 def _longest(logs: Sequence[Log]) -> Log:
@@ -423,10 +425,7 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
         return np.stack([column.values[run] for column in log.columns]), None
     stamps = log.seconds[run]
     rows = [bridged(column.values[run], stamps, MAX_BRIDGED_SECONDS) for column in log.columns]
-    step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(
-        len(stamps) - 1, 1
-    )
-    rate = plain_rate(1.0 / step, INTERPOLATED_TOLERANCE)
+    rate = plain_rate(rate_of(stamps), INTERPOLATED_TOLERANCE)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
     if is_even or (stamps[-1] - stamps[0]) * rate > 4 * len(stamps):
         return np.stack(rows), rate

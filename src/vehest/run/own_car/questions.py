@@ -12,16 +12,19 @@ import typer
 
 from vehest.alignment.proposals.assign import MAX_IMPOSSIBLE_SHARE
 from vehest.alignment.proposals.proposal import LATERAL, Proposal
+from vehest.data.car import CarValues
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.recording import Kind
+from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
-from vehest.run.own_car.inspect import VEHICLE, Examined
+from vehest.run.own_car.inspect import IMU_PLACE, VEHICLE, Examined
 from vehest.run.printing import echo
 from vehest.sources.surveys import Log
-from vehest.sources.surveys.clocks import UNITS
+from vehest.sources.surveys.clocks import STATED_UNITS
 
 LEAVE_OUT = "-"
+UNKNOWN = "unknown"
 KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 
 
@@ -29,7 +32,7 @@ KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 class Question:
     """A question about logs or their car."""
 
-    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, ``kind``, a column, or a value of the vehicle
+    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, ``imu_to_rear_axle``, ``kind``, a column, or a value of the vehicle
     text: str  # for people
     proposed: str  # answer that Enter takes; empty where nothing is proposed
     candidates: tuple[str, ...] = ()  # other answers
@@ -48,6 +51,13 @@ ORIGIN = Question(
     "real",
     ("simulated",),
     hint="real or simulated",
+)
+
+PLACE = Question(
+    IMU_PLACE,
+    "how far ahead of the rear axle is the inertial unit [m], negative behind it?",
+    UNKNOWN,
+    hint=f"a number, or {UNKNOWN}",
 )
 
 
@@ -77,7 +87,7 @@ def ask(
         An answer is invalid, or no channel remains.
     """
     questions = list(questions_of(examined))
-    keys = [*(question.key for question in questions), ORIGIN.key]
+    keys = [*(question.key for question in questions), PLACE.key, ORIGIN.key]
     answers_by_key: dict[str, str] = {}
     for text in answers:
         key, _, answer = text.rpartition("=")
@@ -98,7 +108,7 @@ def ask(
             for key, text in VEHICLE.items()
             if key not in stated
         ]
-    questions.append(ORIGIN)
+    questions += [PLACE, ORIGIN]
     left = []
     for question in questions:
         if question.key in answers_by_key:
@@ -135,7 +145,7 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
         text = f"is '{clock.column}' the time in {clock.unit}?"
-        yield Question("time", text, clock.unit, tuple(UNITS), (clock.evidence,), "a unit")
+        yield Question("time", text, clock.unit, tuple(STATED_UNITS), (clock.evidence,), "a unit")
     for proposal in proposals.channels:
         if proposal.question:
             alternatives = tuple(
@@ -230,9 +240,11 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))
     if key == "time":
-        if answer not in UNITS:
-            raise ConfigurationError(f"'{answer}' is not one of {', '.join(UNITS)}")
+        if answer not in STATED_UNITS:
+            raise ConfigurationError(f"'{answer}' is not one of {', '.join(STATED_UNITS)}")
         return replace(examined, logs=tuple(_with_time_unit(log, answer) for log in examined.logs))
+    if key == IMU_PLACE:
+        return replace(examined, vehicle={**examined.vehicle, key: _place_of_imu(answer)})
     if key in VEHICLE:
         return replace(examined, vehicle={**examined.vehicle, key: _number(answer, key)})
     if key == "radius":
@@ -253,7 +265,7 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
 def _with_time_unit(log: Log, unit: str) -> Log:
     if log.clock is None or log.seconds is None:
         return log
-    factor = UNITS[unit] / UNITS[log.clock.unit]
+    factor = STATED_UNITS[unit] / STATED_UNITS[log.clock.unit]
     return replace(
         log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor
     )
@@ -315,4 +327,16 @@ def _number(text: str, quantity: str) -> float:
         value = math.nan
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{quantity} must be a positive number, not '{text}'")
+    return value
+
+
+def _place_of_imu(text: str) -> float:
+    """Distance of the inertial unit from the rear axle [m], within the limits of `CarValues`."""
+    try:
+        value = float(text.replace(",", "."))
+    except ValueError:
+        raise ConfigurationError(
+            f"{IMU_PLACE} must be a number of metres or {UNKNOWN}, not '{text}'"
+        ) from None
+    validated(CarValues, {IMU_PLACE: value}, "", error=ConfigurationError)
     return value

@@ -24,22 +24,34 @@ COUNTER = re.compile(
     r"?(id|nr|no|number|index))?$"
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
+STATED_UNITS = {**UNITS, "cs": 0.01, "min": 60.0, "h": 3600.0}  # the last where a header says so
+SPELLINGS_OF = {
+    "s": "s sec secs second seconds sekunden",
+    "ms": "ms msec millis milliseconds",
+    "us": "us µs μs usec micros microseconds",
+    "ns": "ns nsec nanos nanoseconds",
+    "d": "d day days",
+    "cs": "cs 1/100s centiseconds hundredths",
+    "min": "min mins minute minutes",
+    "h": "h hr hrs hour hours stunden",
+}
 SPELLINGS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
-    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
-    **dict.fromkeys(("d", "day", "days"), "d"),
+    spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
 FARTHEST_ROW = 100  # rows by which one may stand out of order
-MODULI = (  # of counters, also as fractions of a second, and of seconds of a day and of a GPS week
-    *(2.0**bits * factor for bits in (15, 16, 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
-    *(days * 86_400.0 * factor for days in (1, 7) for factor in (1.0, 1e3, 1e6)),
+MODULI = (  # of counters, also as fractions of a second; of a minute, an hour, a day, a GPS week
+    *(2.0**bits * factor for bits in (*range(8, 17), 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
+    *(
+        period * factor
+        for period in (60.0, 3600.0, 86_400.0, 604_800.0)
+        for factor in (1, 1e3, 1e6)
+    ),
 )
+MAX_WRAP_STEPS = 3.0  # steps that a counter that wraps may go ahead there
 REGULAR = 0.8  # share of the steps within half a median step
 # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
 GROWING = 0.9
@@ -60,7 +72,8 @@ def find_clock(
     step = 0.0
     repaired = {}
     for name, raw in columns.items():
-        unit = SPELLINGS.get(units.get(name, "").strip().lower(), "")
+        written = units.get(name, "").replace(" ", "").lower()
+        unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
@@ -70,7 +83,8 @@ def find_clock(
             None if column_step is None or counts_rows else _stamps(name, column_step, unit, named)
         )
         if column_step is not None and stamps is not None and 2 * bool(unit) + named > likely:
-            best = replace(stamps, repair=repair)
+            is_unknown = bool(written.strip("-")) and not unit
+            best = replace(stamps, repair=repair, asked=stamps.asked or is_unknown)
             repaired = {name: values}
             likely = 2 * bool(unit) + named
             step = column_step
@@ -80,13 +94,13 @@ def find_clock(
     columns = {**columns, **repaired}
     values = columns[best.column]
     steps = np.diff(values)
-    seconds = (values - values[0]) * UNITS[best.unit]
+    seconds = (values - values[0]) * STATED_UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)
     options: dict[str, Any] = {"runs": counted_by}
     if counted_by:
         runs = stretches(starts, n_rows)
     else:
-        runs, pause = between_pauses(seconds, step * UNITS[best.unit])
+        runs, pause = between_pauses(seconds, step * STATED_UNITS[best.unit])
         options = pause | ({"time_restarts": True} if starts.any() else {})
     return best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), options
 
@@ -95,21 +109,28 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     """Times, (N,), that go on where a counter wrapped or rows stood out of order, and the options.
 
     A counter wraps if each of its steps back is that of one modulus. Rows are out of order if
-    sorting makes the times even and moves none of them far; others that go back begin a run.
+    sorting makes the times even, and either puts none of them beside another of nearly the same
+    time, as two drives would, or moves none far; others that go back begin a run.
     """
     steps = np.diff(times)
-    if not (np.isfinite(times).all() and 0 < (steps < 0).sum() < 0.5 * len(steps)):
+    if not (np.isfinite(times).all() and (steps < 0).any()):
         return times, {}
     step = float(np.median(steps))
-    for modulus in MODULI:
+    if step > 0.0:
+        modulus = min(MODULI, key=lambda modulus: abs(steps.min() + modulus - step))
         ahead = steps[steps < 0] + modulus
-        if np.ptp(times) < modulus and (ahead > 0.0).all() and (ahead < LONG_GAP * step).all():
+        if np.ptp(times) < modulus and 0.0 < ahead.min() <= ahead.max() < MAX_WRAP_STEPS * step:
             return unwrapped(times, modulus), {"wraps_at": modulus}
     rows = np.argsort(times, kind="stable")
     ordered = times[rows]
-    even = np.abs(np.diff(ordered) / max(step, 1e-300) - 1.0) < 0.5
+    sorted_steps = np.diff(ordered)
+    relative_steps = sorted_steps / max(float(np.median(sorted_steps)), 1e-300)
+    is_even = np.mean(np.abs(relative_steps - 1.0) < 0.5) >= GROWING
+    is_apart = relative_steps.min() > 0.5 and not span_fault(ordered)  # no stray stamp
     is_near = np.abs(rows - np.arange(len(rows))).max() <= FARTHEST_ROW
-    return (ordered, {"sort": True}) if is_near and even.mean() >= GROWING else (times, {})
+    repeats_no_more = (sorted_steps == 0).sum() <= (steps == 0).sum()
+    is_out_of_order = is_even and (is_apart or (is_near and repeats_no_more))
+    return (ordered, {"sort": True}) if is_out_of_order else (times, {})
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
@@ -161,19 +182,20 @@ def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
 
     None where no unit does.
     """
+    offered = UNITS | ({unit: STATED_UNITS[unit]} if unit else {})
     fitting = [
-        name for name, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
+        name for name, factor in offered.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
     ]
     chosen = unit if unit in fitting or not fitting else fitting[0]
     chosen = chosen or ("s" if named else "")
-    if not chosen or step * UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
+    if not chosen or step * STATED_UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None
-    rate = 1.0 / (step * UNITS[chosen])
+    rate = 1.0 / (step * STATED_UNITS[chosen])
     evidence = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
     if unit == chosen:
         evidence = f"unit in the header, {rate:.6g} Hz"
     elif unit:
-        evidence += f", {1.0 / (step * UNITS[unit]):.6g} Hz in {unit}, as the header says"
+        evidence += f", {1.0 / (step * STATED_UNITS[unit]):.6g} Hz in {unit}, as the header says"
     return Stamps(name, chosen, evidence, asked=chosen not in fitting or unit not in ("", chosen))
 
 

@@ -35,11 +35,11 @@ from vehest.data.parquet import (
     read_numbers,
 )
 from vehest.data.text_files import first_line
-from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.clock_times import past_midnight, seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
-from vehest.sources.surveys.unsuited import require_columns_of_signals
+from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_columns_of_signals
 from vehest.sources.tables import (
     TextLayout,
     is_parquet,
@@ -126,11 +126,9 @@ def survey_table(file: Path) -> Log:
                 for field in table.schema_arrow
                 if field.name in units or is_numeric(field.type)
             ]
-            skipped = [
-                f"column '{printable(field.name)}' holds {field.type}"
-                for field in table.schema_arrow
-                if field.name not in names
-            ]
+            others = [field for field in table.schema_arrow if field.name not in names]
+            require_columns_of_numbers(file, names, [field.name for field in others])
+            skipped = [f"column '{printable(field.name)}' holds {field.type}" for field in others]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
     else:
@@ -240,12 +238,7 @@ def shape_of(file: Path) -> Shape:
     ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
     require_columns_of_signals(file, lines, tables)
-    marks = [
-        (delimiter, decimal)
-        for delimiter in DELIMITERS
-        for decimal in (".", ",")
-        if decimal != delimiter
-    ]
+    marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",")]
     best = max(
         (_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score
     )
@@ -408,6 +401,10 @@ def _columns(
             skipped.append(f"column {place} has no name")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
             values[name], column_marks, odd = numbers
+            if NAMED.match(plain_name(name)) and _shows_a_clock(values[name]):
+                digits = values.pop(name)
+                minutes = digits // 100 % 100 + 60 * (digits // 10_000)
+                clocks[name] = past_midnight(digits % 100 + 60 * minutes)
             marks |= column_marks
             skipped += [
                 f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
@@ -418,6 +415,13 @@ def _columns(
         else:
             skipped.append(f"column '{printable(name)}' holds {_kind_of_text(column)}")
     return values, clocks, marks, skipped
+
+
+def _shows_a_clock(numbers: FloatArray) -> bool:
+    """Whether numbers are times hhmmss.sss: 59 is followed by 100."""
+    minutes, seconds = np.divmod(numbers, 100.0)
+    is_time = (numbers >= 0.0) & (numbers < 240_000.0) & (minutes % 100.0 < 60.0) & (seconds < 60.0)
+    return bool(is_time.all() and np.ptp(minutes) > 0.0 and np.ptp(seconds) > 50.0)
 
 
 def _kind_of_text(column: pa.ChunkedArray) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 from vehest.data.errors import DataError, printable
@@ -25,6 +25,7 @@ _NAMES_BYTES = re.compile(
 )
 _BYTES = re.compile(r"(0x)?[0-9A-Fa-f]{2}([ _:-]?[0-9A-Fa-f]{2})*")
 MIN_ROWS_OF_SIGNAL = 5  # of each quantity in long format, on average
+MAX_COLUMNS = 8  # of a table in long format, where its beginning does not show several quantities
 
 
 def require_columns_of_signals(
@@ -84,17 +85,35 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
 def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
     for at, header in enumerate(table[:20]):
         rows = [row for row in table[at + 1 :] if len(row) == len(header)]
-        of_signal = [k for k, name in enumerate(header) if _NAMES_SIGNAL.fullmatch(name.strip())]
-        of_value = [k for k, name in enumerate(header) if _NAMES_VALUE.fullmatch(name.strip())]
-        for k in of_signal:
+        for k, value in product(*_places_in_long_format(header)):
             names = [row[k] for row in rows]
             n_names = len(set(names))
             is_text = not any(name.strip().lstrip("+-")[:1].isdigit() for name in names)
-            if of_value and is_text and 1 < n_names <= len(rows) / MIN_ROWS_OF_SIGNAL:
-                signal, value = printable(header[k].strip()), printable(header[of_value[0]].strip())
-                raise DataError(
-                    f"'{file}' is in long format, one value a row: '{signal}' names the quantity, "
-                    f"'{value}' holds it; make a column of each, for example by pandas: "
-                    f"table.pivot_table(index='TIME', columns='{signal}', values='{value}')"
-                    ".interpolate().to_csv('wide.csv'), with the name of the column of times"
-                )
+            has_few_names = 1 <= n_names <= len(rows) / MIN_ROWS_OF_SIGNAL
+            if is_text and has_few_names and (n_names > 1 or len(header) <= MAX_COLUMNS):
+                raise _in_long_format(file, header[k], header[value])
+
+
+def require_columns_of_numbers(file: Path, numbers: Sequence[str], texts: Sequence[str]) -> None:
+    """Refuse, by a `DataError` with the way out, columns of numbers and texts in long format."""
+    signals, _ = _places_in_long_format(texts)
+    _, values = _places_in_long_format(numbers)
+    if signals and values and len(numbers) + len(texts) <= MAX_COLUMNS:
+        raise _in_long_format(file, texts[signals[0]], numbers[values[0]])
+
+
+def _places_in_long_format(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Places of columns that may name a quantity, and of those that may hold its value."""
+    plain = [name.strip(" _") for name in names]
+    signals = [k for k, name in enumerate(plain) if _NAMES_SIGNAL.fullmatch(name)]
+    return signals, [k for k, name in enumerate(plain) if _NAMES_VALUE.fullmatch(name)]
+
+
+def _in_long_format(file: Path, signal: str, value: str) -> DataError:
+    signal, value = printable(signal.strip()), printable(value.strip())
+    return DataError(
+        f"'{file}' is in long format, one value a row: '{signal}' names the quantity, "
+        f"'{value}' holds it; make a column of each, for example by pandas: "
+        f"table.pivot_table(index='TIME', columns='{signal}', values='{value}')"
+        ".interpolate().to_csv('wide.csv'), with the name of the column of times"
+    )

@@ -1,1 +1,3 @@
-"""What every report of a comparison is made of: its runs, who may be called best, a front page, warnings, and how it was made."""
+"""What every report of a comparison is made of: its runs, who may be called best, a front page,
+warnings, and how it was made.
+"""

@@ -27,7 +27,9 @@ TEST_COLOUR = "#0b4f9c"
 
 @dataclass(frozen=True, eq=False)
 class DriveSignals:
-    """Estimates and reference over all scored ranges of a test set, with a gap of NaN between two ranges."""
+    """Estimates and reference over all scored ranges of a test set, with a gap of NaN between two
+    ranges.
+    """
 
     artefacts: PartArtefacts
     test_set: str
@@ -38,7 +40,9 @@ class DriveSignals:
 
     @property
     def reference(self) -> Scored:
-        """Signals of the first candidate, whose time, reference and acceleration are those of all."""
+        """Signals of the first candidate, whose time, reference and acceleration are those of
+        all.
+        """
         return next(iter(self.joined.values()))
 
     @property
@@ -96,7 +100,8 @@ def traces_block(signals: DriveSignals, file: str) -> Figure:
     drive = signals.reference
     return Figure(
         f"traces_{file}",
-        "Lateral velocity and sideslip over the whole test set: measured (grey) and estimated (coloured), of each "
+        "Lateral velocity and sideslip over the whole test set: measured (grey) and estimated "
+        "(coloured), of each "
         "estimator the seed chosen on validation.",
         figures.traces_figure(
             drive.time, _reference_trace(signals), _estimate_traces(signals), signals.time_label
@@ -105,7 +110,10 @@ def traces_block(signals: DriveSignals, file: str) -> Figure:
 
 
 def busiest_block(signals: DriveSignals, file: str) -> Figure:
-    """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`; on the page, all traces of the test set, which begin there."""
+    """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`.
+
+    On the page, all traces of the test set, which begin there.
+    """
     drive = signals.reference
     start, stop = signals.busiest
     inside = (drive.time >= start) & (drive.time <= stop)
@@ -117,7 +125,8 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
     return Figure(
         f"zoom_{file}",
         f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
-        f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error (estimate − measured), "
+        f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error "
+        "(estimate − measured), "
         f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}.",
         figures.zoom_figure(
             drive.time[inside],
@@ -145,7 +154,9 @@ def _band_of_first(
 
 
 def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
-    """Figures ``agreement_FILE`` and, with lateral acceleration, ``over_ay_FILE``: estimate over reference, β over ay, g-g."""
+    """Figures ``agreement_FILE`` and, with lateral acceleration, ``over_ay_FILE``: estimate over
+    reference, β over ay, g-g.
+    """
     drive = signals.reference
     scored = drive.is_sideslip_scored
     reference = np.degrees(drive.sideslip_ref)[scored]
@@ -157,7 +168,8 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     ]
     agreement = Figure(
         f"agreement_{file}",
-        "Estimated over measured sideslip at evenly spaced samples of the test set; on the line both are equal.",
+        "Estimated over measured sideslip at evenly spaced samples of the test set; on the line "
+        "both are equal.",
         agreement_figure(reference, clouds),
     )
     if not signals.has_ay:
@@ -185,7 +197,10 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
 
 
 def _accelerations(signals: DriveSignals) -> list[Cloud]:
-    """Longitudinal over lateral acceleration of the training ranges and the test set; empty where either was not measured."""
+    """Longitudinal over lateral acceleration of the training ranges and the test set.
+
+    Empty where either was not measured.
+    """
     part = signals.artefacts
     roles = {"training": part.split.train, "test": part.split.tests[signals.test_set]}
     colours = {"training": REFERENCE_GREY, "test": TEST_COLOUR}
@@ -207,7 +222,8 @@ def histogram_block(signals: DriveSignals, file: str) -> Figure:
     """Figure ``errors_FILE``: distribution of the sideslip error."""
     return Figure(
         f"errors_{file}",
-        "Distribution of the sideslip error; the few errors beyond the axis are counted in its outermost bins.",
+        "Distribution of the sideslip error; the few errors beyond the axis are counted in its "
+        "outermost bins.",
         figures.error_histogram(_errors(signals)),
     )
 
@@ -217,8 +233,9 @@ def error_over_ay_block(signals: DriveSignals, file: str) -> Figure:
     drive = signals.reference
     return Figure(
         f"errors_over_ay_{file}",
-        "RMSE of sideslip over the magnitude of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
-        f"{figures.LEAST_SAMPLES} samples show no error.",
+        "RMSE of sideslip over the magnitude of the measured lateral acceleration, in bins of 1 "
+        "m/s²; bins of fewer than "
+        f"{figures.MIN_SAMPLES_IN_BIN} samples show no error.",
         figures.error_over_ay(drive.ay[drive.is_sideslip_scored], _errors(signals)),
     )
 
@@ -292,7 +309,9 @@ def _gap_of(parts: Sequence[Scored]) -> int:
 
 
 def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[float, float]:
-    """Times between which the mean square of the reference sideslip is largest, within one range."""
+    """Times between which the mean square of the reference sideslip is largest, within one
+    range.
+    """
     best = -math.inf
     first = 0
     length = 1

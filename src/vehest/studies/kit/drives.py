@@ -1,4 +1,6 @@
-"""Noise floor and Cramér-Rao bound of a test set, errors by regime and calibrated bands, as blocks of a report."""
+"""Noise floor and Cramér-Rao bound of a test set, errors by regime and calibrated bands, as blocks
+of a report.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ from vehest.trust.bands import LEVELS
 
 SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
 COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
-SHOWN = "coverage_90"
+DRAWN_COVERAGE = "coverage_90"
 _FIGURES = (
     "coverage_90_p10",
     "coverage_90_p90",
@@ -44,30 +46,32 @@ _FIGURES = (
 
 
 def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
-    """The reference's spread and noise, then the bounds without and with the car by set of inputs, of those that were measured."""
+    """The reference's spread and noise, then the bounds without and with the car by set of inputs,
+    of those that were measured.
+    """
     drives = drives_of(part.split.tests[test_set], part.reference, part.protocol)
     spread = reference_spread(drives)
-    found: list[tuple[str, str, Floor | None]] = [
+    floors: list[tuple[str, str, Floor | None]] = [
         ("zero-sideslip baseline: the reference itself", MISSING, spread),
         ("noise of the reference, at least", MISSING, reference_floor(drives)),
     ]
-    for car, what in ((False, "bound, kinematics alone"), (True, "bound, axles known")):
+    for car, meaning in ((False, "bound, kinematics alone"), (True, "bound, axles known")):
         for inputs in SETS:
             if car or ("ay" in inputs and "steer" not in inputs):
-                found.append(
+                floors.append(
                     (
-                        what,
+                        meaning,
                         ", ".join(SYMBOLS[name] for name in inputs),
                         cramer_rao_floor(drives, inputs, car=car),
                     )
                 )
     rows = []
-    for what, symbols, floor in found:
+    for meaning, symbols, floor in floors:
         if floor is not None:
             share = (floor.vy / spread.vy) ** 2 if spread.vy > 0 else float("nan")
             rows.append(
                 {
-                    "what": what,
+                    "what": meaning,
                     "inputs": symbols,
                     "vy": floor.vy,
                     "sideslip": floor.sideslip,
@@ -76,10 +80,14 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
             )
     return Table(
         name,
-        f"Noise floor and Cramér-Rao bound of test set `{test_set}`, root mean square over the scored samples: the reference, the white noise "
-        f"in it (slow or smoothed errors are not included), and the posterior Cramér-Rao bound of causal estimators by their inputs. "
-        f"Bounds from kinematics alone use no parameters of the car; the others use its axles, with 23 % uncertainty of the tyres' "
-        f"stiffness and model errors as large as on this drive. An error below a bound shows that an estimator uses more information on "
+        f"Noise floor and Cramér-Rao bound of test set `{test_set}`, root mean square over the "
+        "scored samples: the reference, the white noise "
+        "in it (slow or smoothed errors are not included), and the posterior Cramér-Rao bound of "
+        "causal estimators by their inputs. "
+        "Bounds from kinematics alone use no parameters of the car; the others use its axles, "
+        "with 23 % uncertainty of the tyres' "
+        "stiffness and model errors as large as on this drive. An error below a bound shows that "
+        "an estimator uses more information on "
         f"the car than the bound's model.",
         pd.DataFrame(rows),
         {
@@ -97,15 +105,15 @@ def regime_table(
 ) -> Table | None:
     """RMSE(β) of candidates by regime; None where metrics have no regimes."""
     metrics = part.metrics
-    own = metrics[
+    rows_of_test = metrics[
         (metrics["test_set"] == test_set)
         & metrics["subset"].isin(REGIMES)
         & (metrics["condition"] == "nominal")
     ]
-    seen = [regime for regime in REGIMES if regime in set(own["subset"])]
-    if not seen:
+    regimes = [regime for regime in REGIMES if regime in set(rows_of_test["subset"])]
+    if not regimes:
         return None
-    errors = own[own["metric"] == "rmse_sideslip"]
+    errors = rows_of_test[rows_of_test["metric"] == "rmse_sideslip"]
     keys = zip(
         errors["estimator"],
         errors["variant"].fillna(""),
@@ -114,25 +122,28 @@ def regime_table(
         strict=True,
     )
     values = dict(zip(keys, errors["value"], strict=True))
-    shares = own[own["metric"] == "share"].groupby("subset")["value"].first()
+    shares = rows_of_test[rows_of_test["metric"] == "share"].groupby("subset")["value"].first()
     rows = [
         {"title": title}
-        | {regime: values.get((*key, seed, regime), float("nan")) for regime in seen}
+        | {regime: values.get((*key, seed, regime), float("nan")) for regime in regimes}
         for key, (title, seed) in chosen.items()
     ]
     headers = {
         regime: f"{_in_words(regime)} ({fixed(100 * float(shares[regime]), 0)} %)"
-        for regime in seen
+        for regime in regimes
     }
     return Table(
         name,
-        f"RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets the share of samples. Straight: yaw rate "
-        f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
-        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {MIN_REGIME_SECONDS:g} s are left out.",
+        "RMSE(β) [deg] by regime, of each estimator the seed chosen on validation; in brackets "
+        "the share of samples. Straight: yaw rate "
+        f"within ±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than "
+        f"{TRANSIENT['yaw_rate']:g} rad/s² or lateral "
+        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than "
+        f"{MIN_REGIME_SECONDS:g} s are left out.",
         pd.DataFrame(rows),
         {
             "title": Column("estimator"),
-            **{regime: Column(headers[regime], decimals=3) for regime in seen},
+            **{regime: Column(headers[regime], decimals=3) for regime in regimes},
         },
     )
 
@@ -151,42 +162,51 @@ def band_blocks(
     lines: Mapping[Name, Line],
     file: str,
 ) -> list[Block]:
-    """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands."""
+    """Table ``bands_FILE`` and figure ``reliability_FILE``.
+
+    Nothing where no estimator has bands.
+    """
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows = []
     drawn = []
     for name, (title, seed) in chosen.items():
-        own = {
+        figures = {
             metric: values_of(values, name, [seed], test_set, metric)[0]
             for metric in (*COVERAGES, *_FIGURES)
         }
-        if not np.isfinite(own[SHOWN]):
+        if not np.isfinite(figures[DRAWN_COVERAGE]):
             continue
         ends = [
             np.array([values_of(runs, name, [seed], test_set, metric)[0] for metric in COVERAGES])
             for runs in (lows, highs)
         ]
-        low, high = (100 * end[COVERAGES.index(SHOWN)] for end in ends)
+        low, high = (100 * end[COVERAGES.index(DRAWN_COVERAGE)] for end in ends)
         interval = f"{low:.0f} … {high:.0f}" if np.isfinite(low) else MISSING
         percent = {
-            metric: 100 * own[metric] for metric in (SHOWN, "coverage_90_p10", "coverage_90_p90")
+            metric: 100 * figures[metric]
+            for metric in (DRAWN_COVERAGE, "coverage_90_p10", "coverage_90_p90")
         }
-        rows.append({"title": title, **own, **percent, "interval": interval})
+        rows.append({"title": title, **figures, **percent, "interval": interval})
         drawn.append(
-            Reliability(title, lines[name], np.array([own[metric] for metric in COVERAGES]), *ends)
+            Reliability(
+                title, lines[name], np.array([figures[metric] for metric in COVERAGES]), *ends
+            )
         )
     if not rows:
         return []
     table = Table(
         f"bands_{file}",
-        f"Calibrated 90 % bands of β on test set `{test_set}`: coverage, with the 95 % interval over blocks of the drive and the 10 "
-        f"and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full width; interval score and CRPS, which "
-        f"penalise wide bands; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and over how "
+        f"Calibrated 90 % bands of β on test set `{test_set}`: coverage, with the 95 % interval "
+        "over blocks of the drive and the 10 "
+        "and 90 % quantiles over manoeuvres (from turn to turn, or a range each); mean full "
+        "width; interval score and CRPS, which "
+        "penalise wide bands; intraclass correlation of squared errors, 1 where an error lasts "
+        "for a whole manoeuvre; and over how "
         f"many equal manoeuvres the errors are spread.",
         pd.DataFrame(rows),
         {
             "title": Column("estimator"),
-            SHOWN: Column("coverage [%]", decimals=1),
+            DRAWN_COVERAGE: Column("coverage [%]", decimals=1),
             "interval": Column("95 % interval [%]"),
             "coverage_90_p10": Column("of manoeuvres, 10 % [%]", decimals=0),
             "coverage_90_p90": Column("90 % [%]", decimals=0),
@@ -199,7 +219,8 @@ def band_blocks(
     )
     figure = Figure(
         f"reliability_{file}",
-        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, with 95 % intervals over blocks. "
+        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, "
+        "with 95 % intervals over blocks. "
         f"On the diagonal, coverage is as stated; above it, bands are too wide.",
         reliability_figure(LEVELS, drawn),
     )

@@ -1,4 +1,6 @@
-"""All signals of a test set for the page of a report: what was measured, the reference, estimates with bands and health, the course."""
+"""All signals of a test set for the page of a report: what was measured, the reference, estimates
+with bands and health, the course.
+"""
 
 from __future__ import annotations
 
@@ -18,24 +20,32 @@ from vehest.studies.kit.runs import Name
 from vehest.trust.health import health_rows
 from vehest.trust.record import TRUST, read_trust
 
-MOST_INPUTS = 16
+MAX_INPUTS = 16
 DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
-RECKONED = "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and drifts the longer it gets."
+RECKONED = (
+    "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and "
+    "drifts the longer it gets."
+)
 
 
 def explorer_of(
     artefacts: PartArtefacts,
     test_set: str,
-    shown: Mapping[Name, tuple[EvaluatedModel, str, Line]],
+    candidates_drawn: Mapping[Name, tuple[EvaluatedModel, str, Line]],
     scored: Mapping[Name, Sequence[Scored]],
     axis: tuple[float, str, int, tuple[float, float]],
 ) -> str:
     """What the page draws of a test set, as `explorer_json`.
 
-    Args:
-        shown: (estimator, variant) -> model, title and looks, in the order of the board.
-        scored: (estimator, variant) -> estimate and reference of each range, or sequence.
-        axis: first time [s], label of the time axis, samples between two ranges, and a range that deserves a button [s].
+    Parameters
+    ----------
+    candidates_drawn : Mapping[Name, tuple[EvaluatedModel, str, Line]]
+        (estimator, variant) -> model, title and looks, in the order of the board.
+    scored : Mapping[Name, Sequence[Scored]]
+        (estimator, variant) -> estimate and reference of each range, or sequence.
+    axis : tuple[float, str, int, tuple[float, float]]
+        First time [s], label of the time axis, samples between two ranges, and a range that
+        deserves a button [s].
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
@@ -66,14 +76,16 @@ def explorer_of(
     }
     inputs = []
     candidates = []
-    for i, name in enumerate(names[:MOST_INPUTS]):
+    for i, name in enumerate(names[:MAX_INPUTS]):
         columns[f"input{i}"], unit = in_display_unit(name, measured(name))
         inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
-    for i, (own, (model, title, line)) in enumerate(shown.items()):
-        columns[f"vy{i}"] = chained([part.vy for part in scored[own]], gap)
-        bands = [part.bands for part in scored[own]]
+    for i, (candidate, (model, title, line)) in enumerate(candidates_drawn.items()):
+        columns[f"vy{i}"] = chained([part.vy for part in scored[candidate]], gap)
+        bands = [part.bands for part in scored[candidate]]
         band_vy, band_sideslip = (
-            chained([one[q] for one in bands], gap) if all(q in one for one in bands) else None
+            chained([half_widths[q] for half_widths in bands], gap)
+            if all(q in half_widths for half_widths in bands)
+            else None
             for q in _BANDS
         )
         columns |= {
@@ -116,7 +128,8 @@ def health_over(
     artefacts: PartArtefacts,
     gap: int,
 ) -> FloatArray | None:
-    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2 invalid, over all ranges.
+    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2
+    invalid, over all ranges.
 
     None where the model has no health, or reads another rate than that of the evaluation.
     """
@@ -127,16 +140,16 @@ def health_over(
         return None
     if not all(name in recording for recording, _ in pieces for name in health.channels):
         return None
-    found = []
+    statuses = []
     for recording, piece in pieces:
         first, end = scored_range(recording, piece, artefacts.protocol)
         begin = recording.index_range(
             max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop
         )[0]
         rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
-        found.append(
+        statuses.append(
             health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[
                 first - begin :
             ]
         )
-    return chained(found, gap)
+    return chained(statuses, gap)

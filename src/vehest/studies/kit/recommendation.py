@@ -1,4 +1,6 @@
-"""Which estimator of a comparison is recommended: one rule for the page, the Markdown report and the terminal."""
+"""Which estimator of a comparison is recommended: one rule for the page, the Markdown report and
+the terminal.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from vehest.data.splits import VALIDATION
 from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking
-from vehest.report.document import as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.runs import by_name, chosen_seed, runs_of, values_of
+from vehest.studies.kit.runs import by_name, chosen_seed, runs_of, titles_of, value_of_run
 from vehest.studies.kit.standing import BASELINE_TITLES, best_sentence, figure_of, ranking_of
 from vehest.studies.kit.warnings import cannot_rank
 
@@ -61,18 +63,29 @@ class Recommendation:
             missing = [BASELINE_TITLES[baseline] for baseline in ranking.missing_baselines]
             if missing:
                 return f"**No estimator is recommended**: none was compared with {listed(missing)}."
-            return f"**No estimator is recommended**: none of these is significantly better than {baselines}."
+            return (
+                "**No estimator is recommended**: none of these is significantly better than "
+                f"{baselines}."
+            )
         title = self.titles[self.model.name]
-        expected = f"RMSE(β) {figure_of(ranking, self.model.name)}{f' for {condition}' if condition else ''}"
+        expected = (
+            "RMSE(β) "
+            f"{figure_of(ranking, self.model.name)}{f' for {condition}' if condition else ''}"
+        )
         if ranking.winner is not None:
             return (
-                f"**Recommended: {title}**, expected {expected}: it is significantly better than every "
+                f"**Recommended: {title}**, expected {expected}: it is significantly better than "
+                "every "
                 f"other estimator, {baselines}."
             )
         if len(ranking.recommendable) == 1:
-            return f"**Recommended: {title}**, expected {expected}: of these it alone is significantly better than {baselines}."
+            return (
+                f"**Recommended: {title}**, expected {expected}: of these it alone is "
+                f"significantly better than {baselines}."
+            )
         return (
-            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} estimators among these that are "
+            f"**Recommended: {title}**, expected {expected}: of the {len(ranking.recommendable)} "
+            "estimators among these that are "
             f"significantly better than {baselines}, it has the lowest RMSE(v) on validation."
         )
 
@@ -80,9 +93,10 @@ class Recommendation:
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
     """What to recommend after a test set.
 
-    Recommended is the estimator that is significantly better than all others (`Ranking.winner`); without one, of those in
-    `Ranking.recommendable`, the one with the lowest RMSE(v) on validation. None is recommended where none is significantly
-    better than the zero-sideslip baseline and the static map, or where the test cannot rank estimators.
+    Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
+    without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.
+    None is recommended where none is significantly better than the zero-sideslip baseline and the
+    static map, or where the test cannot rank estimators.
 
     Raises
     ------
@@ -90,7 +104,7 @@ def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
         Metrics are missing or ambiguous.
     """
     ranking = ranking_of(part, test_set)
-    titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
+    titles = titles_of(part.models)
     obstacles = _obstacles(part, test_set, ranking) if ranking.order else []
     names = [] if obstacles else ranking.recommendable
     if ranking.winner is not None:
@@ -105,8 +119,11 @@ def plain_text(markdown: str) -> str:
 
 
 def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str]:
-    few = f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at least {MIN_BLOCKS} are needed"
-    return [*([few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
+    too_few = (
+        f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at "
+        f"least {MIN_BLOCKS} are needed"
+    )
+    return [*([too_few] if ranking.n_blocks < MIN_BLOCKS else []), *cannot_rank(part, test_set)]
 
 
 def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> EvaluatedModel:
@@ -115,7 +132,7 @@ def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> Evaluat
     errors = list[tuple[float, EvaluatedModel]]()
     for name in names:
         seed = chosen_seed(sorted(model.seed for model in groups[name]), name, runs)
-        error = values_of(runs, name, [seed], "validation", "rmse_vy")[0]
+        error = value_of_run(runs, name, seed, VALIDATION, "rmse_vy")
         model = next(model for model in groups[name] if model.seed == seed)
         errors.append((error if math.isfinite(error) else math.inf, model))
     return min(errors, key=lambda pair: pair[0])[1]

@@ -10,7 +10,8 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.report.document import as_text
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, nominal_rows
 
 Name = tuple[str, str]  # estimator and variant
 
@@ -20,9 +21,12 @@ Runs = dict[
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
-    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by run and test set; raises `DataError`."""
-    metrics = artefacts.metrics
-    nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
+    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by
+    run and test set.
+
+    Raises `DataError`.
+    """
+    nominal = nominal_rows(artefacts.metrics)
     columns = (
         nominal[name].tolist()
         for name in ("estimator", "variant", "seed", "test_set", "metric", column)
@@ -35,7 +39,8 @@ def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
             math.isnan(number) or math.isnan(run.get(metric, math.nan)) or run[metric] == number
         ):
             raise DataError(
-                f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on '{test_set}' is both {run[metric]:g} and "
+                f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on "
+                f"'{test_set}' is both {run[metric]:g} and "
                 f"{number:g}; give models that differ in more than the seed different variants"
             )
         if not math.isnan(number):
@@ -47,25 +52,40 @@ def values_of(
     runs: Runs, name: Name, seeds: Sequence[int], test_set: str, metric: str
 ) -> FloatArray:
     """Values of a metric, one a seed; NaN where there is none."""
-    return np.array([runs.get((*name, seed, test_set), {}).get(metric, math.nan) for seed in seeds])
+    return np.array([value_of_run(runs, name, seed, test_set, metric) for seed in seeds])
+
+
+def value_of_run(runs: Runs, name: Name, seed: int, test_set: str, metric: str) -> float:
+    """Value of a metric of one seed; NaN where there is none."""
+    return runs.get((*name, seed, test_set), {}).get(metric, math.nan)
 
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
     """A metric of the model itself, under whatever test set it was noted."""
-    known = (
+    values = (
         run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run
     )
-    return next(known, math.nan)
+    return next(values, math.nan)
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing; raises `DataError`."""
+    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data
+    choose nothing.
+
+    Raises `DataError`.
+    """
     if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
         raise DataError(
-            f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"
+            f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to "
+            "choose one by; evaluate it there"
         )
     validation = values_of(runs, name, seeds, VALIDATION, "rmse_vy")
     return seeds[int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))]
+
+
+def titles_of(models: Iterable[EvaluatedModel]) -> dict[Name, str]:
+    """Estimator and variant -> title, as Markdown."""
+    return {name: as_text(seeds[0].title) for name, seeds in by_name(models).items()}
 
 
 def by_name(models: Iterable[EvaluatedModel]) -> dict[Name, list[EvaluatedModel]]:

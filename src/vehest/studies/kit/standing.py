@@ -1,9 +1,11 @@
-"""Where the candidates of a comparison stand to each other and to the baselines: columns of a table, and sentences."""
+"""Where the candidates of a comparison stand to each other and to the baselines: columns of a
+table, and sentences.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from vehest.evaluation.blocks import MIN_BLOCKS
@@ -17,24 +19,26 @@ NOT_SIGNIFICANT = "not significant"  # a difference, as cells of tables state it
 BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the static map"}
 
 
-def ranking_of(
-    artefacts: PartArtefacts, test_set: str, asked: Sequence[tuple[Name, Name]] = ()
-) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without infinite errors; raises `DataError`."""
+def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without
+    infinite errors.
+
+    Raises `DataError`.
+    """
     segments = {
-        name: [model.segments(test_set) for model in own]
-        for name, own in by_name(artefacts.models).items()
+        name: [model.segments(test_set) for model in models]
+        for name, models in by_name(artefacts.models).items()
     }
     finite = {
-        name: own
-        for name, own in segments.items()
-        if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)
+        name: models for name, models in segments.items() if all(part.is_finite for part in models)
     }
-    return rank(finite, artefacts.protocol.rate_hz, claimed_pairs=asked)
+    return rank(finite, artefacts.protocol.rate_hz)
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
-    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and ``against_best`` in words."""
+    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and
+    ``against_best`` in words.
+    """
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
     columns: dict[str, str | float] = {"rmse_sideslip_low": low, "rmse_sideslip_high": high}
     for baseline in BASELINES:
@@ -63,10 +67,10 @@ def _against_best(ranking: Ranking, name: Name) -> str:
         return MISSING
     if name == ranking.order[0]:
         return BEST
-    own = ranking.pairs.get((ranking.order[0], name))
-    if own is None or own.verdict == "not told apart":
-        return MISSING if own is None else NOT_SIGNIFICANT
-    return f"+{fixed(-own.difference, 3)} [{fixed(-own.high, 3)}, {fixed(-own.low, 3)}]"
+    pair = ranking.pairs.get((ranking.order[0], name))
+    if pair is None or pair.verdict == "not told apart":
+        return MISSING if pair is None else NOT_SIGNIFICANT
+    return f"+{fixed(-pair.difference, 3)} [{fixed(-pair.high, 3)}, {fixed(-pair.low, 3)}]"
 
 
 def figure_of(ranking: Ranking, name: Name) -> str:
@@ -80,7 +84,9 @@ def figure_of(ranking: Ranking, name: Name) -> str:
 
 
 def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in Markdown."""
+    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in
+    Markdown.
+    """
     best = ranking.order[0]
     words = f"**Best: {titles[best]}, {figure_of(ranking, best)}.**"
     if ranking.n_blocks < MIN_BLOCKS:
@@ -92,17 +98,22 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
         )
     if len(equal) == 1:
         return f"{words} {equal[0]} is not significantly worse."
-    others = equal[1] if len(equal) == 2 else f"{len(equal) - 1} others"
-    return f"{words} {equal[0]} and {others} are not significantly worse."
+    remaining = equal[1] if len(equal) == 2 else f"{len(equal) - 1} others"
+    return f"{words} {equal[0]} and {remaining} are not significantly worse."
 
 
-def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) -> str:
-    """The best estimator, those that are not significantly worse, and whether it beats the baselines."""
+def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: str) -> str:
+    """The best estimator, those that are not significantly worse, and whether it beats the
+    baselines.
+    """
     if not ranking.order:
-        return f"No estimator has a finite sideslip error on {where}."
+        return f"No estimator has a finite sideslip error on {test_text}."
     if ranking.n_blocks < MIN_BLOCKS:
-        return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, where)}"
-    return f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} {basis_sentence(ranking, where)}"
+        return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, test_text)}"
+    return (
+        f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} "
+        f"{basis_sentence(ranking, test_text)}"
+    )
 
 
 def _baselines_sentence(ranking: Ranking) -> str:
@@ -111,9 +122,9 @@ def _baselines_sentence(ranking: Ranking) -> str:
     if best[0] in BASELINES:
         return " It is a baseline."
     missing = [BASELINE_TITLES[name] for name in ranking.missing_baselines]
-    others = [name for name in BASELINES if name not in ranking.missing_baselines]
-    beaten = [BASELINE_TITLES[name] for name in others if ranking.beats(best, name)]
-    level = [BASELINE_TITLES[name] for name in others if not ranking.beats(best, name)]
+    compared = [name for name in BASELINES if name not in ranking.missing_baselines]
+    beaten = [BASELINE_TITLES[name] for name in compared if ranking.beats(best, name)]
+    level = [BASELINE_TITLES[name] for name in compared if not ranking.beats(best, name)]
     sentences = [
         f" It is significantly better than {listed(beaten)}." if beaten else "",
         f" It is not significantly better than {listed(level)}." if level else "",
@@ -122,12 +133,14 @@ def _baselines_sentence(ranking: Ranking) -> str:
     return "".join(sentences)
 
 
-def basis_sentence(ranking: Ranking, where: str) -> str:
+def basis_sentence(ranking: Ranking, test_text: str) -> str:
     """What the figures are and how they were compared."""
-    figures = f"RMSE(β) over all seeds with its 95 % interval, on {where}"
+    figures = f"RMSE(β) over all seeds with its 95 % interval, on {test_text}"
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."
     return (
-        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of {ranking.block_seconds:.3g} s and over seeds, "
-        f"corrected by Holm. Effective number of blocks, by the squared error of the best: {ranking.effective_blocks:.0f}."
+        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
+        f"{ranking.block_seconds:.3g} s and over seeds, "
+        "corrected by Holm. Effective number of blocks, by the squared error of the best: "
+        f"{ranking.effective_blocks:.0f}."
     )

@@ -1,4 +1,6 @@
-"""What trainings and online steps took, for the page alone: a time is never the same twice, and so no published file holds one."""
+"""What trainings and online steps took, for the page alone: a time is never the same twice, and so
+no published file holds one.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,25 @@ from vehest.report.document import Column, Table
 
 NAME = ("estimator", "variant")
 CAPTION = (
-    "Medians over seeds, wall time on the machine that `provenance.json` names, where others may have worked at the same time; an online "
-    "step is one sample through `step()`. Every figure is in `timings.csv` beside this page, in seconds."
+    "Medians over seeds, wall time on the machine that `provenance.json` names, where others may "
+    "have worked at the same time; an online "
+    "step is one sample through `step()`. Every figure is in `timings.csv` beside this page, in "
+    "seconds."
 )
 
 
 def timings_of_study(
     parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]],
 ) -> list[str | Table]:
-    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title); nothing where it is not known."""
+    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title).
+
+    Nothing where it is not known.
+    """
     rows = [row for part in parts for row in _rows(*part)]
     if not rows:
         return []
     frame = pd.DataFrame(rows)
-    known = {
+    columns_by_name = {
         "part": Column("part"),
         "title": Column("estimator"),
         "fits": Column("fits", decimals=0),
@@ -31,8 +38,8 @@ def timings_of_study(
         "all_seconds": Column("of all seeds [s]", decimals=0),
         "step_seconds": Column("online step [ms]", digits=2),
     }
-    phases = [str(name) for name in frame if name not in known]
-    columns = {name: column for name, column in known.items() if name in frame}
+    phases = [str(name) for name in frame if name not in columns_by_name]
+    columns = {name: column for name, column in columns_by_name.items() if name in frame}
     columns |= {
         name: Column(
             f"of a training: {name.removesuffix('_seconds').replace('_', ' ')} [s]", digits=2
@@ -52,16 +59,20 @@ def _rows(
     )  # a time of the fit is noted under every test set
     rows = []
     for name, title in titles.items():
-        own = seeds[(seeds["estimator"] == name[0]) & (seeds["variant"].fillna("") == name[1])]
-        if own.empty:
+        times = seeds[(seeds["estimator"] == name[0]) & (seeds["variant"].fillna("") == name[1])]
+        if times.empty:
             continue
         medians = {
             str(metric): float(value)
-            for metric, value in own.groupby("metric")["value"].median().items()
+            for metric, value in times.groupby("metric")["value"].median().items()
         }
-        row: dict[str, object] = {"part": part, "title": title, "fits": own["seed"].nunique()}
-        row |= {"train_seconds": medians.pop("train_seconds", float("nan"))}
-        row |= {"all_seconds": float(own.loc[own["metric"] == "train_seconds", "value"].sum())}
-        row |= {"step_seconds": 1e3 * medians.pop("step_seconds", float("nan"))}
+        row: dict[str, object] = {
+            "part": part,
+            "title": title,
+            "fits": times["seed"].nunique(),
+            "train_seconds": medians.pop("train_seconds", float("nan")),
+            "all_seconds": float(times.loc[times["metric"] == "train_seconds", "value"].sum()),
+            "step_seconds": 1e3 * medians.pop("step_seconds", float("nan")),
+        }
         rows.append(row | medians)
     return rows

@@ -1,4 +1,6 @@
-"""Warnings of a comparison: tests without sideslip, trainings that ended early, test ranges of another kind."""
+"""Warnings of a comparison: tests without sideslip, trainings that ended early, test ranges of
+another kind.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +17,31 @@ from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
-LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly distinguishes estimators
-CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
-SILENT = 0.7  # bound over the reference itself, above which a drive adds no information on v
-DIFFERENT = (
+# deg, root mean square of the reference, below which a test hardly distinguishes estimators
+MIN_SIDESLIP_DEG = 0.5
+MIN_ERROR_OVER_NOISE = (
+    2.0  # lowest error over the noise of the reference, below which the reference may decide
+)
+MAX_BOUND_OVER_SIGNAL = (
+    0.7  # bound over the reference itself, above which a drive adds no information on v
+)
+MIN_RATIO_OF_PERCENTILES = (
     1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 )
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
-    """Sentences, each about one test set or one estimator, those first that are left out; none where there is nothing to warn of."""
+    """Sentences, each about one test set or one estimator, those first that are left out.
+
+    None where there is nothing to warn of.
+    """
     left_out = [
         f"{as_code(name)} is left out: {as_text(reason)}"
         for name, reason in artefacts.failed.items()
     ]
     return [
         *left_out,
-        *_standing(artefacts),
+        *_slow_tests(artefacts),
         *_excitation(artefacts),
         *_floors(artefacts),
         *_kinds(artefacts),
@@ -40,87 +50,100 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
     ]
 
 
-def _standing(artefacts: PartArtefacts) -> list[str]:
+def _slow_tests(artefacts: PartArtefacts) -> list[str]:
     """Tests in which the car is too slow throughout for sideslip to be scored."""
     runs = runs_of(artefacts)
-    found = []
+    sentences = []
     for test_set, spans in artefacts.split.tests.items():
         if _lowest(runs, test_set, "share_below_min_speed") == 1.0:
             speed = artefacts.protocol.describe_min_sideslip_speed(span.dataset for span in spans)
-            found.append(
-                f"Test set `{test_set}`: sideslip is not scored, since the car is slower than {speed} throughout; RMSE(v) counts all samples."
+            sentences.append(
+                f"Test set `{test_set}`: sideslip is not scored, since the car is slower than "
+                f"{speed} throughout; RMSE(v) counts all samples."
             )
-    return found
+    return sentences
 
 
 def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
-    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs with little information on it; none if it can.
+    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs with little
+    information on it; none if it can.
 
     An error below the bound shows that an estimator uses information that the bound does not.
     """
     level = _level(artefacts, artefacts.split.tests[test_set])
-    found = []
-    if level < LITTLE_SIDESLIP:
-        found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
+    clauses = []
+    if level < MIN_SIDESLIP_DEG:
+        clauses.append(f"they hardly excite sideslip ({level:.2g}° rms)")
     bound, error = (
         _lowest(runs_of(artefacts), test_set, name)
         for name in ("floor_cramer_rao", "rmse_sideslip")
     )
-    if min(bound, error) > SILENT * level:
-        found.append(
-            f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the zero-sideslip baseline {level:.2g}°"
+    if min(bound, error) > MAX_BOUND_OVER_SIGNAL * level:
+        clauses.append(
+            f"the Cramér-Rao bound of the measured channels is {bound:.2g}° and the error of the "
+            f"zero-sideslip baseline {level:.2g}°"
         )
-    return found
+    return clauses
 
 
 def _lowest(runs: Runs, test_set: str, metric: str) -> float:
     """Lowest value of a metric on a test set; NaN where no run has it."""
-    own = [metrics for (*_, name), metrics in runs.items() if name == test_set]
-    return min((metrics[metric] for metrics in own if metric in metrics), default=math.nan)
+    metrics_of_test = [metrics for (*_, name), metrics in runs.items() if name == test_set]
+    return min(
+        (metrics[metric] for metrics in metrics_of_test if metric in metrics), default=math.nan
+    )
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
-    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its tail [deg]."""
+    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its
+    tail [deg].
+    """
     size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
     return float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
-    found = []
+    sentences = []
     for test_set, spans in artefacts.split.tests.items():
         sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
         level = float(np.sqrt(np.mean(np.square(sideslip))))
-        if level < LITTLE_SIDESLIP:
-            found.append(
-                f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the time below "
-                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide the order."
+        if level < MIN_SIDESLIP_DEG:
+            sentences.append(
+                f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the "
+                "time below "
+                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide "
+                "the order."
             )
-    return found
+    return sentences
 
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
-    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain little information on v."""
+    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain
+    little information on v.
+    """
     runs = runs_of(artefacts)
-    found = list[str]()
+    sentences = list[str]()
     for test_set, spans in artefacts.split.tests.items():
         error, noise, bound = (
             _lowest(runs, test_set, name)
             for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
         )
-        if error < CLOSE * noise:
-            found.append(
-                f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
+        if error < MIN_ERROR_OVER_NOISE * noise:
+            sentences.append(
+                f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of "
+                f"the reference, at least {noise:.2g}°; "
                 f"errors of the reference may decide the order."
             )
         if math.isnan(bound):
             continue
         level = _level(artefacts, spans)
-        if min(bound, error) > SILENT * level:
-            found.append(
-                f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their inputs is {bound:.2g}°, and the error of "
+        if min(bound, error) > MAX_BOUND_OVER_SIGNAL * level:
+            sentences.append(
+                f"Test set `{test_set}` cannot rank estimators: the Cramér-Rao bound of their "
+                f"inputs is {bound:.2g}°, and the error of "
                 f"the zero-sideslip baseline {level:.2g}°."
             )
-    return found
+    return sentences
 
 
 def _kinds(artefacts: PartArtefacts) -> list[str]:
@@ -128,39 +151,47 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
     if not artefacts.split.train:
         return []
     learnt = _reference(artefacts, artefacts.split.train)
-    found = []
+    sentences = []
     words = {"ay": "lateral acceleration", "sideslip": "sideslip", "vx": "speed"}
     for test_set, spans in artefacts.split.tests.items():
         tested = _reference(artefacts, spans)
-        beyond = []
+        exceeded = []
         short = []
         for name, word in words.items():
             if not (name in tested and name in learnt):
                 continue
-            own, other = (float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt))
-            if other > 0 and own > DIFFERENT * other:
-                beyond.append(f"{word} ({own / other:.2g} times at the 99th percentile)")
-            elif own > 0 and other > DIFFERENT * own:
-                short.append(f"{word} ({own / other:.2g} times)")
-        if beyond:
-            found.append(
-                f"Test set `{test_set}` goes beyond the training ranges in {listed(beyond)}: estimators extrapolate there."
+            tested_level, trained_level = (
+                float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt)
+            )
+            if trained_level > 0 and tested_level > MIN_RATIO_OF_PERCENTILES * trained_level:
+                exceeded.append(
+                    f"{word} ({tested_level / trained_level:.2g} times at the 99th percentile)"
+                )
+            elif tested_level > 0 and trained_level > MIN_RATIO_OF_PERCENTILES * tested_level:
+                short.append(f"{word} ({tested_level / trained_level:.2g} times)")
+        if exceeded:
+            sentences.append(
+                f"Test set `{test_set}` goes beyond the training ranges in {listed(exceeded)}: "
+                "estimators extrapolate there."
             )
         if short:
-            found.append(
-                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than the training."
+            sentences.append(
+                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: "
+                "it is easier than the training."
             )
-        kinds = [artefacts.kinds_of(own) for own in (spans, artefacts.split.train)]
+        kinds = [
+            artefacts.kinds_of(tested_level) for tested_level in (spans, artefacts.split.train)
+        ]
         if kinds[0] != kinds[1]:
-            found.append(
+            sentences.append(
                 f"Test set `{test_set}` is {kinds[0]}, the training ranges are {kinds[1]}."
             )
-    return found
+    return sentences
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
     runs = runs_of(artefacts)
-    found = list[str]()
+    estimators = list[str]()
     for name, models in by_name(artefacts.models).items():
         ended = 0
         for model in models:
@@ -168,12 +199,16 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             limit = model.training.get("max_epochs")
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
-            found.append(
-                f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)"
+            estimators.append(
+                f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} "
+                f"of {len(models)} seeds)"
             )
     return (
-        [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."]
-        if found
+        [
+            "Training ended at its limit, and longer training may lower the error: "
+            f"{listed(estimators)}."
+        ]
+        if estimators
         else []
     )
 
@@ -193,22 +228,24 @@ def _divergence(artefacts: PartArtefacts) -> list[str]:
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
-    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where sideslip is scored and measured."""
+    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where
+    sideslip is scored and measured.
+    """
     parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
             continue
         recording = artefacts.reference(span)
-        own = recording.cut(max(span.start, -math.inf), span.stop)
-        if "ay" not in own:
+        segment = recording.cut(max(span.start, -math.inf), span.stop)
+        if "ay" not in segment:
             parts.pop("ay", None)
         min_speed = artefacts.protocol.min_sideslip_speed_on(span.dataset)
-        known = is_fast_enough(own["vx"], own["vy_ref"], min_speed)
-        known &= np.isfinite(own["ay"]) if "ay" in parts else True
+        is_scored = is_fast_enough(segment["vx"], segment["vy_ref"], min_speed)
+        is_scored &= np.isfinite(segment["ay"]) if "ay" in parts else True
         if "ay" in parts:
-            parts["ay"].append(own["ay"][known])
-        parts["vx"].append(own["vx"][known])
-        parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
+            parts["ay"].append(segment["ay"][is_scored])
+        parts["vx"].append(segment["vx"][is_scored])
+        parts["sideslip"].append(np.arctan2(segment["vy_ref"], segment["vx"])[is_scored])
     return {
         name: np.concatenate([*values, np.zeros(0 if any(map(len, values)) else 1)])
         for name, values in parts.items()

@@ -1,0 +1,70 @@
+"""Equations 61 to 64 on the real wheel speeds of the AV-21."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.derived import SpeedFromWheels
+from vehest.data.recording import Recording
+from vehest.studies.artefacts import PartArtefacts
+from vehest_papers.kit.reading import recordings_of
+
+WHEELS = ("fl", "fr", "rl", "rr")
+RADIUS = 0.2972  # m, of the AV-21, as in conf/dataset/av21.yaml
+BLOCK_SECONDS = 10.0
+SLOWEST = 5.0  # m/s
+LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns as one
+
+
+def tracks_of(drive: Recording) -> tuple[float, float]:
+    """Front and rear track by least squares of the wheels' difference on the yaw rate [m]."""
+    moving = drive["vx_ref"] > SLOWEST
+    turn = drive["yaw_rate"][moving]
+    found = []
+    for left, right in (("fl", "fr"), ("rl", "rr")):
+        scale = np.cos(drive["steer"][moving]) if left == "fl" else 1.0
+        difference = (
+            RADIUS * scale * (drive[f"wheel_speed_{right}"] - drive[f"wheel_speed_{left}"])[moving]
+        )
+        found.append(float(difference @ turn / (turn @ turn)))
+    return found[0], found[1]
+
+
+def trained_tracks(part: PartArtefacts) -> FloatArray:
+    """Front and rear track by least squares on the training range, (2,) [m]."""
+    drives = recordings_of(part, part.split.train)
+    return np.asarray(np.mean([tracks_of(drive) for drive in drives], axis=0), dtype=np.float64)
+
+
+def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...]]]:
+    """Test set -> name of a drive -> `block_sums` of it; an axle whose wheels turn as one is left as it is."""
+    tracks = trained_tracks(part)
+    turning = np.where(tracks > LOCKED, tracks, 0.0)
+    wheels = SpeedFromWheels(
+        wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1])
+    )
+    return {
+        test: {
+            f"{drive.id} {drive.start_time:.2f} s": block_sums(drive, wheels)
+            for drive in recordings_of(part, spans)
+            if (drive["vx_ref"] > SLOWEST).any()
+        }
+        for test, spans in part.split.tests.items()
+    }
+
+
+def block_sums(
+    drive: Recording, wheels: SpeedFromWheels
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sums over blocks of 10 s: variance of the wheels as measured and as corrected, and samples."""
+    is_moving = (drive["vx_ref"] > SLOWEST).astype(np.float64)
+    measured = wheels.wheel_radius * drive.stack([f"wheel_speed_{wheel}" for wheel in WHEELS]).T
+    starts = np.arange(0, len(drive), round(BLOCK_SECONDS * drive.rate_hz))
+    variances = [
+        np.add.reduceat(speeds.var(0) * is_moving, starts)
+        for speeds in (measured, wheels.corrected(drive))
+    ]
+    sizes = np.add.reduceat(is_moving, starts)
+    has_samples = sizes > 0
+    return variances[0][has_samples], variances[1][has_samples], sizes[has_samples]
