@@ -24,13 +24,26 @@ SWEEPS = [
     [
         "estimator=ksnn",
         "estimator.n_local=2",
-        "estimator.n_hidden=0,1",
+        "estimator.n_hidden=0,2",
         "estimator.bias=false,true",
         "seed=0",
     ],
 ]
+LONGER_WINDOW = [
+    [
+        "estimator=ksnn",
+        "estimator.n_local=2",
+        "estimator.n_hidden=2",
+        "estimator.bias=false",
+        "estimator.window=60",
+        "seed=0",
+    ]
+]
 PIPELINES = Path(__file__).parents[2] / "pipelines"
-MAIN = ("scheme_1", "scheme_2", "one_vehicle")
+SHORT_SWEEPS = {
+    **dict.fromkeys(("scheme_1", "scheme_2", "one_vehicle"), SWEEPS),
+    **dict.fromkeys(("window_60_1", "window_60_2"), LONGER_WINDOW),
+}
 SECONDS = 40.0
 
 
@@ -48,7 +61,9 @@ def study(elsewhere, monkeypatch):
             write_csv(folder / f"{name}.csv", drive)
         write_vehicle_parameters(folder / dataset["vehicle_parameters"])
     content = yaml.safe_load((PIPELINES / "ksnn_revs.yaml").read_text(encoding="utf-8"))
-    parts = {name: {**content["parts"][name], "sweeps": SWEEPS} for name in MAIN}
+    parts = {
+        name: {**content["parts"][name], "sweeps": sweeps} for name, sweeps in SHORT_SWEEPS.items()
+    }
     pipeline = {**content, "study": "revs_short", "publish": False, "parts": parts}
     (elsewhere / "pipelines").mkdir(exist_ok=True)
     (elsewhere / "pipelines" / "revs_short.yaml").write_text(yaml.safe_dump(pipeline))
