@@ -20,7 +20,7 @@ def test_losses_of_every_epoch_phase_and_seed_are_listed_and_searches_are_not(tm
     of_phases = {
         "epoch": [1, 2, 3],
         "train_loss": [3.0, 2.0, -1.0],
-        "validation_loss": [4.0, 3.0, 0.5],
+        "validation_loss": [4.0, None, 0.5],
         "phase": [0, 0, 1],
     }
     single = {"epoch": [1], "train_loss": [1.0], "validation_loss": [2.0]}
@@ -34,13 +34,15 @@ def test_losses_of_every_epoch_phase_and_seed_are_listed_and_searches_are_not(tm
     )
     assert losses.groupby("candidate").size().to_dict() == {"two phases": 6, "one phase": 1}
     first = losses[(losses["candidate"] == "two phases") & (losses["seed"] == 0)]
-    assert first["validation_loss"].tolist() == [4.0, 3.0, 0.5]
+    assert first["validation_loss"].dropna().tolist() == [4.0, 0.5]
     assert first["phase"].tolist() == [0, 0, 1]
     assert losses[losses["candidate"] == "one phase"]["phase"].tolist() == [0]
     figure = loss_figure(losses, "c").static
     titled = [axes for axes in figure.axes if axes.get_title()]
     assert [axes.get_title() for axes in titled] == ["two phases", "one phase"]
-    assert [len(line.get_xdata()) for line in titled[0].lines] == [1, 1], "the last phase"
+    train, validation = titled[0].lines
+    assert train.get_xydata().tolist() == [[1.0, 1.0], [2.0, 0.0]], "the longest phase"
+    assert validation.get_xdata().tolist() == [1], "epochs with a validation alone"
 
 
 def test_a_study_without_epochs_has_an_empty_table(tmp_path):

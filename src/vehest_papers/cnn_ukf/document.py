@@ -368,7 +368,7 @@ def _files(outcome: Outcome, subjects: Subjects) -> None:
     losses = loss_curves(models)
     outcome.data[LOSS_CURVES] = losses
     if len(losses):
-        caption = f"Losses of training and validation, the last phase of each candidate's first seed, scaled. Data: {kind}."
+        caption = f"Losses of training and validation, the longest phase of each candidate's first seed, scaled. Data: {kind}."
         outcome.blocks.append(loss_figure(losses, caption))
     outcome.add_files(
         tables.filters([own for name, own in titled.items() if name in (FULL, "free")], kind),

@@ -45,7 +45,8 @@ def loss_curves(models: Mapping[str, Sequence[EvaluatedModel]]) -> pd.DataFrame:
 
 
 def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
-    """Losses of each candidate's first seed over the epochs of its last phase, a panel a candidate.
+    """Losses of each candidate's first seed over the epochs of its longest phase, the last of equally long
+    ones, a panel a candidate.
 
     Every curve is scaled to its own range, since losses have different units and may be negative.
     """
@@ -58,13 +59,15 @@ def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
         for axes, candidate in zip(panels.flat, candidates, strict=False):
             own = losses[losses["candidate"] == candidate]
             own = own[own["seed"] == own["seed"].iloc[0]]
-            own = own[own["phase"] == own["phase"].iloc[-1]]
+            n_epochs = own.groupby("phase")["epoch"].transform("size")
+            own = own[own["phase"] == own.loc[n_epochs == n_epochs.max(), "phase"].iloc[-1]]
             for name, colour in LOSSES.items():
                 label = name.removesuffix("_loss")
-                epochs = np.arange(1, len(own) + 1)
-                axes.plot(
-                    epochs, _scaled(own[name].to_numpy(np.float64)), color=colour, label=label
-                )
+                losses_of_epochs = own[name].to_numpy(np.float64)
+                validated = np.isfinite(losses_of_epochs)  # not after every epoch
+                epochs = 1 + np.flatnonzero(validated)
+                scaled = _scaled(losses_of_epochs[validated])
+                axes.plot(epochs, scaled, color=colour, label=label)
             axes.set_title(candidate, fontsize=6.0)
             axes.set_yticks([0.0, 1.0])
         panels[0, 0].legend(loc="upper right")
@@ -73,8 +76,7 @@ def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
 
 
 def _scaled(values: FloatArray) -> FloatArray:
-    """Values mapped to 0 … 1 by their extremes; NaN stays."""
-    finite = values[np.isfinite(values)]
-    if not len(finite) or np.ptp(finite) == 0.0:
+    """Values mapped to 0 … 1 by their extremes."""
+    if not len(values) or np.ptp(values) == 0.0:
         return np.zeros_like(values)
-    return np.asarray((values - finite.min()) / np.ptp(finite))
+    return np.asarray((values - values.min()) / np.ptp(values))

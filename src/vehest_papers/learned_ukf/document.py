@@ -221,9 +221,7 @@ def _outcome(
     losses = loss_curves(groups)
     data[LOSS_CURVES] = losses
     if len(losses):
-        caption = (
-            f"Losses of the last phase of each method's first seed, scaled. Data: {kind.upper()}."
-        )
+        caption = f"Losses of the longest phase of each method's first seed, scaled. Data: {kind.upper()}."
         own.appendix += ["## Appendix: loss curves", loss_figure(losses, caption)]
     own.appendix += appendix_of_part(name, part, runs, where, data)
     return own
