@@ -374,3 +374,17 @@ def test_cars_differ_by_wheelbase_and_mass_beyond_what_sources_and_load_explain(
     car, other, difference
 ):
     assert car.difference_to(other) == difference
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"cg_to_rear_axle": 2.6}, "cg_to_rear_axle must be below the wheelbase (2.6 m), not 2.6"),
+        ({"imu_to_rear_axle": -2.7}, r"imu_to_rear_axle .* (-2.6 to 5.2 m), not at -2.7"),
+        ({"imu_to_rear_axle": 5.3}, r"imu_to_rear_axle .* (-2.6 to 5.2 m), not at 5.3"),
+    ],
+)
+def test_places_that_no_car_of_this_wheelbase_has_are_refused(values, said):
+    with pytest.raises(ValueError, match=said.replace("(", r"\(").replace(")", r"\)")):
+        CarValues(wheelbase=2.6, **values)
+    CarValues(**values)

@@ -46,11 +46,21 @@ class CarValues:
     ) = None
 
     def __post_init__(self) -> None:
-        """Raises `ValueError`: a centre of gravity outside of the wheelbase."""
+        """Raises `ValueError`: a centre of gravity outside of the wheelbase, or an inertial unit
+        farther than one wheelbase behind the rear axle or two ahead of it.
+        """
+        if self.wheelbase is None:
+            return
         rear = self.cg_to_rear_axle
-        if rear is not None and self.wheelbase is not None and rear >= self.wheelbase:
+        if rear is not None and rear >= self.wheelbase:
             raise ValueError(
                 f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {rear:g}"
+            )
+        imu = self.imu_to_rear_axle
+        if imu is not None and not -self.wheelbase <= imu <= 2.0 * self.wheelbase:
+            raise ValueError(
+                "imu_to_rear_axle must lie between one wheelbase behind the rear axle and two ahead "
+                f"of it ({-self.wheelbase:g} to {2.0 * self.wheelbase:g} m), not at {imu:g}"
             )
 
     def scaled(self, factor: float) -> CarValues:
