@@ -9,7 +9,6 @@ import pytest
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest_papers.heavy_ekf import accuracy
-from vehest_papers.heavy_ekf.subjects import corners
 
 RATE = 20.0
 WHEEL_RADIUS = 0.48
@@ -59,19 +58,6 @@ def estimated(drive, gain, noise=0.0):
         drive.start_time,
         {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip},
     )
-
-
-def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8():
-    drive = short_drive(120.0)
-    drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
-    values = accuracy.gains_of(drive, estimated(drive, 0.8, 1e-5))
-    assert len(values) == 12
-    assert values.mean() == pytest.approx(0.8, abs=0.01)
-    turning = corners(drive)
-    true = drive["sideslip_ref"][turning]
-    scaled = estimated(drive, 0.8, 1e-3)["sideslip"][turning]
-    slope = np.polyfit(true, scaled, 1)[0]
-    assert accuracy.gains_of(drive, estimated(drive, 0.8, 1e-3)).mean() == pytest.approx(slope)
 
 
 def test_errors_that_double_on_the_last_lap_have_a_log_change_of_their_squares():

@@ -93,7 +93,6 @@ LEVELS: Mapping[str, float] = {
 }
 """Deviations of a step's process noise [m/s, rad/s] and of the sensors [m/s², rad/s, N, N] (Sections III-B and III-C)."""
 
-MEMBER_EPOCHS = 30  # epochs of each network of the ensemble (Section IV-C)
 
 BATCH = 256  # of both phases of the CNN-UKF's training (Section III-C)
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest_papers.heavy_ekf.subjects import corners
 
 LAPS = 3
 SKIP_SECONDS = 1.5
@@ -27,25 +26,6 @@ def shares_of_way(drive: Recording) -> FloatArray:
     """Share of the whole way that lies behind each sample, (T,)."""
     way = np.cumsum(np.maximum(drive["vx_ref"], 0.0))
     return np.asarray(way / way[-1], dtype=np.float64)
-
-
-def gains_of(drive: Recording, estimate: Estimate) -> FloatArray:
-    """Gain Σ β̂ β / Σ β² of β's variation about its mean while cornering, as a value for each block of 10 s, (B,).
-
-    Their mean is the gain of the whole drive, and their spread that of a ratio of sums (its
-    linearisation in the sums of each block), so that blocks in which β hardly varies weigh little.
-    """
-    turning = corners(drive)
-    true, estimated = (
-        values - float(np.mean(values[turning]))
-        for values in (drive["sideslip_ref"], estimate["sideslip"])
-    )
-    products, squares = (
-        sums_of_blocks(values * turning, drive.rate_hz)
-        for values in (estimated * true, true * true)
-    )
-    gain = products.sum() / squares.sum()
-    return np.asarray(gain + (products - gain * squares) / squares.mean(), dtype=np.float64)
 
 
 def log_change_of_last_lap(
@@ -82,8 +62,3 @@ def stop_of(drive: Recording) -> float:
     """When the car comes to its last stop [s]."""
     moves = np.flatnonzero(drive["vx_ref"] > STANDS)
     return float(drive.time[min(int(moves[-1]) + 1, len(drive) - 1)])
-
-
-def sums_of_blocks(values: FloatArray, rate_hz: float) -> FloatArray:
-    """Sums over blocks of 10 s that follow one another."""
-    return np.add.reduceat(values, np.arange(0, len(values), round(BLOCK_SECONDS * rate_hz)))

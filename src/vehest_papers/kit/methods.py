@@ -8,16 +8,7 @@ import pandas as pd
 
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.warnings import warnings_of
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
-
-
-def kinds_of_parts(artefacts: StudyArtefacts, names: Iterable[str]) -> str:
-    """``**Title: REAL data**`` of some parts."""
-    return "; ".join(
-        f"**{artefacts.titles[name]}: {words_of_kinds(artefacts.parts[name]).upper()} data**"
-        for name in names
-    )
 
 
 def absent_parts(artefacts: StudyArtefacts) -> str:
@@ -43,14 +34,6 @@ def scoring(part: PartArtefacts, reading: str = "") -> str:
         f"{protocol.piece} are not scored.{protocol.start_description}"
         f"{protocol.describe_sideslip(part.split.datasets)}"
     )
-
-
-def warnings_in_words(parts: Mapping[str, PartArtefacts]) -> str:
-    """Warnings on parts, by title; empty where there is none."""
-    lines = dict.fromkeys(
-        f"{title}: {line}" for title, part in parts.items() for line in warnings_of(part)
-    )
-    return bullets("**Mind:**", lines) if lines else ""
 
 
 def facts_of(parts: Iterable[PartArtefacts]) -> list[str]:

@@ -121,11 +121,6 @@ def median_and_range(values: FloatArray, decimals: int) -> str:
     )
 
 
-def percent_below(value: float, other: float) -> str:
-    """By how much ``value`` lies below ``other``, in whole per cent, for example ``12 %``."""
-    return f"{100 * (1 - value / other):.0f} %"
-
-
 def with_interval(value: float, low: float, high: float, decimals: int, unit: str = "") -> str:
     """A figure with its interval: ``0.0086 [0.0071, 0.0101]``, or with a unit ``0.12° [0.10, 0.15]``."""
     return f"{fixed(value, decimals)}{unit} [{fixed(low, decimals)}, {fixed(high, decimals)}]"

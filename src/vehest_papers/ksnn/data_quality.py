@@ -15,13 +15,10 @@ from vehest_papers.kit.spectra import (
     process_noise,
 )
 
-NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
 HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
-MOST_POINTS = 5000
 AY_WIDTH = 1.0
 LEAST_SAMPLES = 50
-COMPARED_AY = 8.0
 
 
 @dataclass(frozen=True)

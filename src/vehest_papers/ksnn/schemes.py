@@ -24,7 +24,6 @@ from vehest_papers.ksnn.paper import Published
 CANDIDATES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP}  # name in blocks.csv -> category
 STEERING = ("GRU with steering angle", "GRU without steering angle")  # each in parts of its own
 THIRD = "j1"  # test set of a car that no network learns or stops on, where there is one
-SET_TITLES = {"c2": "C-2", "f2": "F-2", THIRD: "third car"}
 
 
 @lru_cache(maxsize=2000)
