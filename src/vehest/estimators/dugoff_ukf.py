@@ -111,7 +111,10 @@ LEVELS = tuple(entry.name for entry in fields(TrackLevels))
 
 @dataclass(frozen=True)
 class AxleTyres(Group):
-    """Dugoff's parameters of both axles, all or none; where they are not given, the fit finds them."""
+    """Dugoff's parameters of both axles, all or none.
+
+    Where they are not given, the fit finds them.
+    """
 
     group = "estimator.tyres"
     cornering_stiffness_front: float | None = setting(
@@ -162,7 +165,8 @@ class DugoffUkf(DugoffFilter):
         Trial(
             9,
             "unscented filter with Dugoff tyres; minutes",
-            "estimator.inputs=imu {car} training.method=nelder_mead training.grid=1 training.max_evaluations=40 "
+            "estimator.inputs=imu {car} training.method=nelder_mead training.grid=1 "
+            "training.max_evaluations=40 "
             "training.tyres_from='*' training.restarts=1 training.generations=60",
         ),
     )
@@ -172,7 +176,8 @@ class DugoffUkf(DugoffFilter):
     skippable: ClassVar[tuple[str, ...]] = ("yaw_rate", "ay", *CHANNELS["full"][len(INERTIAL) :])
     inputs: Inputs = setting(
         "full",
-        "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car",
+        "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on "
+        "any car",
     )
     curve: Curve = setting(
         "plain", "tyres of Eq. 9 (plain) or 10 (smooth), as in training through the filter"
@@ -191,8 +196,8 @@ class DugoffUkf(DugoffFilter):
     )
     correlated_samples: float = setting(
         1.0,
-        "samples over which errors of sensors are alike, by which their variance is larger; about rate_hz / (2 f) of white noise behind a "
-        "low-pass of f Hz",
+        "samples over which errors of sensors are alike, by which their variance is larger; "
+        "about rate_hz / (2 f) of white noise behind a low-pass of f Hz",
         positive=True,
     )
     noise: TrackLevels = setting(TrackLevels(), "standard deviations; null: found by the training")
@@ -221,7 +226,8 @@ class DugoffUkf(DugoffFilter):
         """
         if not self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
-                f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
+                "estimator.linear_below must lie between 0 and nonlinear_from "
+                f"({self.nonlinear_from:g}), not at {self.linear_below:g}"
             )
 
     @property
@@ -238,7 +244,10 @@ class DugoffUkf(DugoffFilter):
     @property
     def full_title(self) -> str:
         """Title with what is measured, and the gate."""
-        return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{self.gate_title}"
+        return (
+            f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre "
+            f"forces{self.gate_title}"
+        )
 
     @property
     def n_parameters(self) -> int:
@@ -280,7 +289,7 @@ class DugoffUkf(DugoffFilter):
         if training.method == "data":
             self.levels |= {name: ASSUMED_LEVELS[name] for name in searched}
         elif searched:
-            search = search_levels(self, searched, data.train, training, self._seed, context)
+            search = search_levels(self, searched, data.train, training, self.fit_seed, context)
             history = search.history(searched)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
@@ -297,8 +306,9 @@ class DugoffUkf(DugoffFilter):
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
 
     def _identify_tyres(self, data: FitData, training: IdentificationSettings) -> dict[str, float]:
-        """Set the tyres; returns them with half of the range over restarts and the rms of residual
-        forces [N].
+        """Set the tyres.
+
+        Returns them with half of the range over restarts and the rms of residual forces [N].
         """
         fit = identify_tyres(
             data.train,
@@ -307,7 +317,7 @@ class DugoffUkf(DugoffFilter):
             training,
             minimum_speed=self.minimum_speed,
             has_forces=self.inputs == "full",
-            seed=self._seed,
+            seed=self.fit_seed,
         )
         self.axle_tyres = fit.parameters.ravel()
         return {
@@ -330,8 +340,12 @@ class DugoffUkf(DugoffFilter):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take tyres and levels back; raises `DataError`: they do not fit, or are out of their
-        settings' bounds.
+        """Take tyres and levels back.
+
+        Raises
+        ------
+        DataError
+            They do not fit, or are out of their settings' bounds.
         """
         require_shapes(
             self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()}
@@ -346,7 +360,7 @@ class DugoffUkf(DugoffFilter):
         self.levels = levels
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` where a level is searched, or tyres are identified without a sideslip angle."""
+        """``vy_ref`` for a searched level, or for tyres without a reference of sideslip."""
         if training.method != "data" and self.noise.unknown(SEARCHED[self.inputs]):
             return ("vy_ref",)
         return () if self.tyres.has_values or "sideslip_ref" in channels else ("vy_ref",)

@@ -60,8 +60,9 @@ class SensorNoise(Group):
 
 @dataclass(frozen=True)
 class SensorOffsets(Group):
-    """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within
-    a manoeuvre is in the covariance.
+    """Offsets that are states, first-order Gauss-Markov processes.
+
+    An error that is constant within a manoeuvre is in the covariance.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
     """
@@ -87,8 +88,9 @@ class SensorOffsets(Group):
 
 
 class KalmanFilter(SideslipFilter):
-    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is
-    a noisy input.
+    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r.
+
+    The steering angle is a noisy input.
 
     Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels, which
     are `values`, are standard deviations of the high-passed signals; no reference is looked at.
@@ -104,8 +106,8 @@ class KalmanFilter(SideslipFilter):
     may_be_nan = LEVELS
     template = "kalman"
     offline = (
-        "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
-        "set estimator.noise.read_from=training, or give the levels"
+        "a Kalman filter that reads its noise levels off the whole recording cannot run along "
+        "with a drive; set estimator.noise.read_from=training, or give the levels"
     )
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
     offsets: SensorOffsets = setting(
@@ -168,14 +170,15 @@ class KalmanFilter(SideslipFilter):
             recordings, self.noise.unknown, self.noise.cutoff, MIN_LEVEL
         )
 
-    def _estimate_one(
+    def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
+        """With noise levels read off the recording where nothing else provides them."""
         fitted = self
         if not self.causal:
             fitted = copy(self)
             fitted.values = self._levels_of([recording])
-        return super(KalmanFilter, fitted)._estimate_one(recording, initial_state)
+        return super(KalmanFilter, fitted).estimate_recording(recording, initial_state)
 
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
@@ -195,8 +198,10 @@ class KalmanFilter(SideslipFilter):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y +
-        b_ay, and wheels stand at δ - b_δ.
+        """Filter by `kalman_scan`.
+
+        a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ -
+        b_δ.
         """
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)

@@ -1,4 +1,7 @@
-"""Base of estimators whose weights are those of a network: initial weights, parameters, saving, training member by member."""
+"""Base of estimators whose weights are those of a network.
+
+Initial weights, parameters, saving, training member by member.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ SCALES = ("input_scale", "output_scale", "input_span", "unit", "yaw_rate_max")
 class Network(Estimator):
     """An estimator with a ``network``, any ``nn.Module``.
 
-    A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
+    A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its
+    own `fit_members`.
     """
 
     learns = True  # always
@@ -77,7 +81,7 @@ class Network(Estimator):
             parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad
         )
 
-    def fewest_weights(self) -> int:
+    def min_weights(self) -> int:
         """Its parameters, found without room for them."""
         import torch
 

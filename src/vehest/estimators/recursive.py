@@ -29,9 +29,8 @@ from vehest.estimators.base import (
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
-_numbers_type: Any = cache(
-    partial(namedtuple, "Numbers")
-)  # one type a family, so that numba compiles its ``step`` once
+# one type a family, so that numba compiles its ``step`` once
+_numbers_type: Any = cache(partial(namedtuple, "Numbers"))
 
 
 def compiled(step: Callable[..., Any]) -> Any:
@@ -40,8 +39,9 @@ def compiled(step: Callable[..., Any]) -> Any:
 
 
 class Recursive(Estimator):
-    """An observer or filter: it goes through samples in order and carries a state. Nothing in it is
-    random.
+    """An observer or filter: it goes through samples in order and carries a state.
+
+    Nothing in it is random.
 
     Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a
     setting is not fitted. A family has either a compiled ``step(numbers, state, sample)``, which
@@ -49,9 +49,8 @@ class Recursive(Estimator):
     """
 
     training_type: ClassVar[type] = NoTraining
-    states: ClassVar[tuple[str, ...]] = (
-        "vy",
-    )  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
+    # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
+    states: ClassVar[tuple[str, ...]] = ("vy",)
     refuses: ClassVar[tuple[str, ...]] = ("NaN",)
     step: ClassVar[Any]
     values: dict[str, float]  # fitted numbers by name
@@ -74,8 +73,9 @@ class Recursive(Estimator):
         self.unknown = tuple(name for name, value in fitted_settings.items() if value is None)
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
-        """The state before the first sample: that of a protocol, else what is measured, else 0; see
-        `Estimator.first_state`.
+        """The state before the first sample.
+
+        That of a protocol, else what is measured, else 0; see `Estimator.first_state`.
         """
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
         return tuple(
@@ -113,8 +113,9 @@ class Recursive(Estimator):
     def find_numbers(
         self, data: FitData, training: Any, context: FitContext
     ) -> tuple[Mapping[str, float], FitRecord]:
-        """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared
-        error of vy in training.
+        """Best values of what is not given.
+
+        In closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
 
@@ -151,7 +152,9 @@ class Recursive(Estimator):
             self.values |= dict(zip(self.unknown, numbers.tolist(), strict=True))
             return self.mean_squared_error(data.train)
 
-        search = nelder_mead_over_grid(cost, boxes, starts, training, context)  # type: ignore[arg-type]
+        search = nelder_mead_over_grid(  # type: ignore[arg-type]
+            cost, boxes, starts, training, context
+        )
         self.values |= dict(zip(self.unknown, search.best.tolist(), strict=True))
         metrics = {
             "evaluations": search.evaluations,

@@ -1,4 +1,6 @@
-"""Feed-forward network from the measurements of one instant to the sideslip angle: the data-driven method of Bertipaglia et al. 2024."""
+"""Feed-forward network from the measurements of one instant to the sideslip angle: the data-driven
+method of Bertipaglia et al. 2024.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,12 @@ from vehest.training.samples import SampleSettings
 
 
 class SideslipFfnn(SampleNetworkEstimator):
-    """Two hidden layers with rectifiers and dropout, trained on the mean squared error of the sideslip angle with early stopping.
+    """Two hidden layers with rectifiers and dropout, trained on the mean squared error of the
+    sideslip angle with early stopping.
 
-    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural network for vehicle sideslip angle
-    estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section IV-C.
+    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural
+    network for vehicle sideslip angle estimation, IEEE Transactions on Vehicular Technology 73 (9),
+    2024, Section IV-C.
     """
 
     name = "sideslip_ffnn"
@@ -67,7 +71,7 @@ class SideslipFfnn(SampleNetworkEstimator):
         self, data: FitData, training: SampleSettings, context: FitContext, index: int
     ) -> FitRecord:
         """Train on samples in random order."""
-        return self.fit_samples(data, training, squared_error, context, index, [self._seed])
+        return self.fit_samples(data, training, squared_error, context, index, [self.fit_seed])
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
         """v = u tan β, each sample by itself."""

@@ -50,7 +50,8 @@ class StaticMap(Recursive):
         scale = np.sqrt(np.mean(np.square(design), axis=0))
         if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
             raise DataError(
-                "the training recordings do not determine a static map: the car hardly turns, or always at the same speed"
+                "the training recordings do not determine a static map: the car hardly turns, or "
+                "always at the same speed"
             )
         return dict(
             zip(

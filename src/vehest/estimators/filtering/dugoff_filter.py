@@ -1,7 +1,8 @@
 """Filters recordings and single samples by the unscented filter of a single track on Dugoff's
 tyres.
 
-    recordings --split_samples--> measurements (T, 4), inputs (T, 3) --`TrackFilter`--> states --> estimates
+    recordings --split_samples--> measurements (T, 4), inputs (T, 3)
+    --`TrackFilter`--> states --> estimates
     one sample --filter_step--> `FilterStep` --`UnscentedStepper`--> state
 
 Measured are a_y, r and, where tyre forces are measured, those of both axles; forward speed,
@@ -62,21 +63,24 @@ class PseudoMeasurement(NamedTuple):
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
     variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
-    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's
+    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
+    # filter's
     process: FloatArray | None = None
 
 
 class DugoffFilter(SigmaPointEstimator):
-    """An estimator by an unscented filter over `DugoffTrack`; a subclass has the settings and the
-    fit.
+    """An estimator by an unscented filter over `DugoffTrack`.
+
+    A subclass has the settings and the fit.
 
     Attributes
     ----------
     axle_tyres : array, shape (6,)
-        Cornering stiffness [N/rad], friction [1] and reduction [s/m] of the front, then of the rear axle.
+        Cornering stiffness [N/rad], friction [1] and reduction [s/m] of the front, then of the rear
+        axle.
     levels : dict
-        Standard deviations by name: ``process_vy`` [m/s] and ``process_yaw_rate`` [rad/s] of a step, those
-        of the sensors, and ``force_factor``.
+        Standard deviations by name: ``process_vy`` [m/s] and ``process_yaw_rate`` [rad/s] of a
+        step, those of the sensors, and ``force_factor``.
     """
 
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
@@ -108,7 +112,8 @@ class DugoffFilter(SigmaPointEstimator):
         """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
         if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(
-                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres"
+                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give "
+                "estimator.tyres"
             )
         s = self.settings
         front, rear = (
@@ -127,7 +132,8 @@ class DugoffFilter(SigmaPointEstimator):
         """
         if any(math.isnan(level) for level in levels.values()):
             raise ConfigurationError(
-                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise"
+                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give "
+                "estimator.noise"
             )
         process = (
             torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64)
@@ -160,8 +166,9 @@ class DugoffFilter(SigmaPointEstimator):
         return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
-        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see
-        `in_nonlinear_range`.
+        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²].
+
+        See `in_nonlinear_range`.
         """
         return in_nonlinear_range(ay, self.nonlinear_from, self.linear_below, before)
 
@@ -174,8 +181,9 @@ class DugoffFilter(SigmaPointEstimator):
         pseudo: Sequence[PseudoMeasurement] | None = None,
         limit: float = 0.0,
     ) -> float:
-        """Mean squared error of sideslip [rad²] over samples fast enough for the model; see
-        `error_over`, and `robust_squares` for the limit [deg].
+        """Mean squared error of sideslip [rad²] over samples fast enough for the model.
+
+        See `error_over`, and `robust_squares` for the limit [deg].
         """
         skip = round(skip_seconds * self.rate_hz)
         sums: list[tuple[float, int]] = []
@@ -254,9 +262,8 @@ class DugoffFilter(SigmaPointEstimator):
                     for sensors_only, angle in zip(measured, added, strict=True)
                 ]
                 if added[0].process is not None:
-                    steps_noise = torch.diag_embed(
-                        torch.as_tensor(padded([angle.process for angle in added], None))  # type: ignore[misc]
-                    )
+                    process = padded([angle.process for angle in added], None)  # type: ignore[misc]
+                    steps_noise = torch.diag_embed(torch.as_tensor(process))
             measurements = torch.as_tensor(padded(measured, np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
             noise = sensors[

@@ -1,5 +1,6 @@
-"""Base of filters of sideslip angle and yaw rate over a single track: settings, the model of a
-recording, estimates.
+"""Base of filters of sideslip angle and yaw rate over a single track.
+
+Settings, the model of a recording, estimates.
 """
 
 from __future__ import annotations
@@ -34,11 +35,12 @@ class FilteredStates(NamedTuple):
     """What a filter knows after T samples."""
 
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
-    deviation: (
-        FloatArray | None
-    )  # standard deviations of all states, (T, n), where the filter gives them
+    # standard deviations of all states, (T, n), where the filter gives them
+    deviation: FloatArray | None
     covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
-    innovation: FloatArray  # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T, 2)
+    # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T,
+    # 2)
+    innovation: FloatArray
     innovation_covariance: FloatArray  # (T, 2, 2)
     measured: NDArray[np.bool_]  # (T, 2)
     last: Gaussian[FloatArray]  # state after the last sample
@@ -60,8 +62,9 @@ class FilteredStates(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What a filter carries on: the last sample, which is filtered again without its measurements,
-    and the state after it.
+    """What a filter carries on.
+
+    The last sample, which is filtered again without its measurements, and the state after it.
     """
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
@@ -86,8 +89,9 @@ class SideslipFilter(GatedFilter, Recursive):
     )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
-        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k],
-        a_y[k] = C[k] x[k] + D[k] δ[k].
+        """The model in steps at forward speeds vx, (T,) [m/s].
+
+        x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k].
         """
         return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(
             1.0 / self.rate_hz
@@ -96,8 +100,9 @@ class SideslipFilter(GatedFilter, Recursive):
     def first_motion(
         self, sample: FloatArray, deviation: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too,
-        or what a protocol hands over.
+        """β and r before the first sample.
+
+        0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
@@ -176,7 +181,10 @@ def read_levels(
     The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise.
     Raises `DataError`: a channel has too many gaps, or no noise.
     """
-    label = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+    label = (
+        f"recording{'s' if len(recordings) > 1 else ''} "
+        f"{', '.join(repr(recording.id) for recording in recordings)}"
+    )
     levels = {}
     for name in names:
         try:
@@ -187,6 +195,7 @@ def read_levels(
             ) from None
         if not levels[name] > min_level:
             raise DataError(
-                f"{label}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}"
+                f"{label}: channel '{name}' has no noise that could be read off it; give "
+                f"estimator.noise.{name}"
             )
     return levels

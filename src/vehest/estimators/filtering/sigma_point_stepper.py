@@ -1,5 +1,6 @@
-"""Sigma-point filters online: one stepper for all families that filter by
-`vehest.filters.unscented_scan`.
+"""Sigma-point filters online.
+
+One stepper for all families that filter by `vehest.filters.unscented_scan`.
 """
 
 from __future__ import annotations
@@ -30,13 +31,20 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """A sample of ``channels``, (C,), as the filter takes it; ``memory`` is what earlier
-        samples left, empty at first.
+        """A sample of ``channels``, (C,), as the filter takes it.
+
+        ``memory`` is what earlier samples left, empty at first.
         """
 
     @abstractmethod
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """The filter before its first sample; raises `ConfigurationError`: it has not been fitted."""
+        """The filter before its first sample.
+
+        Raises
+        ------
+        ConfigurationError
+            It has not been fitted.
+        """
 
     def online(self) -> Stepper:
         """A stepper that starts from the first sample it sees."""

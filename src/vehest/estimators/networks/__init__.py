@@ -1,1 +1,4 @@
-"""What network estimators share: over windows, over all samples so far, and over single instants."""
+"""What network estimators share.
+
+Over windows, over all samples so far, and over single instants.
+"""
