@@ -111,9 +111,7 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
     shares = torch.sigmoid(hidden[..., 1:])
     process = torch.diag_embed(shares[..., 1:].square())
     of_sensors = training.sensors[batch.trusted.long()].diagonal(dim1=-2, dim2=-1)
-    sensors = torch.diag_embed(
-        torch.cat([of_sensors, shares[..., :1].square() + MIN_VARIANCE], -1)
-    )
+    sensors = torch.diag_embed(torch.cat([of_sensors, shares[..., :1].square() + MIN_VARIANCE], -1))
     measured = torch.cat([batch.measured, angle.unsqueeze(-1)], -1)
     track = training.filter.track
     n = 2
