@@ -14,8 +14,9 @@ from vehest.data.schema import settings_from_config
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import EndToEnd, EndToEndSettings
-from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.ensemble_ukf import EnsembleSettings, scaled_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.filtering.track_filter import EXACT_STATE_DEVIATION, TrackFilter, error_over
 from vehest.estimators.network_ukf import MIN_VARIANCE
 from vehest.estimators.networks.sample_network import learnt_samples

@@ -20,7 +20,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.sample_network import (

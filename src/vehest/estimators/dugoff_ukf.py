@@ -29,19 +29,11 @@ from vehest.estimators.base import (
     require_within_bounds,
 )
 from vehest.estimators.filtering.dugoff_filter import (
-    CHANNELS as CHANNELS,
-)
-from vehest.estimators.filtering.dugoff_filter import (
+    CHANNELS,
     INERTIAL,
     Curve,
     DugoffFilter,
     Inputs,
-)
-from vehest.estimators.filtering.dugoff_filter import (
-    PseudoMeasurement as PseudoMeasurement,
-)
-from vehest.estimators.filtering.dugoff_filter import (
-    with_variance as with_variance,
 )
 from vehest.estimators.filtering.dugoff_identification import (
     identify_tyres,

@@ -15,7 +15,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import MIN_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip

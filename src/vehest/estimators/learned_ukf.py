@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -12,42 +11,39 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vehest.constants import GRAVITY, FloatArray
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import MAX_WIDTH, Group, setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Trial, require_learnable
+from vehest.estimators.filtering.car_c import car_filter_in_c
 from vehest.estimators.filtering.car_filter import CarFilter
-from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.filtering.car_fit import scale_network, training_phases
+from vehest.estimators.filtering.sigma_point_stepper import (
+    FilterStep,
+    SigmaPointEstimator,
+    normalised_innovations,
+)
 from vehest.estimators.network import Network
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.unscented_scan import MARGIN, CompiledNoise, StepNoise, UnscentedStepper
+from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
 from vehest.training.through_filter import (
     Drive,
     ThroughFilterSettings,
-    Weights,
-    filter_phases,
-    one_step_phase,
 )
 from vehest.vehicle.dynamics import (
-    PACEJKA,
     STATES,
-    TURN,
-    UNSCALED,
     Dynamics,
     NeuralCar,
     PacejkaCar,
-    Perceptron,
     ResidualCar,
     TyreNetworkCar,
-    physical_of,
 )
 from vehest.vehicle.parameters import LENGTH, MASS, YAW_INERTIA
-from vehest.vehicle.planar import F1TENTH, LEARNT
-from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
+from vehest.vehicle.planar import F1TENTH
 
 SHORT = {
     "pacejka": "pc",
@@ -66,21 +62,8 @@ TITLES = {
 REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")
 MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")
 INPUTS = ("steer", "motor_current")
-SLIP = 0.3  # rad and 1, what slips are divided by before a network sees them
-# of vx, vy, yaw rate and rim speed: the inverse of how much they change from sample to sample
-WEIGHTS = (
-    0.2225,
-    0.5064,
-    0.1566,
-    0.1145,
-)
 # m/s, m/s, rad/s, m/s: standard deviations of a start that nobody hands over
-UNKNOWN = (
-    0.5,
-    0.3,
-    0.1,
-    0.1,
-)
+UNKNOWN = (0.5, 0.3, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
@@ -331,40 +314,15 @@ class LearnedUkf(Network, SigmaPointEstimator):
         self.network = self.new_network().to(dtype)
         self.network.repair = True
         if self.scaled:
-            self._scale(train)
-        self.filter.reset(torch.Generator().manual_seed(self.fit_seed))
-        weights = torch.tensor(WEIGHTS, dtype=dtype)
-        last = torch.zeros(1, dtype=dtype)
-        counted = Weights(
-            torch.cat([weights, last]),
-            torch.cat([weights, last + 1.0]),
-            torch.cat([weights[:3], last, last]),
+            scale_network(self.network, train, self.car.mass, self.rate_hz)
+        self.network.reset(torch.Generator().manual_seed(self.fit_seed))
+        phases = training_phases(
+            self.network, train, validation, training, learns_dynamics=self.through_filter
         )
-        learns_dynamics = self.through_filter
-        phases = [
-            one_step_phase(
-                self.filter,
-                train,
-                validation,
-                counted,
-                training,
-                lambda name: name.startswith("dynamics."),
-            ),
-            *filter_phases(
-                self.filter,
-                train,
-                validation,
-                counted,
-                training,
-                training.through if learns_dynamics else training.noise,
-                lambda name: learns_dynamics or not name.startswith("dynamics."),
-                "through_filter" if learns_dynamics else "noise",
-            ),
-        ]
         records = train_phases(
             phases, self.fit_seed, context, index, training.checkpoint_seconds, twins
         )
-        self.filter.repair = self.repair
+        self.network.repair = self.repair
         return records
 
     def new_network(self) -> CarFilter:
@@ -392,33 +350,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
         return TyreNetworkCar(
             car, friction_scaled=s.dynamics == "friction_tyre_network", hidden=(width, width)
         )
-
-    def _scale(self, train: Sequence[Drive]) -> None:
-        """Networks' inputs by their root mean square in training.
-
-        Forces by an axle's share of the weight, rates by theirs.
-        """
-        network = getattr(self.filter.dynamics, "network", None)
-        if not isinstance(network, Perceptron):
-            return
-        states, inputs = (torch.cat([drive[part] for drive in train]) for part in (0, 1))
-        size = torch.cat([states, inputs], -1).square().mean(0).sqrt()
-        vx, vy, yaw_rate, rim, friction, steer, current = size.clamp(min=1e-6).tolist()
-        if isinstance(self.filter.dynamics, TyreNetworkCar):
-            input_scale = [vx, vy, yaw_rate, rim, friction, steer, SLIP, SLIP, SLIP]
-            scales = (
-                input_scale if self.filter.dynamics.friction_scaled else [*input_scale, current]
-            )
-            output_scale = [0.5 * self.car.mass * GRAVITY] * 4
-        else:
-            scales = [vx, vy, yaw_rate, rim, steer, current]
-            rates = (
-                torch.cat([drive.states[1:, :4] - drive.states[:-1, :4] for drive in train])
-                * self.rate_hz
-            )
-            output_scale = rates.square().mean(0).sqrt().clamp(min=1e-6).tolist()
-        network.input_scale.copy_(torch.tensor(scales))
-        network.output_scale.copy_(torch.tensor(output_scale))
 
     def _samples(self, recording: Recording) -> tuple[FloatArray, FloatArray]:
         """Measurements (T, 4), the rim speed last, and inputs (T, 2), held where missing."""
@@ -488,19 +419,14 @@ class LearnedUkf(Network, SigmaPointEstimator):
             steps = self.filter.filtered(
                 measurements, inputs, initial, gate=self.gate_in_use()
             ).steps
-            nis = (
-                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
-                .result.mul(steps.innovation)
-                .sum(-1)
-            )
+            nis, dof = normalised_innovations(steps)
         mean = steps.filtered.mean.double().numpy()
         covariance = steps.filtered.covariance.double().numpy()
-        dof = steps.measured.sum(-1)
         estimates = []
         for row, recording in enumerate(recordings):
             quantities = {name: mean[row, :, k].copy() for k, name in enumerate(STATES)}
-            quantities["nis"] = nis[row].double().numpy()
-            quantities["nis_dof"] = dof[row].double().numpy()
+            quantities["nis"] = nis[row]
+            quantities["nis_dof"] = dof[row]
             measured = recording["vx"]
             vx = np.where(np.isnan(measured), quantities["vx"], measured)
             filled = replace(recording, channels={**recording.channels, "vx": vx})
@@ -564,32 +490,16 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 "estimator 'learned_ukf' with estimator.curvature=true cannot be exported to C; "
                 "train it with curvature=false"
             )
-        model = deepcopy(self.filter).double()
-        with torch.no_grad():
-            process, observation = model.noise_at()
-            return {
-                **super().c_values(),
-                **_dynamics_in_c(model.dynamics),
-                "n": len(STATES),
-                "m": len(MEASURED),
-                "rule": model.rule,
-                "lower": [value if math.isfinite(value) else None for value in model.lower],
-                "repair": model.repair,
-                "margin": MARGIN,
-                "kind": s.dynamics,
-                "dynamics": s.dynamics.replace("_", " "),
-                "noise_kind": s.noise.replace("_", " "),
-                "step": model.step,
-                "radius": s.car.wheel_radius,
-                "still": SLIP_SPEED_OFFSET,
-                "turn": TURN,
-                "unscaled": UNSCALED,
-                "friction": s.friction if s.start_friction is None else s.start_friction,
-                "initial": _numbers(model.initial_covariance())
-                + np.diag([*np.square(UNKNOWN), 0.0]),
-                "process": _noise_in_c(process),
-                "observation": _noise_in_c(observation),
-            }
+        values = super().c_values() | car_filter_in_c(self.filter)
+        values["initial"] = values["initial"] + np.diag([*np.square(UNKNOWN), 0.0])
+        return values | {
+            "m": len(MEASURED),
+            "kind": s.dynamics,
+            "dynamics": s.dynamics.replace("_", " "),
+            "noise_kind": s.noise.replace("_", " "),
+            "radius": s.car.wheel_radius,
+            "friction": s.friction if s.start_friction is None else s.start_friction,
+        }
 
 
 def _hold_missing(values: FloatArray) -> FloatArray:
@@ -598,48 +508,6 @@ def _hold_missing(values: FloatArray) -> FloatArray:
         np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None])
     )
     return np.take_along_axis(np.concatenate([np.zeros_like(values[:1]), values]), last, axis=0)
-
-
-def _dynamics_in_c(dynamics: Dynamics) -> dict[str, Any]:
-    """Physical numbers, curves, and the network's layers, inputs first."""
-    values, (mass, wheelbase, _) = physical_of(dynamics)
-    p = dict(zip((*LEARNT, *PACEJKA), values.tolist(), strict=True))
-    weight = mass * GRAVITY / wheelbase
-    front_arm = wheelbase - p["cg_to_rear_axle"]
-    values_in_c: dict[str, Any] = {
-        "p": p,
-        "mass": mass,
-        "front_arm": front_arm,
-        "front_load": weight * p["cg_to_rear_axle"],
-        "rear_load": weight * front_arm,
-        "curves": [[p[f"{letter}_{axle}"] for letter in "BCD"] for axle in ("x", "front", "rear")],
-    }
-    network = getattr(dynamics, "network", None)
-    if isinstance(network, Perceptron):
-        for number, (matrix, offset) in enumerate(network.layers(), 1):
-            values_in_c |= {f"W{number}": _numbers(matrix.T), f"b{number}": _numbers(offset)}
-    return values_in_c
-
-
-def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
-    """A covariance that is constant, or linear in the state by its factor; see `compiled_noise`."""
-    if not isinstance(noise, CompiledNoise):
-        return {"constant": noise[0], "weight": None}
-    constant, weight, offset, *numbers = noise.car
-    scale, lower = map(float, numbers)
-    n = len(constant)
-    values = {
-        "constant": constant,
-        "weight": weight,
-        "offset": offset,
-        "scale": scale,
-        "least": lower if math.isfinite(lower) else None,
-    }
-    return {**values, "units": n * math.log(2.0 * math.pi * math.e), "size": n}
-
-
-def _numbers(values: Tensor) -> np.ndarray[Any, Any]:
-    return values.detach().numpy().astype(np.float64)
 
 
 ESTIMATOR = LearnedUkf

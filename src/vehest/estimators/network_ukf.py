@@ -16,7 +16,8 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.dugoff_ukf import CHANNELS, DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.dugoff_filter import CHANNELS, PseudoMeasurement
 from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetworkEstimator
 from vehest.training.context import FitContext
 

@@ -89,9 +89,7 @@ class Recursive(Estimator):
         return dict(zip(self.states, estimates.T.copy(), strict=True)), state
 
     def numbers(self) -> Any:
-        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes
-        them: a named tuple.
-        """
+        """Named tuple that ``step`` takes: numeric settings, fitted numbers and ``dt`` [s]."""
         numbers = {
             name: value
             for name, value in vars(self.settings).items()
@@ -100,8 +98,7 @@ class Recursive(Estimator):
         return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
-        """Numbers of the smallest mean squared error of vy, where the family has them in closed
-        form.
+        """Numbers of the smallest mean squared error of vy; None without a closed form.
 
         Raises
         ------
@@ -127,12 +124,11 @@ class Recursive(Estimator):
         values = self.closed_form(data.train)
         if values is not None:
             self.values |= values
-            losses = {"best_train_loss": data.train, "best_validation_loss": data.validation}
-            return values, FitRecord(
-                metrics={
-                    name: self.mean_squared_error(recordings) for name, recordings in losses.items()
-                }
-            )
+            metrics = {
+                "best_train_loss": self.mean_squared_error(data.train),
+                "best_validation_loss": self.mean_squared_error(data.validation),
+            }
+            return values, FitRecord(metrics=metrics)
         declared = [self.settings.declarations()[name] for name in self.unknown]
         scales = [
             largest_absolute(data.train, declaration.of_largest, self.name)
@@ -183,15 +179,15 @@ class Recursive(Estimator):
         recursives = [member for member in members if isinstance(member, Recursive)]
         values: Mapping[str, float] = {}
         record = FitRecord()
-        if recursives[0].learns:
-            channels = (*recursives[0].channels, *recursives[0].learns_from)
+        first = recursives[0]
+        if first.learns:
             require_learnable(
                 [*data.train, *data.validation],
-                channels,
-                recursives[0].name,
-                recursives[0].skippable,
+                (*first.channels, *first.learns_from),
+                first.name,
+                first.skippable,
             )
-            values, record = recursives[0].find_numbers(data, training, context)
+            values, record = first.find_numbers(data, training, context)
         for member in recursives:
             member.values |= {name: float(value) for name, value in values.items()}
         metrics = {"epochs": 0, **record.metrics, "train_seconds": time.monotonic() - started}
@@ -251,7 +247,7 @@ def _fitted_number(name: str) -> property:
 
 @numba.njit(error_model="numpy")
 def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
-    """State after the last sample; writes the state after each sample into ``found``, (T, n)."""
+    """State after the last sample; writes the states after all samples into ``estimates``, (T, n)."""
     for k in range(len(samples)):
         state = step(numbers, state, samples[k])
         for i in range(len(state)):

@@ -28,7 +28,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.filtering.sigma_point_stepper import (
+    FilterStep,
+    SigmaPointEstimator,
+    normalised_innovations,
+)
 from vehest.estimators.filtering.track_filter import (
     ROLLING,
     Over,
@@ -207,13 +211,7 @@ class DugoffFilter(SigmaPointEstimator):
             recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)
         ):
             mean, covariance = (part.numpy() for part in steps.filtered)
-            nis = (
-                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
-                .result.mul(steps.innovation)
-                .sum(-1)
-                .numpy()
-            )
-            dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
+            nis, dof = normalised_innovations(steps)
             for place, row in enumerate(rows):
                 n = len(recordings[row])
                 quantities = {
