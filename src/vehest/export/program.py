@@ -261,7 +261,7 @@ def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
     """Tables of `vehest.trust.health_kernel` by name; None where no health was learnt."""
     if packed is None:
         return None
-    layout = Layout(*packed.view(np.int64)[: len(Layout._fields)].tolist())
+    layout = Layout(*map(int, views(Layout, packed, ())[0]))
     model, _ = views(Model, packed, layout)
     return {
         **model._asdict(),

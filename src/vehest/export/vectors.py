@@ -71,7 +71,7 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
     rate = stepper.input_rate_hz
     steps = round(SECONDS * rate)
     times = np.arange(steps) / rate
-    samples = _motion(stepper, times, rate)
+    samples = _motion(stepper, times)
     names = list(samples)
     for at, name in enumerate(names):
         first = round((3.0 + 0.3 * at / len(names)) * rate)
@@ -92,7 +92,7 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
     return times[rows], {name: values[rows] for name, values in samples.items()}
 
 
-def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
+def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]:
     """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that
     is the same on every machine.
     """
@@ -104,7 +104,7 @@ def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str
     motion = {}
     for number, name in enumerate(names):
         size = sizes[name]
-        if name == "vx" or name == "motor_speed" or name.startswith("wheel_speed"):
+        if name in ("vx", "motor_speed") or name.startswith("wheel_speed"):
             values = usual[name] * speed
         elif name == "ax" and "vx" in names:
             values = np.gradient(usual["vx"] * speed, times)

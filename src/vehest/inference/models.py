@@ -159,12 +159,11 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
         {folder for root in roots for folder in (root / CALIBRATION_STAGE).glob("[!.]*")}
     )
     calibrations = [folder for folder in folders if _calibrates(folder, model)]
-    newest = max(
+    return max(
         map(read_artefact, calibrations),
         key=lambda artefact: str(artefact.provenance.get("created", "")),
         default=None,
     )
-    return newest
 
 
 def _calibrates(folder: Path, model: Artefact) -> bool:

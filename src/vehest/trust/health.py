@@ -1,6 +1,6 @@
 """Health of estimates, judged by the channels that they were computed from.
 
-Valid, degraded or invalid.
+An estimate is valid, degraded or invalid.
 
     drives -> learn_health -> HealthModel (trust.yaml) -> packed -> health_rows -> status, reason
 
@@ -273,16 +273,8 @@ class HealthModel:
             for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)
         ]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
-        return Layout._make(
-            [
-                len(names),
-                len(self.coefficients),
-                len(self.relations),
-                *columns,
-                *rows,
-                len(self.statistics),
-            ]
-        )
+        counts = (len(names), len(self.coefficients), len(self.relations))
+        return Layout(*counts, *columns, *rows, len(self.statistics))
 
     @property
     def statistics(self) -> list[Statistic]:
