@@ -93,7 +93,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Root:
-    """What every command's configuration has; groups that a command does not have are None."""
+    """Groups of every command's configuration; those that a command does not have are None."""
 
     __pydantic_config__ = FURTHER_KEYS
     output: str

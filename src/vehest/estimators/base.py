@@ -220,7 +220,7 @@ class Estimator(ABC):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:
-        """Build one from plain values.
+        """Build an estimator from plain values.
 
         Raises
         ------
@@ -254,7 +254,7 @@ class Estimator(ABC):
 
     @property
     def variant(self) -> str:
-        """What the paper calls this configuration."""
+        """The paper's name of this configuration."""
         return self.name
 
     @property
@@ -299,10 +299,10 @@ class Estimator(ABC):
     @property
     @abstractmethod
     def n_parameters(self) -> int:
-        """How many numbers the fit determines."""
+        """Number of values that the fit determines."""
 
     def seed(self, seed: int) -> None:
-        """Say which random numbers the next fit starts from and uses."""
+        """Set the seed of the next fit."""
         self.fit_seed = seed
 
     @classmethod
@@ -330,11 +330,11 @@ class Estimator(ABC):
         """
 
     def min_weights(self) -> int:
-        """How many numbers its settings ask for at least."""
+        """Lower bound of the number of weights with these settings."""
         return self.n_parameters
 
     def fit(self, data: FitData, training: Any, context: FitContext | None = None) -> FitRecord:
-        """Fit this one alone."""
+        """Fit this estimator alone."""
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
     def estimate(

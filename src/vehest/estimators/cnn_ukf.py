@@ -105,7 +105,7 @@ class NetworkOutput(NamedTuple):
 
     @property
     def variance(self) -> Tensor:
-        """Of the sideslip angle as a measurement [rad²]."""
+        """Variance of the sideslip angle as a measurement [rad²]."""
         return self.distrust.square() + self.least_variance
 
 
@@ -123,8 +123,7 @@ class Cuts(NamedTuple):
 
 
 class CnnUkf(NetworkUkf):
-    """A network gives the filter a sideslip angle, how little to trust it, and the process noise,
-    sample by sample.
+    """Filter with a sideslip angle, its variance and process noise by a network, at each sample.
 
     Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy
     and σ_ψ̇ come out of logistic functions; all three are standard deviations here, in pre-training
@@ -177,7 +176,7 @@ class CnnUkf(NetworkUkf):
 
     @property
     def variant(self) -> str:
-        """With the tyres, where they are not the smooth ones, and what is taken away."""
+        """Name with tyres that are not smooth and with the parts that are switched off."""
         tyres = "" if self.curve == "smooth" else "_plain"
         return super().variant + tyres + "".join(f"_no_{name}" for name in self.without)
 
@@ -282,8 +281,9 @@ class CnnUkf(NetworkUkf):
     def _pre_training(
         self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
     ) -> Phase:
-        """The network alone: a likelihood of its angle and distrust, and process noise at the
-        filter's levels (Eqs. 5 and 6).
+        """Phase of the network alone (Eqs. 5 and 6).
+
+        Its loss is a likelihood of angle and distrust; process noise is at the filter's levels.
         """
         network = self.network
         dropout = self.dropout
@@ -357,9 +357,7 @@ class EndToEnd:
         self.lost = 0
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
-        """As many sequences of each recording as fit into it, from an offset that is drawn, in
-        random order.
-        """
+        """Sequences of each recording from a random offset on, as many as fit, in random order."""
         for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(
             self.training.batch_size
         ):
@@ -380,8 +378,9 @@ class EndToEnd:
         )
 
     def loss(self, batch: Cuts) -> Tensor:
-        """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad², or
-        deg² if the settings say so].
+        """Sum of the mean squared errors of the network's angle and of the filter's (Eq. 7).
+
+        It is in rad², or in deg² if the settings say so.
 
         Beyond ``training.loss_limit`` squares are continued by their tangents (`robust_squares`).
 
@@ -424,19 +423,14 @@ class EndToEnd:
         )
 
     def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
-        """A gradient, (B, T, 4), that is zero for sequences that are lost, or for which it is not
-        finite.
-        """
+        """A gradient, (B, T, 4), that is zero for lost sequences and where it is not finite."""
         bad = ~torch.isfinite(gradient).all(-1)
         bad[lost] = False
         lost = lost | self._account(bad, batch, "gradient")
         return torch.where(lost[:, None, None], 0.0, gradient)
 
     def _account(self, bad: Tensor, batch: Cuts, quantity: str) -> Tensor:
-        """Which sequences are lost, (B,), of where something is not finite, (B, T).
-
-        Counts them, and stops if they are too many.
-        """
+        """Count the sequences with samples that are not finite, ``bad`` (B, T); return them."""
         lost = bad.any(1)
         number = int(lost.sum())
         self.lost += number
@@ -452,7 +446,7 @@ class EndToEnd:
         return lost
 
     def place(self, sample: int) -> str:
-        """Which sample of which recording one of all training samples is."""
+        """Recording and time of one of all training samples, for messages."""
         number = int(np.searchsorted(self.offsets, sample, side="right")) - 1
         recording = self.recordings[number]
         time = recording.start_time + (sample - int(self.offsets[number])) / recording.rate_hz

@@ -73,7 +73,7 @@ class DataSheet(Recursive):
         }, state
 
     def c_values(self) -> dict[str, Any]:
-        """What the data sheet says."""
+        """Numbers of the data sheet for the C template."""
         about = "Steady cornering of a linear single track from a data sheet."
         return {
             "about": about,

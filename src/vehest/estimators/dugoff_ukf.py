@@ -1,5 +1,6 @@
-"""Unscented Kalman filter on a single track with Dugoff tyres: the model-based part of Bertipaglia
-et al. 2024.
+"""Unscented Kalman filter on a single track with Dugoff tyres.
+
+Source: the model-based part of Bertipaglia et al. 2024.
 
     training recordings --identify--> tyres of both axles, noise levels
     ay, yaw_rate, tyre forces --`DugoffFilter`--> vy, yaw rate
@@ -229,7 +230,7 @@ class DugoffUkf(DugoffFilter):
 
     @property
     def variant(self) -> str:
-        """What is measured, the curve, and the gate."""
+        """Name with what is measured, the curve, and the gate."""
         s = self.settings
         return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + self.gate_suffix
 
@@ -256,8 +257,9 @@ class DugoffUkf(DugoffFilter):
     def fit_members(
         cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
     ) -> list[FitRecord]:
-        """Identify tyres, read sensors' levels, find the process noise, each where it is not given;
-        see `IdentificationSettings`.
+        """Identify tyres, levels of sensors and process noise, each where it is not given.
+
+        See `IdentificationSettings`.
         """
         return [member.identify(data, training, context) for member in members]
 
@@ -323,9 +325,7 @@ class DugoffUkf(DugoffFilter):
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Tyre parameters in the order of `AxleTyres`, and levels of noise in that of
-        `level_names`.
-        """
+        """Tyre parameters in the order of `AxleTyres`, levels in that of `level_names`."""
         return {
             "tyres": self.axle_tyres.copy(),
             "levels": np.array([self.levels[name] for name in self.level_names]),
@@ -358,7 +358,7 @@ class DugoffUkf(DugoffFilter):
         return () if self.tyres.has_values or "sideslip_ref" in channels else ("vy_ref",)
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Where no recording matches the pattern that names those to identify tyres on."""
+        """An override for tyres where no recording matches ``training.tyres_from``."""
         if self.tyres.has_values or any(
             fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings
         ):

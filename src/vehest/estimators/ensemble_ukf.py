@@ -1,6 +1,4 @@
-"""Unscented filter with a deep ensemble's mean and variance as a measurement of the sideslip angle
-(DE-UKF).
-"""
+"""Unscented filter that measures the sideslip angle by a deep ensemble (DE-UKF)."""
 
 from __future__ import annotations
 
@@ -106,7 +104,7 @@ class EnsembleUkf(NetworkUkf):
 
     @property
     def n_parameters(self) -> int:
-        """With p₁ and p₂."""
+        """Parameters of the networks, and p₁ and p₂."""
         return super().n_parameters + len(self.scaling)
 
     def new_network(self) -> SampleNetwork:
@@ -182,7 +180,7 @@ class EnsembleUkf(NetworkUkf):
         return PseudoMeasurement(sideslip, scaled)
 
     def c_values(self) -> dict[str, Any]:
-        """With the scaling of the variance."""
+        """Values of filter, networks and scaling for the C template."""
         ensemble = {"scaling": self.scaling, "mixture": self.variance == "mixture"}
         return {
             **super().c_values(),
@@ -192,11 +190,11 @@ class EnsembleUkf(NetworkUkf):
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Those of filter and networks, and p₁ and p₂."""
+        """Weights of filter and networks, and p₁ and p₂."""
         return {**super().weights(), "scaling": self.scaling.copy()}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back.
+        """Set weights of filter and networks, and p₁ and p₂.
 
         Raises
         ------

@@ -1,5 +1,6 @@
-"""Factor graph over the linear single track: the FG of Leanza et al. 2021, as in Table VI of Da Lio
-et al. 2023.
+"""Factor graph over the linear single track.
+
+Source: the FG of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
 """
 
 from __future__ import annotations
@@ -51,9 +52,7 @@ class FactorNoise(Group):
 
 
 class WindowState(NamedTuple):
-    """Samples of the window behind the next one, (N, 4), the first state before its measurement,
-    and refused measurements (`Gate`).
-    """
+    """Samples (N, 4) before the next one, the first state before its measurement, refusals."""
 
     samples: FloatArray
     start: Gaussian[FloatArray]
@@ -61,8 +60,7 @@ class WindowState(NamedTuple):
 
 
 class FactorGraph(SideslipFilter):
-    """Factor graph of sideslip angle and yaw rate, solved as a whole or over a window that moves
-    along.
+    """Factor graph of sideslip angle and yaw rate, solved as a whole or over a moving window.
 
     At each sample a factor on a_y and one on r; between samples one factor for β and one for r.
     Given the speed the model is linear and the graph a chain, so a Kalman filter and a
@@ -96,9 +94,7 @@ class FactorGraph(SideslipFilter):
     )
 
     def check(self) -> None:
-        """Raises `ConfigurationError`: a window shorter than a sampling interval, or a gate without
-        a window.
-        """
+        """Raise `ConfigurationError` for a window below a sample, or a gate without a window."""
         if self.window is not None and self.intervals < 1:
             raise ConfigurationError(
                 "estimator.window must be null or at least one sampling interval, "
@@ -117,7 +113,7 @@ class FactorGraph(SideslipFilter):
 
     @property
     def causal(self) -> bool:
-        """With a window."""
+        """Whether there is a window."""
         return self.window is not None
 
     @property
@@ -202,8 +198,9 @@ class FactorGraph(SideslipFilter):
         start: Gaussian[FloatArray],
         refused: NDArray[np.int64],
     ) -> FloatArray:
-        """States of a window's samples given all of them, (N, 2), of their model and ``start``, the
-        first state before its measurement.
+        """Smoothed states of a window's samples, (N, 2).
+
+        ``start`` is the first state before its measurement.
 
         Samples are of ``channels``, (N, 4). Measurements of the newest that the gate refuses become
         NaN in them; ``refused`` is changed in place, too (see `Gate`).

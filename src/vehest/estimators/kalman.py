@@ -1,5 +1,6 @@
-"""Kalman filter over the linear single track: the KF of Leanza et al. 2021, as in Table VI of Da
-Lio et al. 2023.
+"""Kalman filter over the linear single track.
+
+Source: the KF of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
 """
 
 from __future__ import annotations
@@ -31,9 +32,7 @@ MIN_LEVEL = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
 
 @dataclass(frozen=True)
 class SensorNoise(Group):
-    """Standard deviations of the sensors' noise, given, or else read off measured signals above a
-    frequency.
-    """
+    """Standard deviations of the sensors' noise, given or read off high-passed signals."""
 
     group = "estimator.noise"
     read_from: Literal["training", "recording"] = setting(
@@ -83,7 +82,7 @@ class SensorOffsets(Group):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Which there are."""
+        """Channels whose offset is a state."""
         return tuple(name for name in ("ay", "steer") if getattr(self, name) is not None)
 
 
@@ -138,7 +137,7 @@ class KalmanFilter(SideslipFilter):
 
     @property
     def variant(self) -> str:
-        """Where the noise levels come from, unless it is the training; offsets and the gate."""
+        """Name with the source of noise levels, unless it is the training, offsets and gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
         offsets = "".join(f"_{name}_offset" for name in self.offsets.names)
         return self.name + noise + offsets + self.gate_suffix
@@ -156,7 +155,7 @@ class KalmanFilter(SideslipFilter):
         return self.title + noise + offsets + self.gate_title
 
     def declarations_of_values(self) -> Mapping[str, Declaration]:
-        """Those of the sensors' noise."""
+        """Declarations of the sensors' noise."""
         return self.noise.declarations()
 
     def find_numbers(
@@ -173,7 +172,7 @@ class KalmanFilter(SideslipFilter):
     def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        """With noise levels read off the recording where nothing else provides them."""
+        """Estimate a recording, with noise levels of its own where nothing else provides them."""
         fitted = self
         if not self.causal:
             fitted = copy(self)
@@ -242,7 +241,7 @@ class KalmanFilter(SideslipFilter):
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Its car, levels of noise, offsets and gate."""
+        """Car, noise levels, offsets and gate for the C template."""
         car = self.car
         decay = math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
         offsets = [

@@ -72,7 +72,7 @@ class Ksnn(WindowedEstimator):
 
     @property
     def kind(self) -> str:
-        """Of the feedback functions."""
+        """Whether the feedback functions are linear or nonlinear."""
         return "nonlinear" if self.n_hidden else "linear"
 
     @property
@@ -103,7 +103,7 @@ class Ksnn(WindowedEstimator):
         return KinematicsStructuredNetwork(self.settings, yaw_rate_max)
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of parameters, and of the buffer ``yaw_rate_max``."""
+        """Shapes of parameters and of the buffer ``yaw_rate_max``."""
         return kernel.shapes_of(self.n_local, self.n_hidden, bias=self.bias) | {"yaw_rate_max": ()}
 
     def min_weights(self) -> int:
@@ -130,7 +130,7 @@ class Ksnn(WindowedEstimator):
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Its local models and their neurons."""
+        """Local models and their neurons for the C template."""
         weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
         return kernel.c_tables(
             kernel.packed(weights),

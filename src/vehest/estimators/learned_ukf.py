@@ -215,7 +215,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
     @property
     def filter(self) -> CarFilter:
-        """Its network: the filter whose dynamics and noise are learnt."""
+        """The network, which is the filter whose dynamics and noise are learnt."""
         return self.network
 
     adapts = True  # friction is a state
@@ -255,7 +255,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
     @property
     def n_parameters(self) -> int:
-        """Those that can change: without entries off the diagonals of diagonal noise."""
+        """Number of parameters that can change; diagonal noise has none off its diagonals."""
         fixed = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (
             1 if self.noise == "constant" else 2 + len(STATES)
         )
@@ -483,7 +483,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         return FilterStep(measurement, memory["inputs"], *memory["noises"])
 
     def c_values(self) -> dict[str, Any]:
-        """Its dynamics, noise, car and gate; raises `ConfigurationError`: curves have E terms."""
+        """Values of the C template; raises `ConfigurationError` where curves have E terms."""
         s = self.settings
         if s.curvature:
             raise ConfigurationError(

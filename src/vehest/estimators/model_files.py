@@ -60,7 +60,7 @@ class About:
 
 @dataclass(frozen=True)
 class Description:
-    """What model.yaml says."""
+    """Content of model.yaml."""
 
     format: int  # version of the layout
     estimator: str  # name in the registry, never an import path
@@ -150,7 +150,7 @@ def load_model(folder: Path) -> Estimator:
 
 
 def read_description(folder: Path) -> Description:
-    """What a model folder says about itself.
+    """Read the description of a model folder.
 
     Raises
     ------

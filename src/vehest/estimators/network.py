@@ -41,7 +41,7 @@ class Network(Estimator):
 
     @cached_property
     def network(self) -> Any:
-        """Its network, built and loaded when it is first asked for, since it needs torch."""
+        """The network, built and loaded when it is first used, since it needs torch."""
         import torch
 
         from vehest.training.members import random_numbers
@@ -61,7 +61,7 @@ class Network(Estimator):
     def fit_member(
         self, data: FitData, training: Any, context: FitContext, index: int
     ) -> FitRecord:
-        """Train this one, whose place among the members is ``index``; see `fit_members`."""
+        """Train one estimator; ``index`` is its place among the members, see `fit_members`."""
         raise NotImplementedError(f"{type(self).__name__} has no method 'fit_member'")
 
     @classmethod
@@ -82,7 +82,7 @@ class Network(Estimator):
         )
 
     def min_weights(self) -> int:
-        """Its parameters, found without room for them."""
+        """Number of parameters, without memory for them."""
         import torch
 
         with torch.device("meta"):

@@ -26,8 +26,9 @@ MIN_VARIANCE = 1e-6
 
 
 class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
-    """A `DugoffUkf` that also measures the sideslip angle that a network derives from the same
-    sample (Bertipaglia et al. 2024, Eq. 4).
+    """A `DugoffUkf` that also measures a network's sideslip angle of the same sample.
+
+    Source: Bertipaglia et al. 2024, Eq. 4.
 
     Filter and network are fitted in one training: the filter first, as it would be alone with the
     same seed. A network needs every sample, so that gaps are refused.
@@ -49,7 +50,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @abstractmethod
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """What the network adds to samples (T, C) of ``network_inputs``."""
+        """Sideslip angle, variance and process noise by the network, of samples (T, C)."""
 
     @abstractmethod
     def fit_network(
@@ -59,7 +60,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @property
     def variant(self) -> str:
-        """Which inputs it sees, and the gate."""
+        """Name of the family with the network's inputs and the gate."""
         return self.inputs + self.gate_suffix + NAMED[self.normalisation]
 
     @property
@@ -100,7 +101,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """With the network's angle and its variance; its process noise holds for the next step."""
+        """Add the network's angle and its variance; its process noise is that of the next step."""
         added = self.pseudo_of(self.network_samples(sample[None]))
         if added.process is not None:
             memory["noise"] = np.diag(added.process[0])
@@ -109,7 +110,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         )
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Those of the filter and of the network."""
+        """Weights of the filter, ``filter.…``, and of the network, ``network.…``."""
         parts = {"filter": DugoffUkf.weights(self), "network": SampleNetworkEstimator.weights(self)}
         return {
             f"{part}.{name}": values
@@ -118,7 +119,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back."""
+        """Set weights of the filter and of the network."""
         parts: dict[str, dict[str, np.ndarray[Any, Any]]] = {"filter": {}, "network": {}}
         for name, values in weights.items():
             part, _, weight_name = name.partition(".")
@@ -135,14 +136,14 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         return self.learns_from
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Those of the filter's identification."""
+        """Overrides that the filter's identification needs."""
         patterns = super().unmatched_patterns(training.identification, recordings)
         return tuple(
             pattern.replace("training.", "training.identification.", 1) for pattern in patterns
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Filter and network."""
+        """Values of filter and network for the C template."""
         values = {**super().c_values(), **self.network.c_values()}
         return values | {
             "network": True,

@@ -1,6 +1,4 @@
-"""Baseline: steady cornering with the priors of the self-calibrating filter; nothing is learnt and
-nothing is identified.
-"""
+"""Baseline: steady cornering with the priors of the self-calibrating filter, without a fit."""
 
 from __future__ import annotations
 
@@ -77,7 +75,7 @@ class PriorMap(Recursive):
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its two numbers."""
+        """The numbers b and k of the C template."""
         about = "Steady cornering of a linear single track with typical numbers."
         return {"about": about, "b": self.b, "k": self.k}
 

@@ -285,9 +285,7 @@ class RationalTrack(SideslipFilter):
         return filter_extended(self.model(), samples, levels, first, gate, refused, crossfall)
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
-        """Cornering stiffnesses [N/rad], c₁ [rad²] and friction of states (T, n); see
-        `RationalModel`.
-        """
+        """Cornering stiffnesses [N/rad], c₁ [rad²] and friction of states (T, n)."""
         return self.model().quantities(states)
 
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
@@ -309,8 +307,9 @@ class RationalTrack(SideslipFilter):
 
 
 class RationalFilter(RationalTrack):
-    """Kalman filter of sideslip angle, yaw rate, their rates and, if adapted, tyre parameters, over
-    `TyreTrack`.
+    """Kalman filter over `TyreTrack`.
+
+    Its states are sideslip angle, yaw rate, their rates and, if adapted, tyre parameters.
 
     Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process
     noise Δt B Λ Bᵀ comes from the steering angle and the drift of tyre parameters. Below the
@@ -372,8 +371,9 @@ class RationalFilter(RationalTrack):
     def fit_members(
         cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
     ) -> list[FitRecord]:
-        """Fit axle curves to the reference sideslip of the training recordings, then find the noise
-        levels; see `NoiseTuningSettings`.
+        """Fit axle curves to the reference sideslip, then search noise levels.
+
+        See `NoiseTuningSettings`.
 
         Members of one seed cannot differ, others only by Optuna's trials.
         """

@@ -161,7 +161,7 @@ class Recursive(Estimator):
 
     @property
     def n_parameters(self) -> int:
-        """How many numbers are not given."""
+        """Number of values that are not given."""
         return len(self.unknown)
 
     @classmethod
@@ -194,7 +194,7 @@ class Recursive(Estimator):
         return [replace(record, metrics=metrics)] * len(members)
 
     def mean_squared_error(self, recordings: Sequence[Recording]) -> float:
-        """Of vy against ``vy_ref`` with the present `values` [m²/s²]; NaN without recordings."""
+        """Mean squared error of vy with the present `values` [m²/s²]; NaN without recordings."""
         errors = []
         for recording in recordings:
             samples = recording.stack(self.channels)
@@ -247,7 +247,7 @@ def _fitted_number(name: str) -> property:
 
 @numba.njit(error_model="numpy")
 def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
-    """State after the last sample; writes the states after all samples into ``estimates``, (T, n)."""
+    """State after the last sample; writes those after all samples into ``estimates``, (T, n)."""
     for k in range(len(samples)):
         state = step(numbers, state, samples[k])
         for i in range(len(state)):

@@ -67,7 +67,7 @@ class StaticMap(Recursive):
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its two numbers."""
+        """The numbers b and k of the C template."""
         return {
             "about": "Steady cornering of a linear single track, its two numbers by least squares.",
             **self.values,

@@ -17,8 +17,7 @@ from vehest.estimators.networks.velocity_recurrent import (
 
 
 class VelocityLstmNetwork(VelocityNetwork):
-    """An LSTM over the sensors, and dense layers over its hidden state and the velocities estimated
-    one sample before.
+    """An LSTM over the sensors, and dense layers over its hidden state and the last velocities.
 
     h⁺, c⁺ = LSTM(h, c, x),  y⁺ = W₂ relu(W₁ [d(h⁺), y] + b₁) + b₂
     with x, y standardised, d dropout
@@ -37,9 +36,7 @@ class VelocityLstmNetwork(VelocityNetwork):
         self.read_out = nn.Linear(settings.n_dense, len(settings.outputs))
 
     def start(self, velocities: Tensor) -> State:
-        """Hidden state and cell of zero, and the velocities as the estimate before the first
-        sample.
-        """
+        """Hidden state and cell of zero, and the velocities as the estimate before."""
         zeros = velocities.new_zeros(1, len(velocities), self.recurrent.hidden_size)
         return (zeros, zeros, (velocities - self.output_mean) / self.output_scale)
 

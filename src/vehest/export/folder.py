@@ -1,4 +1,4 @@
-"""An export on disk: sources, vectors and what people need to know, written whole or not at all."""
+"""Writes an export: sources, vectors and README, completely or not at all."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def readme(
     has_trust: bool,
     elsewhere: bool,
 ) -> str:
-    """What people need to know of an export: how it is called, units, licences."""
+    """README of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
     reasons = {
         kind: text

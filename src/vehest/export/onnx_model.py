@@ -28,7 +28,7 @@ from vehest.estimators.velocity_lstm import VelocityLstm
 from vehest.training.members import prepare
 
 OPSET = 18
-"""Of the ai.onnx operators."""
+"""Version of the ai.onnx operators."""
 
 _UNITS = {"vy": "m/s", "vx": "m/s", "yaw_rate": "rad/s", "sideslip": "rad"}
 

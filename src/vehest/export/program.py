@@ -158,7 +158,7 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
 
 
 def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
-    """What the templates of the contract are filled in with."""
+    """Variables of the contract's templates."""
     estimator = stepper.estimator
     monitor = stepper.monitor
     rate = float(estimator.settings.rate_hz)
@@ -204,8 +204,9 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
 
 
 def guard_table(guard: Guard) -> dict[str, Any]:
-    """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged
-    and that a new level has to stand.
+    """Limits of each channel, longest runs, bridged samples, and samples that confirm a new level.
+
+    A row of limits is low, high, jump, lower and upper stop.
     """
     runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard.limits[:, 3]]
     limits = _endless(guard.limits[:, [0, 1, 2, 4, 5]]).tolist()

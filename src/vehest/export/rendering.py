@@ -89,8 +89,7 @@ def typed(source: str, precision: Precision) -> str:
 
 
 def literal(value: float, precision: Precision) -> str:
-    """A C literal, without suffix, that reads back to the same double or to the float nearest to
-    the value.
+    """A C literal, without suffix, that reads back to the same double or the nearest float.
 
     Raises
     ------

@@ -47,9 +47,7 @@ def replayed(
 
 
 def in_float64(estimator: Estimator) -> Estimator:
-    """The same estimator with weights that compute in float64, which networks that were trained in
-    float32 do not.
-    """
+    """The same estimator with weights in float64, also where it was trained in float32."""
     twin = type(estimator)(estimator.settings)
     twin.preparation = estimator.preparation
     twin.load_weights(

@@ -1,6 +1,6 @@
-"""Values of a car that a model's settings take, and a car's record.
+"""Values of a car as settings of a model, and a car's record.
 
-What `vehest identify` finds on its drives, in YAML.
+`vehest identify` identifies the record's values on drives and writes them as YAML.
 """
 
 from __future__ import annotations
@@ -194,9 +194,7 @@ def _values_of_dataset(
     settings: Mapping[str, Any],
     record: CarRecord | None,
 ) -> dict[str, float]:
-    """Values of a data set's car that neither the command line nor the record nor the training
-    decides.
-    """
+    """Values of a data set's car that command line, record and training leave open."""
     wheelbase = settings.get("wheelbase", None if record is None else record.wheelbase)
     if wheelbase not in (None, car.wheelbase):
         return {}  # another car is meant
@@ -215,8 +213,9 @@ def _is_changed(model: SelfCalibrating, name: str) -> bool:
 
 
 def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) -> SelfCalibrating:
-    """The filter with a car's wheelbase and, as priors, its leakage and rear axle, deviations
-    widened; errors of `with_settings`.
+    """The filter with a car's wheelbase and, as priors, its leakage and rear axle.
+
+    Deviations are widened. Errors are those of `with_settings`.
 
     Compliance and grip are found anew: tyres and road change them, and estimates that started from
     them were worse.

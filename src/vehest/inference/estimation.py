@@ -26,8 +26,9 @@ def estimate_recording(
     trust: Trust | None = None,
     same_vehicle: bool | None = None,
 ) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it, guarded as online
-    (`vehest.trust.contract`); raises `DataError`.
+    """Bring a recording to the model's rate and run the model on it, guarded as online.
+
+    See `vehest.trust.contract`; raises `DataError`.
     """
     prepared = prepared_recording(model, recording)
     elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle, recording.car)
@@ -36,9 +37,7 @@ def estimate_recording(
 
 
 def estimate_parts(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate]:
-    """The estimates of parts, each made by a thread, in compiled code, while the next part is read,
-    checked and resampled.
-    """
+    """Estimate parts, each in a thread while the next one is read, checked and resampled."""
     with ThreadPoolExecutor(1) as thread:
         going: list[Future[Estimate]] = []
         for part in parts:

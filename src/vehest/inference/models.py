@@ -38,7 +38,7 @@ SHIPPED_NOTES = {
     "is patented by its authors (PCT/IT2023/050058); errors and limits: "
     "docs/estimators/self_calibrating.md",
 }
-"""What users of these models should know, in one line; their model.yaml says more."""
+"""Notes on these models in one line; their model.yaml says more."""
 CALIBRATION_STAGE = "calibrate"
 """Stage that calibrates models, and its folder in an output root."""
 
@@ -87,8 +87,9 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
 def open_model(
     name: str, output: Path, say: Callable[[str], None]
 ) -> tuple[Path, Estimator, Trust | None]:
-    """A model's folder, found as `find_model` does, the model with the preparation of its training
-    data, and its calibration.
+    """Find a model as `find_model` does and open it.
+
+    Returns its folder, the model with the preparation of its training data, and its calibration.
     """
     folder = find_model(name, output, say)
     if (folder / MANIFEST).is_file():
@@ -111,10 +112,7 @@ def is_training_recording(model_folder: Path, recording_id: str) -> bool:
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
-    """Method and transforms of a model's training data.
-
-    New recordings must be prepared the same way.
-    """
+    """Method and transforms of a model's training data, which new recordings need too."""
     return read_description(model_folder).about.downsample.as_plain()
 
 

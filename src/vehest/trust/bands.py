@@ -246,9 +246,7 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
 def with_bands(
     estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False
 ) -> Estimate:
-    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and
-    ``band_sideslip`` [rad]; raises `DataError`.
-    """
+    """Add 90 % half widths ``band_vy`` [m/s] and ``band_sideslip`` [rad] to an estimate."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
     return replace(
@@ -472,8 +470,9 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
 def pooled_quantile(
     scores: FloatArray, blocks: NDArray[np.int64], level: float
 ) -> tuple[float, bool]:
-    """The level's quantile of scores pooled over K blocks, each of the same weight, with 1/(n + 1)
-    of the weight at infinity.
+    """The level's quantile of scores pooled over K blocks of equal weight.
+
+    1/(n + 1) of the weight is at infinity.
 
     n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in
     blocks of m on average, ρ the intraclass correlation of "below the quantile". If scores of a
@@ -556,8 +555,7 @@ def block_labels(
 
 
 def turns_of(yaw_rate: FloatArray, rate_hz: float) -> NDArray[np.int64]:
-    """Number of the stretch, from the start of one turn to that of the next, that each sample
-    belongs to, (T,).
+    """Number of the turn that each sample belongs to, (T,).
 
     A turn starts where |yaw rate| rises over 0.05 rad/s, at the earliest 2 s after the one before;
     what is left at the end and shorter than that belongs to the last.

@@ -1,5 +1,6 @@
-"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`GuardedRun`), by
-the same compiled recursions.
+"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`GuardedRun`).
+
+Both use the same compiled recursions.
 
     received rows -> guard -> health -> estimator -> watch -> verdict, bands -> estimate
 
@@ -66,8 +67,7 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
 
 
 class GuardedRun:
-    """An estimator under the contract on a recording, or on its parts one after another, to the
-    same bits.
+    """An estimator under the contract on a recording, or on its parts to the same bits.
 
     Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is
     neither band nor health of channels. The state of a protocol, ``initial_state``, is that at the
@@ -196,8 +196,9 @@ class GuardedRun:
         return done, watched.lost
 
     def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
-        """The estimator's v after each row of a piece, (T,), which goes on from a state or from the
-        rows before it, or begins anew.
+        """The estimator's v after each row of a piece, (T,).
+
+        It continues from a state or from the rows before the piece, or begins anew.
         """
         # rows after the last, whose values no estimate at their time depends on
         extra = self.estimator.horizon_steps
@@ -244,8 +245,9 @@ class GuardedRun:
     def _estimated(
         self, piece: Recording, state: Any, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        """The estimate of a piece from a state, which is updated, or from the initial state of a
-        protocol where it is None.
+        """The estimate of a piece from a state, which is updated.
+
+        Where the state is None, it starts from the initial state of a protocol.
         """
         estimator = self.estimator
         if not estimator.continues:
@@ -380,7 +382,7 @@ class GuardedStepper(Stepper):
 
     @property
     def delay(self) -> float:
-        """Of slow signals through the filter from the bus's rate [s]; 0 without one."""
+        """Delay of slow signals through the filter from the bus's rate [s]; 0 without one."""
         return self.front_end.delay if self.front_end is not None else 0.0
 
     def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:

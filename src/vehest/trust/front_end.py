@@ -23,8 +23,9 @@ SLACK = 1e-9
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
-    """Channels (T, C) at the model's rate as the filter would pass them from a bus `USUAL_RATIO`
-    times as fast; NaN is bridged.
+    """Channels (T, C) at the model's rate as the filter passes them from a faster bus.
+
+    The bus is `USUAL_RATIO` times as fast; NaN is bridged.
 
     They are brought to that rate without phase, then filtered causally and thinned out again; the
     filter starts as in a steady signal. What lay above the model's Nyquist frequency is gone in
@@ -58,8 +59,7 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 
 class FrontEnd:
-    """Accepted samples of a bus through a causal low-pass, of which as many are passed on as the
-    estimator's rate asks for.
+    """Causal low-pass from a bus's rate to the estimator's, over accepted samples.
 
     A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. A channel that is
     not measured holds its last value in the filter, and is passed on as not measured. After longer
@@ -109,7 +109,7 @@ class FrontEnd:
 
     @property
     def delay(self) -> float:
-        """Of slow signals through the filter [s]."""
+        """Delay of slow signals through the filter [s]."""
         if not len(self.sections):
             return 0.0
         numerator, denominator = scipy.signal.sos2tf(self.sections)

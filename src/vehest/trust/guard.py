@@ -190,8 +190,9 @@ def _tan_sideslip(recording: Recording) -> FloatArray:
 
 
 def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
-    """Twice the longest time that a channel stood still between its stops while the car moved [s];
-    0 if it has no limit.
+    """Twice the longest time that a channel stood still while the car moved [s]; 0: no limit.
+
+    Only time between its stops counts.
     """
     if CHANNELS[name].rests or not recordings:
         return 0.0
@@ -214,9 +215,9 @@ def longest_run(flags: NDArray[np.bool_]) -> int:
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
-    """Where a steering is at its lock, (lower, upper).
+    """Locks of a steering, (lower, upper): where it stayed for three samples in training.
 
-    Where it stayed for three samples in training, within a tenth of its extremes.
+    They lie within a tenth of its extremes.
 
     Resampling rings at a stop, so that the extreme itself may lie beyond it. Channels other than
     `STEERING` have no stops.

@@ -387,9 +387,7 @@ class HealthModel:
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Limits of today's 7 C + R statistics from files of earlier versions, which had 23 C + 4 R or
-    17 C + 3 R.
-    """
+    """Limits of 7 C + R statistics from files of earlier versions: 23 C + 4 R or 17 C + 3 R."""
     forms = {
         23 * channels + 4 * relations: 7 * channels,
         17 * channels + 3 * relations: 5 * channels,
@@ -583,9 +581,7 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """Add the mean offset of each channel by the likelihood ratio over all drives, and the largest
-    weight of a sample.
-    """
+    """Add the mean offset of each channel over all drives, and the largest weight of a sample."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
@@ -601,9 +597,7 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
-    """Largest value of each of K statistics in B blocks of `BLOCK_SECONDS`, without limits, shape
-    (B, K).
-    """
+    """Largest values of K statistics in B blocks of `BLOCK_SECONDS`, (B, K), without limits."""
     packed = replace(model, limits=()).packed()
     n_statistics = len(model.statistics)
     length = max(round(BLOCK_SECONDS * model.rate_hz), 1)
@@ -720,8 +714,9 @@ def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDA
 
 
 def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
-    """Describe the share of a drive outside the range of the training, by the counts of
-    `outside_domain`; empty if there is none.
+    """Describe the share of a drive outside the training's range; empty if there is none.
+
+    ``counts`` are of `outside_domain`.
     """
     *numbers, outside, samples = counts.tolist()
     named = [

@@ -709,9 +709,9 @@ def _wheel(channel, slow, state):
 
 @part()
 def _relation_kind(j, model, state):
-    """Of the last second.
+    """Kind of a relation in the last second.
 
-    `FREE` if a relation holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small.
+    `FREE` if it holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small.
     """
     product = state.product[j]
     expected = state.expected_power[j]

@@ -118,7 +118,7 @@ class CarFilter(nn.Module):
         )
 
     def initial_covariance(self) -> Tensor:
-        """Of a state that is known, (5, 5)."""
+        """Covariance of a state that is known, (5, 5)."""
         covariance: Tensor = self.initial_noise(
             self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0)
         )

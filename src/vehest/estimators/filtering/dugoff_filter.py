@@ -1,5 +1,4 @@
-"""Filters recordings and single samples by the unscented filter of a single track on Dugoff's
-tyres.
+"""The unscented filter of a single track on Dugoff's tyres, on recordings and samples.
 
     recordings --split_samples--> measurements (T, 4), inputs (T, 3)
     --`TrackFilter`--> states --> estimates
@@ -126,8 +125,9 @@ class DugoffFilter(SigmaPointEstimator):
         return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        """Covariance of a step, (2, 2), and those of measurements where the car is linear and where
-        it is not, (2, 4, 4).
+        """Covariance of a step, (2, 2), and covariances of measurements, (2, 4, 4).
+
+        The first of measurements is that of the linear range, the second that of the other.
 
         Raises
         ------
@@ -157,8 +157,9 @@ class DugoffFilter(SigmaPointEstimator):
         return process, torch.diag_embed(variances)
 
     def split_samples(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Measurements (T, 4), NaN where forces are not measured, and inputs (T, 3) of samples (T,
-        n) of ``channels``.
+        """Measurements (T, 4) and inputs (T, 3) of samples (T, n) of ``channels``.
+
+        Forces that are not measured are NaN.
         """
         yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
         wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
@@ -318,15 +319,17 @@ class DugoffFilter(SigmaPointEstimator):
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """A measurement (m,) and its covariance with those that a network adds, whose process noise
-        is left in ``memory``.
+        """A measurement (m,) and its covariance with those that a network adds.
+
+        The network's process noise is left in ``memory``.
         """
         return measurement, noise
 
 
 def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
-    """Covariances of what sensors measure and a network adds, (..., 5, 5), differentiable in the
-    variance.
+    """Covariances of sensors and of a network's angle, (..., 5, 5).
+
+    They are differentiable in the variance of the angle.
 
     Parameters
     ----------

@@ -28,12 +28,12 @@ class GatedFilter(Estimator):
 
     @property
     def gate_suffix(self) -> str:
-        """Of the name of a variant."""
+        """Suffix of a variant's name."""
         return "" if self.gate is None else f"_gate{self.gate:g}"
 
     @property
     def gate_title(self) -> str:
-        """Of the title."""
+        """Suffix of the title."""
         return "" if self.gate is None else f", innovations gated at {self.gate:g} sigma"
 
     def c_values(self) -> dict[str, Any]:

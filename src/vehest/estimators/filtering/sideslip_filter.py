@@ -32,7 +32,7 @@ EXACT_STATE_DEVIATION = 1e-6
 
 
 class FilteredStates(NamedTuple):
-    """What a filter knows after T samples."""
+    """Result of a filter over T samples."""
 
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
     # standard deviations of all states, (T, n), where the filter gives them
@@ -46,9 +46,7 @@ class FilteredStates(NamedTuple):
     last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:
-        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured, of some rows;
-        (T,) each.
-        """
+        """Normalised innovation squared, eᵀS⁻¹e, and number of measurements, (T,) each."""
         (first_variance, covariance), (_, second_variance) = np.moveaxis(
             self.innovation_covariance[rows], 0, 2
         )
@@ -62,9 +60,9 @@ class FilteredStates(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What a filter carries on.
+    """State of a filter between calls.
 
-    The last sample, which is filtered again without its measurements, and the state after it.
+    The last sample is filtered again without its measurements.
     """
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
@@ -73,9 +71,7 @@ class FilterState(NamedTuple):
 
 
 class SideslipFilter(GatedFilter, Recursive):
-    """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan
-    β.
-    """
+    """A filter whose state begins with sideslip angle β and yaw rate r; v = u tan β."""
 
     channels = ("yaw_rate", "vx", "ay", "steer")
     skippable = ("yaw_rate", "ay")
@@ -127,15 +123,16 @@ class SideslipFilter(GatedFilter, Recursive):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its
-        measurement; ``refused``: see `Gate`.
+        """Filter samples of ``channels``, (T, 4).
+
+        ``first`` is the state before the first measurement; ``refused``: see `Gate`.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'"
         )
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
-        """What further states, (T, n), say: name -> (T,)."""
+        """Quantities of an `Estimate` by further states, (T, n): name -> (T,)."""
         return {}
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> FilterState:
@@ -147,9 +144,7 @@ class SideslipFilter(GatedFilter, Recursive):
         )
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
-        """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what
-        further states say.
-        """
+        """Lateral velocity [m/s], yaw rate [rad/s], covariances, innovations, other quantities."""
         rows = samples
         refused = state.refused.copy()
         if state.sample is not None:

@@ -1,4 +1,4 @@
-"""What the families share that filter by `vehest.filters.unscented_scan`: estimates, stepper."""
+"""Base of families that filter by `vehest.filters.unscented_scan`, and their stepper."""
 
 from __future__ import annotations
 

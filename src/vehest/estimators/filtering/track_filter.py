@@ -146,8 +146,9 @@ def in_nonlinear_range(
 
 
 def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
-    """One figure of the errors of several recordings, of each the sum of its squared errors, and
-    over how many samples.
+    """One figure of the errors of several recordings.
+
+    ``sums`` has the sum of squared errors and the number of samples of each.
 
     ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the
     recordings' root mean squared errors, in which a recording counts by its error, not by the
@@ -165,8 +166,9 @@ def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
 
 
 def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
-    """Rows of similar length, so many that together, padded to the longest, they hold at most so
-    many samples; one at least.
+    """Groups of rows of similar length, each of at most so many samples when padded.
+
+    A group has at least one row.
     """
     rows: list[int] = []
     for row in sorted(range(len(lengths)), key=lambda index: -lengths[index]):
@@ -179,8 +181,9 @@ def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
 
 
 def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
-    """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with
-    their last row (none).
+    """Arrays (T, n) of different lengths as one, (B, max T, n).
+
+    Shorter ones are filled with a value or, for None, with their last row.
     """
     longest = max(len(array) for array in arrays)
     return np.stack(

@@ -55,7 +55,7 @@ NORMAL_95 = 1.959964
 
 
 class AxleMotion(NamedTuple):
-    """What the axles do along drives; slips and forces have a row an axle, front and rear."""
+    """Motion of the axles along drives; slips and forces have a row an axle, front and rear."""
 
     slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
     force: FloatArray  # lateral forces, (2, N) [N]

@@ -1,5 +1,4 @@
-"""Sigma points through the single track on Dugoff's tyres (`DugoffTrack`), compiled, with the
-adjoint.
+"""Sigma points through `DugoffTrack`, a single track on Dugoff's tyres, and the adjoint.
 
 Equations: see `vehest.vehicle.dugoff`, which is the readable definition in torch. With F_F, F_R the
 axle forces and F' their derivatives by the lateral velocity of their axle, which the forward pass
@@ -9,8 +8,8 @@ saves beside the inputs:
     F̄_F = Δt (v̄⁺/m + l_F r̄⁺/I_zz) F_F',   F̄_R = Δt (v̄⁺/m - l_R r̄⁺/I_zz) F_R'
     v̄ = v̄⁺ + F̄_F + F̄_R,   r̄ = r̄⁺ - Δt u v̄⁺ + l_F F̄_F - l_R F̄_R
 
-The observation (a_y, r, F_F, F_R and, for five measurements, β = atan v/u) is treated alike. There
-are no sums over points.
+The observation (a_y, r, F_F, F_R and, for five measurements, β = atan v/u) is treated alike. Order
+of sums: there are none over points.
 """
 
 from __future__ import annotations

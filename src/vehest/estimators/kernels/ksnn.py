@@ -96,9 +96,9 @@ def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
 def c_tables(
     theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool
 ) -> dict[str, Any]:
-    """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q).
+    """Values of the C template of a network with rows of `packed`, (P, 8 + 6 Q).
 
-    Without ``bias`` their biases are left out.
+    Biases are left out without ``bias``.
     """
     n_local = len(theta)
     n_hidden = (theta.shape[1] - LINEAR) // 6

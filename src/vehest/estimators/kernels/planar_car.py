@@ -115,11 +115,11 @@ class CompiledPlanarCar(PointModel):
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
-        """With matrix products on their thread."""
+        """Context in which matrix products stay on their thread."""
         return single_blas_thread()
 
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
-        """With whether they are wanted; those that are not are never written."""
+        """Gradients and whether they are required; otherwise they are never written."""
         learning = bool(self.parameters)
         return (*(gradients if learning else (*self.car[0][:6], self.car[1])), learning)
 

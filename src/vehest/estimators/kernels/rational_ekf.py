@@ -1,6 +1,4 @@
-"""The extended Kalman filter over `TyreTrack`, compiled.
-
-Analytic Jacobians, one pass over a recording.
+"""The extended Kalman filter over `TyreTrack`, compiled: one pass with analytic Jacobians.
 
 For each sample, with A = ∂f/∂x, H = ∂h/∂x (the readable definition of f and h in torch is
 `vehest.vehicle.tyre_track`):

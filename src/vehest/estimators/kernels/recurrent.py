@@ -226,9 +226,9 @@ def _lstm_adjoint(size, room, k):
 
 @part(_nrt=False)
 def _row_of_state(gates, g):
-    """Which saved row is the adjoint of what the state adds to gate g's argument.
+    """Saved row of the adjoint of U_g h, the state's part of gate g's argument.
 
-    A candidate's is its own times the reset.
+    That of a candidate is multiplied by the reset.
     """
     return 3 if gates == GRU and g == 2 else g
 
@@ -292,7 +292,7 @@ def _sum(size, room, sums):
 
 @part(_nrt=False)
 def _sum_block(windows, saved, sums, at, first, count, strides, weights):
-    """Of ``count`` inputs from ``first`` on, with one row of adjoints.
+    """Sum products of ``count`` inputs from ``first`` on with one row of adjoints.
 
     The last block may overlap the one before.
     """

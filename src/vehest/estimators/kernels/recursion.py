@@ -1,13 +1,11 @@
-"""Compiled recursions over windows, for members together.
-
-Predictions, gradients, and batches of training.
+"""Predictions, gradients and training of compiled recursions over windows, for batched members.
 
     parameters (M, K), series (T, C), starts (M, B)
     --`Recursion.loop`--> predictions (M, B), gradient (M, K), steps of Adam
 
 A network's module supplies one compiled loop over members and batches; this one calls it on several
 threads, each for its own members, without a barrier between the steps of training. Windows lie side
-by side in `vehest.lanes`.
+by side in `vehest.lanes`. Order of sums: that of the network's module; members do not mix.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Networks of two hidden layers over single samples, compiled, with masks of dropout that follow
-from seeds.
+"""Networks of two hidden layers over single samples, compiled, with seeded dropout.
 
     h₁ = d₁ relu(W₁ x + b₁),  h₂ = d₂ relu(W₂ h₁ + b₂),  o = W₃ h₂ + b₃
     d: 0 or 256/(256 - dropped) (dropout)
@@ -35,9 +34,9 @@ LEVELS = 256  # dropout drops a whole number of so many parts of hidden values
 LAYERS = 3  # two hidden ones and the output
 
 Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
-"""Of outputs (B, O) and targets (B,).
+"""Loss of outputs (B, O) and targets (B,): the mean.
 
-The mean loss; its gradient by the outputs, (B, O), is written into the last argument.
+Its gradient by the outputs, (B, O), is written into the last argument.
 """
 
 

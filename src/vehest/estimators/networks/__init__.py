@@ -1,4 +1,1 @@
-"""What network estimators share.
-
-Over windows, over all samples so far, and over single instants.
-"""
+"""Bases of network estimators over windows, over all samples so far, and over single instants."""

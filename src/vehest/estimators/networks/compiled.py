@@ -16,7 +16,7 @@ from vehest.estimators.kernels.recursion import Recursion
 
 
 class CompiledNetwork(ABC):
-    """What a network with a `recursion` has for `vehest.training.members`."""
+    """Base of networks with a compiled `recursion`, for `vehest.training.members`."""
 
     @abstractmethod
     def recursion(self) -> Recursion:

@@ -1,4 +1,4 @@
-"""What networks share that map the measurements of one instant to a sideslip angle.
+"""Base of networks that map the measurements of one instant to a sideslip angle.
 
 Inputs, the network, its samples, its weights.
 """
@@ -39,7 +39,7 @@ without.
 
 Normalisation = Literal["range", "standard"]
 NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
-"""What a normalisation adds to the name of a variant."""
+"""Normalisation -> suffix of the variant's name."""
 
 CHUNK = 50_000  # samples that are estimated at a time
 STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
@@ -264,7 +264,7 @@ def learnt_samples(
 
 
 def reference_sideslip(recording: Recording) -> FloatArray:
-    """What is learnt and scored: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
+    """Reference of training and scores: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
     return np.arctan2(recording["vy_ref"], recording["vx"])
 
 

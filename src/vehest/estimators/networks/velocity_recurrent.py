@@ -1,6 +1,6 @@
-"""What recurrent networks share that estimate a car's velocities from all samples so far.
+"""Base of recurrent networks that estimate a car's velocities from all samples so far.
 
-Training, estimating, running online.
+It trains them on sequences, estimates, and runs them online.
 """
 
 from __future__ import annotations
@@ -268,9 +268,9 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         )
 
     def measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
-        """What measurements alone say of the outputs, (T, O).
+        """Outputs as measured, (T, O).
 
-        Vx, the yaw rate where it is read, and 0 for the lateral velocity.
+        They are vx, the yaw rate where it is read, and 0 for the lateral velocity.
         """
         n = len(channels["vx"])
         columns = [
@@ -337,7 +337,7 @@ class _Batch(NamedTuple):
     goes_on: bool = False
 
     def stretch(self, first: int, end: int) -> _Batch:
-        """Its samples from ``first`` to ``end``."""
+        """The batch restricted to samples ``first`` to ``end``."""
         parts = {name: getattr(self, name) for name in ("inputs", "targets", "mask", "counted")}
         return self._replace(
             goes_on=first > 0,
@@ -346,9 +346,7 @@ class _Batch(NamedTuple):
 
 
 class _Drives:
-    """Recordings one after another as tensors, (N, …), from which sequences are cut by their first
-    samples.
-    """
+    """Recordings one after another as tensors, (N, …), from which sequences are cut."""
 
     def __init__(
         self,

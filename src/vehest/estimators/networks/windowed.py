@@ -1,4 +1,4 @@
-"""What networks over windows of past samples share: fitting, estimating, running online, saving."""
+"""Base of networks over windows of past samples: fitting, estimating, running online, saving."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ TARGET = "vy_ref"
 
 
 class WindowedEstimator(Network):
-    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et
-    al. 2023, Fig. 1).
+    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1.
+
+    Source: Da Lio et al. 2023, Fig. 1.
 
     The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it
     may have besides, a compiled recursion for example, is in `vehest.training.members`.
@@ -123,9 +124,7 @@ class WindowedEstimator(Network):
         return network
 
     def weights_of_model(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-        """Weights and ranges of another model of the same family and settings, to start a training
-        from (fine-tuning).
-        """
+        """Weights and ranges of a model of the same family and settings, for fine-tuning."""
         start_model = load_model(folder)
         if (start_model.name, start_model.settings) != (self.name, self.settings):
             raise ConfigurationError(
@@ -151,8 +150,9 @@ class WindowedEstimator(Network):
         return self._wrapped(recording, vy)
 
     def predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
-        """Lateral velocity [m/s] one step after the windows of measurements (T, C) that begin at
-        ``starts``, (B,).
+        """Lateral velocity [m/s] one step after windows of measurements (T, C), (B,).
+
+        ``starts``, (B,), are the first rows of the windows.
         """
         import torch
 
