@@ -972,11 +972,13 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.configuration.composition import GIVEN
+    from vehest.configuration.composition import OVERRIDDEN_RATES_KEY
     from vehest.run.setting_lines import config_as_commented_yaml
 
     config = {
-        key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN
+        key: value
+        for key, value in _compose(command, overrides or []).items()
+        if key != OVERRIDDEN_RATES_KEY
     }
     text = as_json_text(config) if as_json else config_as_commented_yaml(config).rstrip()
     echo(text, keep="\n")

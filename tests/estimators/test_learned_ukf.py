@@ -13,7 +13,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
-from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
+from vehest.estimators.filtering.car_filter import MIN_ENTROPY
 from vehest.estimators.learned_ukf import SHORT, LearnedUkf
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
@@ -282,7 +282,7 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
     with torch.no_grad():
         expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
         of_process = with_entropy(
-            made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY
+            made.filter.process_noise(torch.from_numpy(states), nothing), MIN_ENTROPY
         ).numpy()
     np.testing.assert_allclose(
         covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0

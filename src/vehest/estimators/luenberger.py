@@ -1,5 +1,6 @@
-"""Kinematic Luenberger observer with reset: Farrelly & Wellstead 1996, as in Da Lio et al. 2023,
-Appendix A.
+"""Kinematic Luenberger observer with reset.
+
+Source: Farrelly & Wellstead 1996, as in Da Lio et al. 2023, Appendix A.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ class Luenberger(Recursive):
         return {"vy": vy, "vx": vx}, (float(vy[-1]), float(vx[-1]))
 
     def c_values(self) -> dict[str, Any]:
-        """Its gain and threshold."""
+        """Gain and threshold for the C template."""
         return {**self.values, "step": 1.0 / self.rate_hz}
 
 

@@ -50,7 +50,8 @@ class StaticMap(Recursive):
         scale = np.sqrt(np.mean(np.square(design), axis=0))
         if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
             raise DataError(
-                "the training recordings do not determine a static map: the car hardly turns, or always at the same speed"
+                "the training recordings do not determine a static map: the car hardly turns, or "
+                "always at the same speed"
             )
         return dict(
             zip(
@@ -66,7 +67,7 @@ class StaticMap(Recursive):
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its two numbers."""
+        """The numbers b and k of the C template."""
         return {
             "about": "Steady cornering of a linear single track, its two numbers by least squares.",
             **self.values,

@@ -22,7 +22,7 @@ from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import VALIDATION
 from vehest.data.text_files import write_json
-from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.blas import single_blas_thread
 from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
@@ -203,7 +203,7 @@ def _write(
         (artefacts.titles[name], timings[name], {model.name: model.title for model in part.models})
         for name, part in artefacts.parts.items()
     ]
-    with one_blas_thread():
+    with single_blas_thread():
         write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times))
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
         raise ConfigurationError(

@@ -15,8 +15,8 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.report.document import Column, Figure, Table

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, new_figure

@@ -21,7 +21,7 @@ from vehest.evaluation.bands import proportion_interval
 from vehest.report.document import Block, Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import by_name
-from vehest.trust.bands import SHOWN_LEVEL, block_labels, pooled_quantile
+from vehest.trust.bands import CHANNEL_LEVEL, block_labels, pooled_quantile
 
 LEARNT = "learnt on"  # in the board's column "car"
 DRAWS = 100
@@ -75,7 +75,7 @@ def scores_of(part: PartArtefacts, model: EvaluatedModel, test_set: str) -> Scor
 def holds_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> bool:
     """Whether 0.90 lies in the 95 % interval of a share, by manoeuvres counted from 0, (N,)."""
     low, high = _interval(inside, manoeuvres)
-    return low <= SHOWN_LEVEL <= high
+    return low <= CHANNEL_LEVEL <= high
 
 
 def share_if_shuffled(
@@ -91,7 +91,7 @@ def share_if_shuffled(
     for _ in range(draws):
         order = generator.permutation(calibration.number + test.number)
         learnt = (order < calibration.number)[labels]
-        factor, _ = pooled_quantile(values[learnt], labels[learnt], SHOWN_LEVEL)
+        factor, _ = pooled_quantile(values[learnt], labels[learnt], CHANNEL_LEVEL)
         manoeuvres = np.unique(labels[~learnt], return_inverse=True)[1]
         held += holds_level(values[~learnt] <= factor, manoeuvres)
     return held / draws
