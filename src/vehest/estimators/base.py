@@ -59,10 +59,10 @@ def require_learnable(
             if name not in recording:
                 hint = (hints or {}).get(name, "")
                 raise DataError(
-                    f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}"
+                    f"recording '{recording.id}' has no channel '{name}', on which estimator '{estimator}' is trained{hint}"
                 )
             if name not in skippable and np.isnan(recording[name]).any():
-                what = f"channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; cut them out in conf/split"
+                what = f"channel '{name}' has gaps, on which estimator '{estimator}' cannot be trained; cut them out in conf/split"
                 raise DataError(f"recording '{recording.id}': {what}")
 
 

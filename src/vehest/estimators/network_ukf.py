@@ -31,7 +31,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     skippable = ()
     least_variance: float = setting(
         LEAST_VARIANCE,
-        "added to the variance of the network's angle, so that no filter takes it for exact; ε of Eq. 6",
+        "added to the variance of the network's angle, so that no filter assumes it to be exact; ε of Eq. 6",
         unit="rad²",
         positive=True,
     )

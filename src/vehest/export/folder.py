@@ -147,7 +147,7 @@ def refuse_unresolved(trust: Trust | None) -> None:
             and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest
         ):
             raise ConfigurationError(
-                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size in the training, which float cannot "
                 f"resolve; export with --precision double"
             )
 

@@ -376,7 +376,7 @@ class Runner(Stages):
             for label in labels:
                 self.messages.line("plan", "train", label)
             self.messages.line(
-                "plan", "train", f"{len(labels)} in all", f"{n_there} more are there"
+                "plan", "train", f"{len(labels)} in all", f"{n_there} others exist"
             )
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):

@@ -99,7 +99,7 @@ class Fault:
                 )
         if CHANNELS[self.channel].is_reference:
             raise ConfigurationError(
-                f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel"
+                f"fault.channel '{self.channel}' is a reference, which no estimator reads; name a measured channel"
             )
         if not applies(self.kind, self.channel):
             fitting = ", ".join(name for name in CHANNELS if applies(self.kind, name))

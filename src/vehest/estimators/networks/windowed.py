@@ -136,7 +136,7 @@ class WindowedEstimator(Network):
     ) -> Estimate:
         if initial_state is not None:
             raise ConfigurationError(
-                f"estimator '{self.name}' has no state to start from: it sees a window of samples only; set evaluation.initial_state=false"
+                f"estimator '{self.name}' has no state to start from: it reads a window of samples only; set evaluation.initial_state=false"
             )
         vy = np.full(len(recording), np.nan)
         starts = window_starts(len(recording), self.window)
@@ -199,7 +199,7 @@ def _check_state(network: nn.Module) -> None:
     for name, module in network.named_modules():
         if getattr(module, "track_running_stats", False):
             raise ConfigurationError(
-                f"{kind}: layer '{name}' ({type(module).__name__}) keeps running statistics, which members do not have; "
+                f"{kind}: layer '{name}' ({type(module).__name__}) keeps running statistics, which batched trainings do not have; "
                 f"use LayerNorm, or track_running_stats=False"
             )
     for name, tensor in network.state_dict().items():

@@ -68,7 +68,7 @@ def _against_best(ranking: Ranking, name: Name) -> str:
     if name == ranking.order[0]:
         return BEST
     pair = ranking.pairs.get((ranking.order[0], name))
-    if pair is None or pair.verdict == "not told apart":
+    if pair is None or pair.verdict == "no significant difference":
         return MISSING if pair is None else NOT_SIGNIFICANT
     return f"+{fixed(-pair.difference, 3)} [{fixed(-pair.high, 3)}, {fixed(-pair.low, 3)}]"
 
