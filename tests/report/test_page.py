@@ -129,7 +129,7 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
     for text, view in {
         "": (100.0, 120.0),
         "whole range": (0.0, 3599.95),
-        "busiest 20 s": (100.0, 120.0),
+        "20 s of largest sideslip": (100.0, 120.0),
     }.items():
         if text:
             press(chromium, text)
@@ -153,7 +153,7 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
 
 def test_errors_can_be_taken_over_the_segment_in_view(chromium, hour):
     opened(chromium, hour)
-    press(chromium, "busiest 20 s")
+    press(chromium, "20 s of largest sideslip")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
     assert chromium.find_element("css selector", ".said").text.startswith(
         "401 of 72000 samples, 20.1 s"
