@@ -142,6 +142,6 @@ def basis_sentence(ranking: Ranking, test_text: str) -> str:
     return (
         f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
         f"{ranking.block_seconds:.3g} s and over seeds, "
-        "corrected by Holm. Effective number of blocks, by the squared error of the best: "
-        f"{ranking.effective_blocks:.0f}."
+        "corrected for several comparisons (Holm). The squared error of the best estimator is "
+        f"spread as over {ranking.effective_blocks:.0f} equal blocks."
     )
