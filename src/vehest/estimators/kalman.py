@@ -99,7 +99,11 @@ class KalmanFilter(SideslipFilter):
 
     name = "kalman"
     title = "Kalman filter"
-    trials = (Trial(5, "single-track (bicycle-model) Kalman filter; only noise levels are fitted", "{car}"),)
+    trials = (
+        Trial(
+            5, "single-track (bicycle-model) Kalman filter; only noise levels are fitted", "{car}"
+        ),
+    )
     learns_from = ()
     may_be_nan = LEVELS
     template = "kalman"

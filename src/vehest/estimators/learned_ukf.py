@@ -88,7 +88,9 @@ class CarSettings(Group):
     group = "estimator.car"
     mass: float = setting(5.1, "not trained", unit="kg", least=MASS.lower, most=MASS.upper)
     wheelbase: float = setting(0.33, "not trained", unit="m", least=LENGTH.lower, most=LENGTH.upper)
-    wheel_radius: float = setting(0.05, "not trained", unit="m", least=LENGTH.lower, most=LENGTH.upper)
+    wheel_radius: float = setting(
+        0.05, "not trained", unit="m", least=LENGTH.lower, most=LENGTH.upper
+    )
     yaw_inertia: float = setting(
         F1TENTH["yaw_inertia"],
         "trained from here on",
@@ -206,7 +208,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
         False,
         "whether Pacejka's curves have the E terms of Eq. 3, trained from 0 on; of dynamics=pacejka alone",
     )
-    car: CarSettings = setting(CarSettings(), "parameters of the car, and initial values of those that are trained")
+    car: CarSettings = setting(
+        CarSettings(), "parameters of the car, and initial values of those that are trained"
+    )
 
     def check(self) -> None:
         """Raises `ConfigurationError`: friction that starts below its smallest value, or a curvature of other dynamics."""
