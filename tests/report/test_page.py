@@ -289,6 +289,29 @@ def test_appendices_are_one_folded_list_at_the_end(chromium, toy):
     assert chromium.execute_script(last) == "Note"
 
 
+def test_a_figure_that_scrolls_on_a_phone_says_so(chromium, toy):
+    opened(chromium, toy[0], width=390)
+    places = chromium.execute_script(
+        "return [...document.querySelectorAll('.static')].filter((place) => place.clientWidth)"
+        ".map((place) => [place.scrollWidth > place.clientWidth,"
+        " getComputedStyle(place, '::before').content.includes('scroll sideways')])"
+    )
+    assert {True, False} == {scrolls for scrolls, _ in places}
+    assert all(scrolls == says_so for scrolls, says_so in places)
+
+
+def test_forest_plot_is_beside_the_verdict_on_a_wide_screen(chromium, toy):
+    opened(chromium, toy[0], width=1280)
+    text, figure = chromium.execute_script(
+        "return ['.text', '.text + figure'].map((selector) => {"
+        " const box = document.querySelector(selector).getBoundingClientRect();"
+        " return [box.left, box.right, box.top, box.bottom] })"
+    )
+    assert text[1] <= figure[0]
+    assert text[2] < figure[3]
+    assert figure[2] < text[3]
+
+
 def test_page_shows_the_figure_where_scripts_may_not_run(chromium, toy):
     chromium.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
