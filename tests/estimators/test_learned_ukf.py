@@ -229,7 +229,7 @@ def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
     )
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(
-        DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"
+        DataError, match="has no channel 'vx_ref', on which estimator 'learned_ukf' is trained"
     ):
         estimator().fit(FitData([missing], [missing]), quick())
     gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})

@@ -75,13 +75,13 @@ def require_learnable(
             if name not in recording:
                 hint = (hints or {}).get(name, "")
                 raise DataError(
-                    f"recording '{recording.id}' has no channel '{name}', which estimator "
-                    f"'{estimator}' learns from{hint}"
+                    f"recording '{recording.id}' has no channel '{name}', on which estimator "
+                    f"'{estimator}' is trained{hint}"
                 )
             if name not in skippable and np.isnan(recording[name]).any():
                 raise DataError(
-                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator "
-                    f"'{estimator}' cannot learn from; cut them out in conf/split"
+                    f"recording '{recording.id}': channel '{name}' has gaps, on which estimator "
+                    f"'{estimator}' cannot be trained; cut them out in conf/split"
                 )
 
 

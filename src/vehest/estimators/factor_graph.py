@@ -76,7 +76,7 @@ class FactorGraph(SideslipFilter):
     trials = (
         Trial(
             10,
-            "factor graph over half a second, causal; nothing is learnt",
+            "factor graph over half a second, causal; nothing is fitted",
             "estimator.window=0.5 {car}",
         ),
     )

@@ -100,7 +100,11 @@ class KalmanFilter(SideslipFilter):
 
     name = "kalman"
     title = "Kalman filter"
-    trials = (Trial(5, "Kalman filter over a single track; only noise levels are learnt", "{car}"),)
+    trials = (
+        Trial(
+            5, "single-track (bicycle-model) Kalman filter; only noise levels are fitted", "{car}"
+        ),
+    )
     learns_from = ()
     may_be_nan = LEVELS
     template = "kalman"

@@ -71,9 +71,11 @@ class CarSettings(Group):
     """A small car with one electric motor: what is known, and where learning starts."""
 
     group = "estimator.car"
-    mass: float = setting(5.1, "known", unit="kg", least=MASS.lower, most=MASS.upper)
-    wheelbase: float = setting(0.33, "known", unit="m", least=LENGTH.lower, most=LENGTH.upper)
-    wheel_radius: float = setting(0.05, "known", unit="m", least=LENGTH.lower, most=LENGTH.upper)
+    mass: float = setting(5.1, "not trained", unit="kg", least=MASS.lower, most=MASS.upper)
+    wheelbase: float = setting(0.33, "not trained", unit="m", least=LENGTH.lower, most=LENGTH.upper)
+    wheel_radius: float = setting(
+        0.05, "not trained", unit="m", least=LENGTH.lower, most=LENGTH.upper
+    )
     yaw_inertia: float = setting(
         F1TENTH["yaw_inertia"],
         "trained from here on",
@@ -135,7 +137,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     trials: ClassVar[tuple[Trial, ...]] = (
         Trial(
             14,
-            "filter with learnt dynamics, of electric cars; long",
+            "filter with trained dynamics, of electric cars; long",
             "estimator.car.mass={mass} estimator.car.wheelbase={wheelbase} "
             "training.through.max_epochs=50",
             samples=500,
@@ -175,8 +177,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
     )
     scaled: bool = setting(
         True,
-        "whether networks see and give numbers of about 1; otherwise SI units, as in the "
-        "authors' code",
+        "whether inputs and outputs of the networks are scaled to about 1; otherwise SI units, as "
+        "in the authors' code",
     )
     repair: bool = setting(
         True,
@@ -199,7 +201,9 @@ class LearnedUkf(Network, SigmaPointEstimator):
         "whether Pacejka's curves have the E terms of Eq. 3, trained from 0 on; of "
         "dynamics=pacejka alone",
     )
-    car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
+    car: CarSettings = setting(
+        CarSettings(), "parameters of the car, and initial values of those that are trained"
+    )
 
     def check(self) -> None:
         """Raise `ConfigurationError` where start of friction or curvature do not fit the rest."""

@@ -125,7 +125,7 @@ class Luenberger(Recursive):
         box=(0.0, 0.5),
         of_largest="yaw_rate",
     )
-    style = "#767676", "solid", "s"
+    style = "#5b8c00", "solid", "s"
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Lateral and forward velocity [m/s]."""

@@ -37,8 +37,8 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     skippable = ()
     least_variance: float = setting(
         MIN_VARIANCE,
-        "added to the variance of the network's angle, so that no filter takes it for exact; ε "
-        "of Eq. 6",
+        "added to the variance of the network's angle, so that no filter assumes it to be exact; "
+        "ε of Eq. 6",
         unit="rad²",
         positive=True,
     )

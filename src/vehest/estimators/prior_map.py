@@ -29,7 +29,7 @@ class PriorMap(Recursive):
     trials = (
         Trial(
             1.2,
-            "baseline: steady cornering of a typical car; nothing is learnt",
+            "baseline: steady cornering of a typical car; nothing is fitted",
             "estimator.wheelbase={wheelbase}",
         ),
     )
@@ -40,7 +40,7 @@ class PriorMap(Recursive):
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(
         UNSET,
-        "distance b of the point where v holds from the rear axle; null: 0.48 wheelbases",
+        "distance b from the rear axle to the point at which v is estimated; null: 0.48 wheelbases",
         unit="m",
     )
     compliance: float = setting(

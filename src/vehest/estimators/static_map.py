@@ -14,7 +14,7 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
+# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified separately
 CONDITION = 1e8
 
 
@@ -34,7 +34,7 @@ class StaticMap(Recursive):
     ignores_initial_state = True
     template = "static"
     rate_hz: float = rate(20.0)
-    b: float = fitted("distance of the rear axle from the point where v holds", unit="m")
+    b: float = fitted("distance from the rear axle to the point at which v is estimated", unit="m")
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:

@@ -173,8 +173,8 @@ def refuse_unresolved(trust: Trust | None) -> None:
             and deviation < MIN_ROUNDINGS * float(np.finfo(np.float32).eps) * largest
         ):
             raise ConfigurationError(
-                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size "
-                "where the model learnt, which float cannot "
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size in "
+                "the training, which float cannot "
                 f"resolve; export with --precision double"
             )
 

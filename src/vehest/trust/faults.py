@@ -113,7 +113,7 @@ class Fault:
                 )
         if CHANNELS[self.channel].is_reference:
             raise ConfigurationError(
-                f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a "
+                f"fault.channel '{self.channel}' is a reference, which no estimator reads; name a "
                 "measured channel"
             )
         if not applies(self.kind, self.channel):

@@ -109,9 +109,9 @@ REASONS: dict[int, tuple[str, float]] = {
     kernel.MISSING: ("{channel} is not measured", 0.0),
     kernel.FROZEN: ("{channel} is frozen", 8.0),
     kernel.HELD: ("{channel} repeats its samples", 7.0),
-    kernel.JUMP: ("{channel} jumps, or is noisier than where the model learnt", 2.0),
-    kernel.NOISE: ("{channel} is noisier than where the model learnt", 2.5),
-    kernel.SMOOTH: ("{channel} varies less than where the model learnt", 1.5),
+    kernel.JUMP: ("{channel} jumps, or is noisier than in training", 2.0),
+    kernel.NOISE: ("{channel} is noisier than in training", 2.5),
+    kernel.SMOOTH: ("{channel} varies less than in training", 1.5),
     kernel.OFFSET: ("{channel} has an offset against the other channels", 4.0),
     kernel.SCALE: ("{channel} has another scale than the other channels", 4.0),
     kernel.SIGN: ("{channel} has the wrong sign", 0.0),
@@ -473,8 +473,8 @@ def learn_health(
     for recording in (*train, *validation):
         if abs(recording.rate_hz / rate_hz - 1.0) > 1e-9:
             raise DataError(
-                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health is "
-                f"learnt at {rate_hz:g} Hz"
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health was "
+                f"fitted at {rate_hz:g} Hz"
             )
     received = train
     train, validation = (

@@ -254,8 +254,8 @@ def learnt_samples(
     fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
     if not fast.any():
         raise DataError(
-            f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} "
-            "m/s"
+            f"no sample of the training of estimator '{estimator}' is faster than "
+            f"{minimum_speed:g} m/s"
         )
     inputs = np.concatenate([recording.stack(channels) for recording in recordings])
     return inputs[fast], np.concatenate(

@@ -232,8 +232,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
                 raise ConfigurationError(f"estimator.inputs: {error}") from None
             if reference:
                 raise ConfigurationError(
-                    f"estimator.inputs: '{name}' comes from a reference sensor, which an "
-                    "estimator never sees"
+                    f"estimator.inputs: '{name}' comes from a reference sensor, which no "
+                    "estimator may read"
                 )
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
             raise ConfigurationError(

@@ -140,7 +140,7 @@ class WindowedEstimator(Network):
         """Estimate a checked recording; raises `ConfigurationError` for an initial state."""
         if initial_state is not None:
             raise ConfigurationError(
-                f"estimator '{self.name}' has no state to start from: it sees a window of samples "
+                f"estimator '{self.name}' has no state to start from: it reads a window of samples "
                 "only; set evaluation.initial_state=false"
             )
         vy = np.full(len(recording), np.nan)
@@ -206,7 +206,7 @@ def _check_state(network: nn.Module) -> None:
         if getattr(module, "track_running_stats", False):
             raise ConfigurationError(
                 f"{kind}: layer '{name}' ({type(module).__name__}) keeps running statistics, "
-                "which members do not have; use LayerNorm, or track_running_stats=False"
+                "which batched trainings do not have; use LayerNorm, or track_running_stats=False"
             )
     for name, tensor in network.state_dict().items():
         if not tensor.is_floating_point():
