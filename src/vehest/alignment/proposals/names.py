@@ -14,7 +14,7 @@ _STRONG = {  # over the name without blanks
     r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc|"
     r"crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$",
-    "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
+    "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|"
     r"quera(?!bw)|accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right",
@@ -39,7 +39,7 @@ _STRONG = {  # over the name without blanks
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",
 }
 _WEAK = {
-    "yaw_rate": r"gyro|gier|^r$|^w$|^omega$|yaw|wimu",
+    "yaw_rate": r"gyro|gier|dpsi|^r$|^w$|^omega$|yaw|wimu",
     "ay": r"quer$|^quer|lateral|^lat",
     "ax": r"laengs|langs|^longitudinal",
     "steer": r"^cmd$|^str$|steering",

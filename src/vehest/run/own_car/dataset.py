@@ -122,7 +122,7 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        causes = f"duplicates, repeated names, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
+        causes = f"duplicates, text, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
         notes.append(
             f"data rows of '{stem}' left out by drop_rows ({causes}): {counted([str(row) for row in rows])}"
         )

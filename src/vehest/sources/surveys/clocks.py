@@ -72,7 +72,7 @@ def find_clock(
     step = 0.0
     repaired = {}
     for name, raw in columns.items():
-        written = units.get(name, "").replace(" ", "").lower()
+        written = units.get(name, "").replace(" ", "").strip("[]()").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
