@@ -676,7 +676,8 @@ def _left_right_clues(
     for column in columns:
         if is_vbo and column.name == "heading":
             yield (
-                "'heading', clockwise by its format, decreases when yaw_rate with sign {} is positive",
+                "'heading', clockwise by its format, decreases when yaw_rate with sign {} is "
+                "positive",
                 -turning_of(column, "deg", motion),
             )
     latitude = _first_named(columns, "latitude")
@@ -694,7 +695,8 @@ def _left_right_clues(
     is_sound = is_moving & (np.abs(turned) < MAX_COURSE_STEP) & (np.hypot(*steps) > 0.0)
     if is_sound.sum() > MIN_COURSE_SAMPLES:
         yield (
-            "the course over latitude and longitude turns left when yaw_rate with sign {} is positive",
+            "the course over latitude and longitude turns left when yaw_rate with sign {} is "
+            "positive",
             correlation(turned[is_sound], yaw_rate[is_sound]),
         )
 

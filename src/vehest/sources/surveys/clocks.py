@@ -17,7 +17,8 @@ from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
 NAMED = re.compile(
-    r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
+    r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|"
+    r"epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
 COUNTER = re.compile(
     r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( "

@@ -78,7 +78,9 @@ DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
     "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
-    "a separator of thousands": "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$",
+    "a separator of thousands": (
+        "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$"
+    ),
 }
 """Kinds of texts that are numbers for people: the pattern of each."""
 ABBREVIATED = {
