@@ -340,7 +340,7 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
     both_ways = (names, [name[::-1] for name in names])
-    prefixes = map(os.path.commonprefix, both_ways)  # noqa: RUF071 (of characters)
+    prefixes = map(os.path.commonprefix, both_ways)
     start, end = (prefix.rstrip("0123456789") for prefix in prefixes)
     pattern = (
         f"{glob.escape(start)}*{glob.escape(end[::-1])}"
