@@ -33,6 +33,7 @@ from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
 from vehest_papers.ksnn.pairs import (
     ORDER,
     PART,
+    SHOWN,
     TRAININGS,
     detectable_ratio,
     errors_figure,
@@ -57,6 +58,7 @@ WINDOWS = re.compile(r"window_(\d+)_([12])")
 APART = re.compile(r"pair_|window_|doubled_")  # parts that are no `Scheme`
 REAL = ("ferrari_drive", "simulated_to_ferrari", "devbot_ferrari", "ferrari_devbot")
 SMALL = ("f1tenth", "dart", "roboracer")
+REAL_CANDIDATES = ("static_map", paper.LUENBERGER, paper.GRU, paper.LSTM, paper.NONLINEAR)
 RATIO_SETS = {"Scheme 1": ("C-1", "F-2"), "Scheme 2": ("C-2", "F-1")}
 RATIO_MARGIN = 0.05
 
@@ -103,7 +105,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)
-    tables += [table for table in (gates, windows_table(artefacts), real_table(schemes)) if table]
+    tables += [table for table in (gates, real_table(schemes)) if table]
+    windows = windows_table(artefacts)
     verdicts = claims.frame["verdict"].value_counts()
     values = {
         "recommendation": one_line(content.recommendation),
@@ -117,16 +120,14 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "n_claims": len(claims.frame),
         "absent_parts": absent_parts(artefacts),
         "incomplete": incomplete(artefacts),
+        "has_windows": len(windows) > 0,
         "searches": [
-            {
-                "title": as_text(trial.title),
-                "value": f"{trial.validation:.4f}",
-                "chosen": trial.chosen,
-            }
+            {"title": as_text(trial.title), "value": f"{trial.validation:.4f}"}
             for trial in artefacts.trials
         ],
     }
     data = {"pairs_ratios": ratios_table(errors).frame} if len(errors) else {}
+    data |= {"windows": windows} if len(windows) else {}
     data |= {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
     data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
@@ -157,8 +158,10 @@ def pair_claims(claims: Table) -> Table:
     """The claims that pairs of cars decide, without those that are open."""
     frame = claims.frame
     chosen = frame[frame["id"].str.endswith("_pairs") & frame["verdict"].isin(DECIDED)]
+    subjects = chosen["claim"].str.removeprefix("Over pairs of cars, ")
+    chosen = chosen.assign(claim=subjects.str.replace(" of the lateral velocity", ""))
     columns = {name: claims.columns[name] for name in ("claim", "published", "verdict")}
-    caption = "Claims that the pairs of cars decide; the CSV has the others too. SIMULATED."
+    caption = "Claims on the FVU of the lateral velocity that the pairs of cars decide. SIMULATED."
     return Table("pair_claims", caption, chosen, columns)
 
 
@@ -291,20 +294,27 @@ def schemes_table(schemes: Mapping[str, Scheme]) -> Table:
             continue
         columns[f"{name}_other"] = Column(scheme.title)
         tests = {"other": scheme.other, "own": scheme.own, "third": THIRD}
-        for candidate in ORDER:
+        for candidate in SHOWN:
             key = scheme.key_of(candidate)
             for title, test in tests.items():
                 if test in scheme.part.split.tests and key in scheme.errors(test):
                     row = rows.setdefault(candidate, {"candidate": candidate})
                     row[f"{name}_{title}"] = scheme.errors(test).in_words(key, "fvu")
-    order = sorted(rows, key=ORDER.index)
+    order = sorted(rows, key=SHOWN.index)
     table = pd.DataFrame([rows[name] for name in order]).fillna(MISSING)
-    caption = "FVU on the other car with 95 % intervals over blocks and seeds."
+    caption = "FVU on the other car, 95 % intervals over blocks and seeds; `zero` has 1."
     return Table("schemes", caption, table, columns if len(table) else {})
 
 
-def windows_table(artefacts: StudyArtefacts) -> Table | None:
-    """FVU of networks trained on windows of 15, 30 and 60 samples, on the samples that all estimate."""
+def windows_table(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """FVU of networks trained on windows of N samples at the stop, mean over seeds.
+
+    Returns
+    -------
+    DataFrame
+        ``scheme``, ``candidate``, and ``own_N`` and ``other_N`` on the training and the other car,
+        on the samples that networks of all lengths estimate.
+    """
     schemes = {name: scheme_of(artefacts, name) for name in artefacts.parts if name in SCHEMES}
     windows = windows_of(artefacts)
     rows = []
@@ -323,17 +333,7 @@ def windows_table(artefacts: StudyArtefacts) -> Table | None:
                     fvu = measures.fvu_after_longest_window(lengths[length], candidate, test)
                     row[f"{'own' if test == scheme.own else 'other'}_{length}"] = fvu
             rows.append(row)
-    if not rows:
-        return None
-    table = pd.DataFrame(rows)
-    columns = {"scheme": Column("scheme"), "candidate": Column("candidate")} | {
-        name: Column(f"{name.split('_')[0]} car, N = {name.split('_')[1]}", decimals=3)
-        for name in table.columns[2:]
-    }
-    caption = (
-        "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds."
-    )
-    return Table("windows", caption, table, columns)
+    return pd.DataFrame(rows)
 
 
 def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
@@ -352,6 +352,6 @@ def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
     if not rows:
         return None
     columns = {"trained": Column("comparison"), "test": Column("test")}
-    columns |= {name: Column(name) for name in ORDER}
-    caption = "FVU, 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
+    columns |= {name: Column(name) for name in REAL_CANDIDATES}
+    caption = "FVU, 95 % intervals over blocks and seeds; `zero` has 1, the CSV has all candidates."
     return Table("real_cars", caption, pd.DataFrame(rows), columns)
