@@ -1,6 +1,7 @@
 """The four papers on one page: what each claims and tabulates, beside ours (`make scorecard`).
 
-Made of claims.yaml, results/STUDY/tables/blocks.csv and training.csv alone: no model and no recording is needed.
+Made of claims.yaml, results/STUDY/tables/blocks.csv and training.csv alone: no model and no
+recording is needed.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from vehest_papers.kit.verdict_table import (
     epochs_in_words,
     figure_in_words,
     figures_in_words,
-    one_line,
     published_in_words,
     unit_of,
+    without_line_breaks,
 )
 from vehest_papers.kit.verdicts import (
     NOT_PUBLISHED,
@@ -93,32 +94,36 @@ CSV_COLUMNS = (
 LEGEND = (
     (
         "NNTF_UH, RATTE, …",
-        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` describes each",
+        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` "
+        "describes each",
     ),
     ("published", "value of the paper"),
     (
         "ours",
-        "the same error of our run with its 95 % interval; the data are marked as real or simulated",
+        "the same error of our run with its 95 % interval; the data are marked as real or "
+        "simulated",
     ),
     (
         "metric",
-        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], `rmse_sideslip` [deg] and the "
-        "others: [metrics](../docs/evaluation.md#metrics)",
+        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], "
+        "`rmse_sideslip` [deg] and the others: [metrics](../docs/evaluation.md#metrics)",
     ),
     (
         "ratio",
-        "error of the first candidate of a claim over that of the second, all samples together; below 1 the first "
-        "one is better",
+        "error of the first candidate of a claim over that of the second, all samples together; "
+        "below 1 the first one is better",
     ),
     (
         "mean of blocks' ratios",
-        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same weight for each",
+        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same "
+        "weight for each",
     ),
     ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
     (
         "verdict",
-        "from the errors by block and seed ([definitions, and how often they are right](../docs/scorecard.md)); in "
-        "*italics* where the training has not been shown to be sufficient",
+        "from the errors by block and seed ([definitions, and how often they are "
+        "right](../docs/scorecard.md)); in *italics* where the training has not been shown to be "
+        "sufficient",
     ),
 )
 """Columns of the page's tables and what they hold."""
@@ -169,7 +174,9 @@ def read_study(name: str, results: Path, claims_folder: Path = CLAIMS_FOLDER) ->
 
 
 def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[str, str]:
-    """Content of scorecard.md, scorecard.csv and scorecard/changed_verdicts.csv, as they belong into ``results``."""
+    """Content of scorecard.md, scorecard.csv and scorecard/changed_verdicts.csv, as they belong
+    into ``results``.
+    """
     studies = [read_study(name, results, claims_folder) for name in PAPERS]
     before = claims_folder / "claims_before.csv"
     return {
@@ -180,7 +187,9 @@ def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the scorecard; with ``--check`` exit with 1 where it is not what the committed inputs give."""
+    """Write the scorecard; with ``--check`` exit with 1 where it is not what the committed inputs
+    give.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, default=Path("results"))
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
@@ -210,18 +219,24 @@ def _page(studies: Sequence[Study], results: Path) -> str:
     lines = [
         "# Scorecard: published and ours",
         "",
-        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs of their methods in vehest:",
-        "first whether to use each method, then how many claims of its paper were reproduced, then every table row and",
+        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs "
+        "of their methods in vehest:",
+        "first whether to use each method, then how many claims of its paper were reproduced, "
+        "then every table row and",
         "claim with the published value and ours.",
         "",
         "## Should I use this method?",
         "",
         *_table(
             ("paper", "answer"),
-            [(_linked(study), one_line(study.paper.recommendation)) for study in studies],
+            [
+                (_linked(study), without_line_breaks(study.paper.recommendation))
+                for study in studies
+            ],
         ),
         "",
-        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
+        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, "
+        "which was made with",
         "earlier code and shorter trainings.",
         "",
         "## How to read the tables",
@@ -265,9 +280,9 @@ def _section(study: Study, results: Path) -> list[str]:
     lines = [
         f"## {TITLES[paper.paper]}",
         "",
-        f"{one_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
+        f"{without_line_breaks(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
         "",
-        f"**{one_line(paper.recommendation)}**",
+        f"**{without_line_breaks(paper.recommendation)}**",
         "",
     ]
     if not study.is_published:
@@ -275,8 +290,8 @@ def _section(study: Study, results: Path) -> list[str]:
     for table in paper.tables:
         lines += _section_of_table(study, table)
     lines += [f"### Claims of {TITLES[paper.paper]}", ""]
-    lines += _table_of_claims(study, [own for own in paper.claims if not own.is_added])
-    if added := [own for own in paper.claims if own.is_added]:
+    lines += _table_of_claims(study, [claim for claim in paper.claims if not claim.is_added])
+    if added := [claim for claim in paper.claims if claim.is_added]:
         lines += [f"### Beside the paper: {TITLES[paper.paper]}", ""]
         lines += ["Comparisons that the paper does not make; they are in no count above.", ""]
         lines += _table_of_claims(study, added)
@@ -302,8 +317,8 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 _verdict(judgement, state),
             )
         )
-    about = one_line(study.paper.test_sets[table.test_set])
-    note = f" {one_line(table.note)}" if table.note else ""
+    about = without_line_breaks(study.paper.test_sets[table.test_set])
+    note = f" {without_line_breaks(table.note)}" if table.note else ""
     return [
         f"### {table.table}, {TITLES[study.paper.paper]}: {table.test_set} ({table.part})",
         "",
@@ -345,11 +360,16 @@ def _section_of_planted_truth(results: Path) -> list[str]:
         "## How often these verdicts are right",
         "",
         f"Per cent of {rows[0]['studies']} simulated studies each, made of real errors",
-        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant difference where there",
-        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where it is true or",
-        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in their interval. The",
-        "rows with one seed show why a candidate that was trained once gets no verdict. *Reproduced* excludes that there",
-        "is no effect, not that the effect is half the paper's: the interval of the size shows what is excluded.",
+        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant "
+        "difference where there",
+        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where "
+        "it is true or",
+        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in "
+        "their interval. The",
+        "rows with one seed show why a candidate that was trained once gets no verdict. "
+        "*Reproduced* excludes that there",
+        "is no effect, not that the effect is half the paper's: the interval of the size shows "
+        "what is excluded.",
         "",
         *_table(list(headings.values()), cells, n_text=3),
         "",
@@ -365,7 +385,7 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
         reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
         cells.append(
             (
-                f"{_text(one_line(claim.claim))} ({_text(claim.source)})",
+                f"{_text(without_line_breaks(claim.claim))} ({_text(claim.source)})",
                 published_in_words(claim, _text),
                 figures_in_words(judgement, unit_of(claim), _text),
                 f"{origin}, {claim.test_set}" if origin else MISSING,
@@ -387,7 +407,7 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
 
 
 def _verdict(judgement: Judgement, training: Training | None) -> str:
-    """The verdict, in italics where it rests on networks whose training was not shown to suffice."""
+    """The verdict, in italics where the training of a network was not shown to suffice."""
     is_assessed = judgement.n_blocks > 0
     is_sufficient = training is None or training.state in ("sufficient", "not applicable")
     return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
@@ -421,7 +441,7 @@ def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dic
         "paper": study.paper.paper,
         "row": kind,
         "id": claim.id,
-        "text": one_line(claim.claim),
+        "text": without_line_breaks(claim.claim),
         "source": claim.source,
         "data": study.paper.parts.get(claim.part, ""),
         "part": claim.part,
@@ -469,10 +489,10 @@ def _changes(studies: Sequence[Study], before: Path) -> tuple[Sequence[str], lis
     rows = []
     for row in read_rows(before, ("paper", "old_claim", "data", "verdict", "id", "reason")):
         ids = [] if row["id"] == "removed" else row["id"].split()
-        absent = [name for name in ids if (row["paper"], name) not in judged]
-        if absent:
+        missing = [name for name in ids if (row["paper"], name) not in judged]
+        if missing:
             raise DataError(
-                f"'{before}': {row['paper']} has no claim {absent[0]!r}; write an id of claims.yaml"
+                f"'{before}': {row['paper']} has no claim {missing[0]!r}; write an id of claims.yaml"
             )
         now = [judged[row["paper"], name] for name in ids]
         rows.append(

@@ -1,4 +1,6 @@
-"""How noise of the accelerations comes through an estimator (Figure 7 of Da Lio et al. 2023), in closed form."""
+"""How noise of the accelerations comes through an estimator (Figure 7 of Da Lio et al. 2023), in
+closed form.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ CHANNELS = ("ay", "ax")
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
+    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error``
+    where it is not linear.
 
     Raises `ConfigurationError` where it is neither a KS-NN nor a Luenberger observer.
     """

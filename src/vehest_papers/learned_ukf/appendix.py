@@ -1,4 +1,6 @@
-"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the ranges of the recordings."""
+"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the
+ranges of the recordings.
+"""
 
 from __future__ import annotations
 
@@ -25,20 +27,26 @@ def appendix_of_part(
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    where: str,
+    source: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Consistency of the filters and slip angles; errors by state and budgets of the main part as files."""
+    """Consistency of the filters and slip angles; errors by state and budgets of the main part as
+    files.
+    """
     kind = words_of_kinds(part).upper()
-    state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
+    state = (
+        "Root mean square errors by state, median and range of seeds; in brackets what the paper "
+        f"reports, on its own files. Data: {kind}."
+    )
     consistent = (
-        f"Consistency of the filters: normalised estimation errors squared over vx, vy and yaw rate (NEES) and normalised innovations "
-        f"squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of vy's errors within one and two of "
-        f"the filter's own standard deviations. Data: {kind}."
+        "Consistency of the filters: normalised estimation errors squared over vx, vy and yaw "
+        "rate (NEES) and normalised innovations squared (NIS), 1 for a consistent filter and "
+        "above 1 for one too sure of itself; share of vy's errors within one and two of the "
+        f"filter's own standard deviations. Data: {kind}."
     )
     budget = (
-        f"What was spent: seeds, and epochs as medians of seeds. {paper.NNTF_UH_LOW} is {paper.NNTF_UH} with another start and shares its "
-        f"training. Data: {kind}."
+        f"What was spent: seeds, and epochs as medians of seeds. {paper.NNTF_UH_LOW} is "
+        f"{paper.NNTF_UH} with another start and shares its training. Data: {kind}."
     )
     for table in (
         tables.by_state(runs, list(SETS), f"by_state_{name}", state),
@@ -48,11 +56,11 @@ def appendix_of_part(
     return [
         "## Appendix: consistency of the filters",
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
-        *_slips(part, name, where, data),
+        *_slips(part, name, source, data),
     ]
 
 
-def how_it_was_made(
+def provenance(
     artefacts: StudyArtefacts,
     main: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
@@ -64,10 +72,12 @@ def how_it_was_made(
     lines = [
         f"Command: {as_code(artefacts.command)}",
         methods.scoring(first),
-        "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
-        "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
+        "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted "
+        "0.2225, 0.5064 and 0.1566 and summed at each sample; their means are MSE (weighted) and "
+        "MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
-        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing.",
+        "Figures that show one seed show the one with the lowest MSE (weighted) on the "
+        "validation range. Test data choose nothing.",
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
     ]
     blocks: list[Block] = []
@@ -79,7 +89,7 @@ def how_it_was_made(
     data[ranges.name] = ranges.frame
     names = sorted({*data, TRAINING})
     files = ", ".join(f"[{name}](tables/{name}.csv)" for name in names)
-    return [*blocks, methods.how_it_was_made(lines), f"Further tables: {files}."]
+    return [*blocks, methods.provenance(lines), f"Further tables: {files}."]
 
 
 def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
@@ -114,7 +124,8 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
             *part.split.tests.items(),
         ):
             row[label] = (
-                f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} min{_sequences(part, label)}"
+                f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} "
+                f"min{_sequences(part, label)}"
             )
         rows.append(row)
     columns = {
@@ -125,8 +136,9 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
     }
     columns |= {test: Column(f"test, {tyre}") for test, tyre in SETS.items()}
     caption = (
-        f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in all and learns on about "
-        f"{fixed(paper.MINUTES_LEARNT, 1)} min of tyre A ({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
+        f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in "
+        f"all and learns on about {fixed(paper.MINUTES_LEARNT, 1)} min of tyre A "
+        f"({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
     )
     return Table("data", caption, pd.DataFrame(rows), columns)
 
@@ -148,7 +160,7 @@ def _sequences(part: PartArtefacts, test: str) -> str:
 
 
 def _slips(
-    part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]
+    part: PartArtefacts, name: str, source: str, data: dict[str, pd.DataFrame]
 ) -> list[Block]:
     filters = [model for model in part.models if model.estimator == "learned_ukf"]
     if not filters:
@@ -159,9 +171,13 @@ def _slips(
         **{f"test, {tyre}": part.split.tests[test] for test, tyre in SETS.items()},
     }
     angles = {
-        label: slips.rear_slip(recordings_of(part, own), distance) for label, own in sets.items()
+        label: slips.rear_slip(recordings_of(part, spans), distance)
+        for label, spans in sets.items()
     }
-    note = f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts from."
-    figure, table, drawn = slips.distribution(angles, name, where, note)
+    note = (
+        f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts "
+        "from."
+    )
+    figure, table, drawn = slips.distribution(angles, name, source, note)
     data |= {f"slip_density_{name}": drawn, table.name: table.frame}
     return ["## Appendix: slip angles", figure]

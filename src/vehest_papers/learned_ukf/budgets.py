@@ -1,4 +1,6 @@
-"""What the candidates of the parts beside the main one were trained on, and their validation losses."""
+"""What the candidates of the parts beside the main one were trained on, and their validation
+losses.
+"""
 
 from __future__ import annotations
 
@@ -51,8 +53,9 @@ def budgets_table(candidates: Mapping[str, Candidate], name: str, data: str) -> 
         "validation": Column("MSE, validation"),
     }
     caption = (
-        "Trainings of the parts beside the tables: samples count each time they are used, one-step and through the filter. "
-        f"Validation: weighted MSE on tyre A, run 0, median and range of seeds. Data: {data}."
+        "Trainings of the parts beside the tables: samples count each time they are used, "
+        "one-step and through the filter. Validation: weighted MSE on tyre A, run 0, median and "
+        f"range of seeds. Data: {data}."
     )
     return Table(f"budgets_{name}", caption, pd.DataFrame(rows), columns)
 
@@ -69,14 +72,16 @@ def validation_losses(part: PartArtefacts, models: Sequence[EvaluatedModel]) -> 
 
 
 def samples_trained_on(part: PartArtefacts, model: EvaluatedModel) -> int:
-    """Samples that a seed is trained on, each counted as often as it is used: pairs one-step, sequences through the filter."""
+    """Samples that a seed is trained on, each counted as often as it is used: pairs one-step,
+    sequences through the filter.
+    """
     training = model.training
     drives = lengths_of(part, part.split.train)
     steps = int(training["steps"])
     pairs = sum(length - 1 for length in drives)
     samples = sum(length // steps * steps for length in drives)
-    one_step = int(training["one_step"]["max_epochs"]) * pairs
-    return one_step + int(_second_phase(model)["max_epochs"]) * samples
+    prediction_samples = int(training["one_step"]["max_epochs"]) * pairs
+    return prediction_samples + int(_second_phase(model)["max_epochs"]) * samples
 
 
 def _second_phase(model: EvaluatedModel) -> Mapping[str, float]:

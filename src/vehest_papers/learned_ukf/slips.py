@@ -21,7 +21,8 @@ PERCENTILES = (50, 90, 99)
 
 
 def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatArray:
-    """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves; (K,) [deg].
+    """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves;
+    (K,) [deg].
 
     Args:
         recordings: with ``vx_ref``, ``vy_ref``, ``yaw_rate_ref``.
@@ -54,13 +55,15 @@ def distribution(
                 drawn[label], edges, color=colour, linestyle=dash, linewidth=1.2, label=label
             )
         for side in (-1.0, 1.0):
-            known = "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
+            label_of_limit = (
+                "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
+            )
             axes.axvline(
                 side * paper.SLIP_99,
                 color="#767676",
                 linewidth=0.8,
                 linestyle="dotted",
-                label=known,
+                label=label_of_limit,
             )
         axes.set_yscale("log")
         axes.set_xlim(-LIMIT, LIMIT)
@@ -68,8 +71,8 @@ def distribution(
         axes.set_ylabel("density [1/deg]")
         legend_above(figure, axes)
     caption = (
-        f"Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. Data: {data}. Samples with v_x of "
-        f"{LEAST_SPEED:g} m/s and more. {note}"
+        "Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. "
+        f"Data: {data}. Samples with v_x of {LEAST_SPEED:g} m/s and more. {note}"
     )
     rows = [
         {

@@ -33,7 +33,9 @@ STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 def accuracy(
     blocks: Mapping[Key, BlockErrors], part: str, test: str, name: str, caption: str
 ) -> Table:
-    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds."""
+    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over
+    sequences and seeds.
+    """
     published = paper.TABLES[test]
     rows = []
     for candidate in candidates_in(blocks, part, test):
@@ -70,7 +72,9 @@ def mse_text(blocks: Mapping[Key, BlockErrors], part: str, candidate: str, test:
 
 
 def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
-    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, and the paper's."""
+    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, and
+    the paper's.
+    """
     rows = []
     for candidate in candidates_in(blocks, part, next(iter(SETS))):
         row: dict[str, object] = {"candidate": candidate}
@@ -95,8 +99,9 @@ def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
         columns[f"words_{test}"] = Column(f"ours, {SETS[test]}")
     columns["n_seeds"] = Column("seeds", decimals=0)
     caption = (
-        f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over sequences and seeds. Baselines take vx "
-        "from the rims and the yaw rate from the gyroscope."
+        f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over "
+        "sequences and seeds. Baselines take vx from the rims and the yaw rate from the "
+        "gyroscope."
     )
     return Table("overview", caption, pd.DataFrame(rows), columns)
 
@@ -107,13 +112,13 @@ def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) 
     for candidate in dict.fromkeys(runs["candidate"]):
         row: dict[str, object] = {"candidate": candidate}
         for test in tests:
-            known = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
+            stated = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
             for state in STATES:
                 values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
                 row[f"ours_{state}_{test}"] = median_and_range(values, 3)
                 row |= {
                     f"median_{state}_{test}": np.median(values),
-                    f"paper_{state}_{test}": known.get(state, math.nan),
+                    f"paper_{state}_{test}": stated.get(state, math.nan),
                 }
                 row[f"shown_{state}_{test}"] = _beside(row, state, test)
         rows.append(row)
@@ -209,11 +214,11 @@ def _figure(published: Published | None, short: str) -> float:
 
 def _beside(row: Mapping[str, object], state: str, test: str) -> str:
     value = row[f"paper_{state}_{test}"]
-    own = str(row[f"ours_{state}_{test}"])
+    ours = str(row[f"ours_{state}_{test}"])
     return (
-        f"{own} (paper {fixed(value, 3)})"
+        f"{ours} (paper {fixed(value, 3)})"
         if isinstance(value, float) and math.isfinite(value)
-        else own
+        else ours
     )
 
 
