@@ -29,13 +29,17 @@ from vehest.report.document import (
     Document,
     Figure,
     Table,
+    as_code,
     as_text,
 )
 from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.drive import data_sentence, how_it_was_made
+from vehest.studies.drive import data_of_parts, data_sentence
 
 TAKES = "parts"
+VERSION = "2"
+TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
 SCRATCH = "from scratch"
 COLUMNS = {
@@ -48,32 +52,101 @@ COLUMNS = {
     "against_scratch": Column("than from scratch"),
 }
 """Of a table of `rows_of_curve`."""
+COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
+"""Amounts of reference with a column in the overview [min]; the last column is all of a drive."""
+FIGURE_CAPTION = (
+    "{title}, test set `{test_set}`: RMSE(β) over the minutes of recording with a reference for "
+    "training and validation; bars are 95 % intervals over blocks of the test and trainings. "
+    "Dashed: zero-sideslip baseline."
+)
+OVERVIEW_CAPTION = (
+    "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
+    "trainings with as many minutes."
+)
 MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """A section a curve, and the table of all as the overview."""
-    curves = curves_of(list(artefacts.parts.values()))
-    rows = [
-        {"curve": f"{curve.title}, {curve.test_set}", **row}
-        for curve in curves
-        for row in rows_of_curve(curve)
-    ]
-    overview = Table(
-        "overview",
-        "RMSE(β) by minutes of reference, all curves.",
-        pd.DataFrame(rows),
-        {"curve": Column("test set"), **COLUMNS},
-    )
-    data = list(dict.fromkeys(data_sentence(part) for part in artefacts.parts.values()))
-    blocks: list[Block] = [artefacts.about, "\n\n".join(data)]
-    for number, curve in enumerate(curves, start=1):
-        blocks += [
-            f"## {curve.title}, test set `{curve.test_set}`",
-            *blocks_of_curve(curve, str(number)),
+    """Report: errors with each amount of reference as one table, and a figure a curve."""
+    parts = list(artefacts.parts.values())
+    curves = curves_of(parts)
+    points = pd.DataFrame(
+        [
+            {"curve": f"{curve.title}, {curve.test_set}", **row}
+            for curve in curves
+            for row in rows_of_curve(curve)
         ]
-    blocks += ["## All curves", overview, *how_it_was_made(artefacts.first), PATENT_NOTE]
-    return {REPORT: Document(artefacts.title, blocks)}
+    )
+    placed: list[Block] = [_overview(points)]
+    figures = []
+    for number, curve in enumerate(curves, start=1):
+        caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
+        figures.append(f"reference_minutes_{number}")
+        placed.append(Figure(figures[-1], caption, _figure(curve)))
+    values = {
+        "about": artefacts.about.strip(),
+        "curves": [_summary_of_curve(curve) for curve in curves],
+        "figures": figures,
+        "n_models": sum(len(part.models) for part in parts),
+        "data": list(dict.fromkeys(data_sentence(part) for part in parts)),
+        "command": as_code(artefacts.command),
+    }
+    blocks = [*fill_template(TEMPLATE, values, placed), PATENT_NOTE]
+    data = {"points": points, **data_of_parts(artefacts.parts)}
+    return {REPORT: Document(artefacts.title, blocks, data)}
+
+
+def _overview(points: pd.DataFrame) -> Table:
+    """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns."""
+    rows = []
+    keys = ["curve", "title", "start"]
+    amounts: list[float] = sorted(set(points["minutes"]) & set(COMMON_MINUTES))
+    for key, group in points.groupby(keys, sort=False):
+        by_minutes = group.set_index("minutes")["rmse_sideslip"]
+        longest = float(by_minutes.index.max())
+        row: dict[str, object] = dict(zip(keys, key, strict=True))
+        row |= {f"minutes_{amount:g}": by_minutes.get(amount, math.nan) for amount in amounts}
+        row |= {"longest": longest, "longest_rmse": by_minutes[longest]}
+        rows.append(row)
+    columns = {
+        "curve": Column("test set"),
+        "title": Column("estimator"),
+        "start": Column("training"),
+        **{f"minutes_{amount:g}": Column(f"{amount:g} min", decimals=2) for amount in amounts},
+        "longest_rmse": Column("all", decimals=2),
+        "longest": Column("all [min]", decimals=1),
+    }
+    return Table("overview", OVERVIEW_CAPTION, pd.DataFrame(rows), columns)
+
+
+def _summary_of_curve(curve: Curve) -> dict[str, object]:
+    """Estimators with the lowest error at the fewest and the most minutes [deg], and the minutes at
+    which starting from another model makes a significant difference.
+    """
+    candidates = [point for point in curve.points if point.estimator != BASELINES[0]]
+    ends = []
+    for pick in (min, max):
+        minutes = pick(point.minutes for point in candidates)
+        best = min(
+            (point for point in candidates if point.minutes == minutes),
+            key=lambda point: curve.ranking.rmse[point.name],
+        )
+        ends.append(
+            {
+                "minutes": f"{minutes:g}",
+                "title": best.title,
+                "start": best.start,
+                "rmse": fixed(curve.ranking.rmse[best.name], 2),
+            }
+        )
+    verdicts = [(point.minutes, _against_scratch(curve, point)) for point in candidates]
+    return {
+        "title": curve.title,
+        "test_set": as_code(curve.test_set),
+        "ends": ends,
+        "lower": [f"{minutes:g}" for minutes, verdict in verdicts if verdict == "lower"],
+        "higher": [f"{minutes:g}" for minutes, verdict in verdicts if verdict == "higher"],
+    }
 
 
 @dataclass(frozen=True)
@@ -214,12 +287,7 @@ def minutes_of(part: PartArtefacts) -> float:
 
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """Sentences, figure and table of a curve; ``name`` ends the files' names."""
-    caption = (
-        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a "
-        "reference for training and "
-        "validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: "
-        "zero-sideslip baseline."
-    )
+    caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [
         _in_words(curve),
         Figure(f"reference_minutes_{name}", caption, _figure(curve)),
