@@ -35,7 +35,8 @@ from vehest.report.document import (
 from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.drive import data_of_parts, data_sentence
+from vehest.studies.drive import data_of_parts
+from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
 TAKES = "parts"
 VERSION = "2"
@@ -49,7 +50,7 @@ COLUMNS = {
     "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
     "interval": Column("95 % interval [deg]"),
     "n_trainings": Column("trainings", decimals=0),
-    "against_scratch": Column("than from scratch"),
+    "against_scratch": Column("compared with scratch"),
 }
 """Of a table of `rows_of_curve`."""
 COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
@@ -77,7 +78,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             for row in rows_of_curve(curve)
         ]
     )
-    placed: list[Block] = [_overview(points)]
+    placed: list[Block] = [overview_table(points)]
     figures = []
     for number, curve in enumerate(curves, start=1):
         caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
@@ -85,10 +86,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         placed.append(Figure(figures[-1], caption, _figure(curve)))
     values = {
         "about": artefacts.about.strip(),
-        "curves": [_summary_of_curve(curve) for curve in curves],
+        "curves": [summary_of_curve(rows) for _, rows in points.groupby("curve", sort=False)],
         "figures": figures,
         "n_models": sum(len(part.models) for part in parts),
-        "data": list(dict.fromkeys(data_sentence(part) for part in parts)),
+        "data": list(
+            dict.fromkeys(
+                f"{as_text(part.data_titles.get(name, name))} ({part.kinds[name]})"
+                for part in parts
+                for name in part.split.datasets
+            )
+        ),
         "command": as_code(artefacts.command),
     }
     blocks = [*fill_template(TEMPLATE, values, placed), PATENT_NOTE]
@@ -96,7 +103,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def _overview(points: pd.DataFrame) -> Table:
+def overview_table(points: pd.DataFrame) -> Table:
     """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns."""
     rows = []
     keys = ["curve", "title", "start"]
@@ -119,33 +126,33 @@ def _overview(points: pd.DataFrame) -> Table:
     return Table("overview", OVERVIEW_CAPTION, pd.DataFrame(rows), columns)
 
 
-def _summary_of_curve(curve: Curve) -> dict[str, object]:
+def summary_of_curve(points: pd.DataFrame) -> dict[str, object]:
     """Estimators with the lowest error at the fewest and the most minutes [deg], and the minutes at
     which starting from another model makes a significant difference.
+
+    ``points``: `rows_of_curve`, with a column ``curve``.
     """
-    candidates = [point for point in curve.points if point.estimator != BASELINES[0]]
     ends = []
-    for pick in (min, max):
-        minutes = pick(point.minutes for point in candidates)
-        best = min(
-            (point for point in candidates if point.minutes == minutes),
-            key=lambda point: curve.ranking.rmse[point.name],
-        )
+    for minutes in (points["minutes"].min(), points["minutes"].max()):
+        of_end = points[points["minutes"] == minutes]
+        best = of_end.loc[of_end["rmse_sideslip"].idxmin()]
         ends.append(
             {
                 "minutes": f"{minutes:g}",
-                "title": best.title,
-                "start": best.start,
-                "rmse": fixed(curve.ranking.rmse[best.name], 2),
+                "title": best["title"],
+                "start": best["start"],
+                "rmse": fixed(float(best["rmse_sideslip"]), 2),
             }
         )
-    verdicts = [(point.minutes, _against_scratch(curve, point)) for point in candidates]
+    verdicts = {
+        verdict: [f"{minutes:g}" for minutes in group["minutes"]]
+        for verdict, group in points.groupby("against_scratch")
+    }
     return {
-        "title": curve.title,
-        "test_set": as_code(curve.test_set),
+        "title": points["curve"].iloc[0],
         "ends": ends,
-        "lower": [f"{minutes:g}" for minutes, verdict in verdicts if verdict == "lower"],
-        "higher": [f"{minutes:g}" for minutes, verdict in verdicts if verdict == "higher"],
+        "lower": verdicts.get("lower", []),
+        "higher": verdicts.get("higher", []),
     }
 
 
@@ -328,7 +335,9 @@ def _against_scratch(curve: Curve, point: Point) -> str:
         (candidate for candidate in curve.points if _differ_in_start(candidate, point)), None
     )
     pair = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
-    return pair.verdict if pair is not None else ""
+    if pair is None:
+        return ""
+    return pair.verdict if pair.verdict in ("lower", "higher") else NOT_SIGNIFICANT
 
 
 def _lines(curve: Curve) -> list[list[Point]]:

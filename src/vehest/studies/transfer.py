@@ -110,7 +110,7 @@ def _values(
     ]
     candidates = summary[~summary["name"].isin(BASELINES)]
     everywhere = candidates[candidates["beats_both"] == len(places)]
-    best = candidates["beats_both"].max() if len(candidates) else 0
+    best = int(candidates["beats_both"].max()) if len(candidates) else 0
     beaten = board[_beats_both(board)]
     missing = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     return {

@@ -18,7 +18,7 @@ from vehest.data.recording import Recording
 
 DELAYS = (0.02, 0.04, 0.1)  # s
 TIME_CONSTANT = 0.4  # s
-HELD_RATE = 10.0  # Hz
+SENSOR_RATE_HZ = 10.0  # Hz
 REFERENCE = ("vy_ref", "sideslip_ref")
 COUNTED_NOTES = frozenset({"offset", "held"})
 Change = Callable[[FloatArray, float], FloatArray]
@@ -95,7 +95,13 @@ def planted_faults() -> list[Fault]:
         ),
     ]
     faults += [
-        Fault("held", (name,), f"{HELD_RATE:g} Hz", frozenset({"held"}), partial(_held, HELD_RATE))
+        Fault(
+            "held",
+            (name,),
+            f"{SENSOR_RATE_HZ:g} Hz",
+            frozenset({"held"}),
+            partial(_repeated, SENSOR_RATE_HZ),
+        )
         for name in ("yaw_rate", "ay")
     ]
     slow = partial(_low_passed, TIME_CONSTANT)
@@ -195,8 +201,8 @@ def _shifted(offset: float, samples: FloatArray, rate_hz: float) -> FloatArray:
     return samples + offset
 
 
-def _held(held_rate: float, samples: FloatArray, rate_hz: float) -> FloatArray:
-    step = max(round(rate_hz / held_rate), 1)
+def _repeated(sensor_rate_hz: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    step = max(round(rate_hz / sensor_rate_hz), 1)
     return np.repeat(samples[::step], step)[: len(samples)]
 
 

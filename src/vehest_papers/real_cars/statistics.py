@@ -174,7 +174,7 @@ def _driven(recording: Recording) -> list[Recording]:
 
 
 def _at_rate(recording: Recording) -> Recording:
-    """At `RATE_HZ` without aliasing; channels with gaps are interpolated, as no filter passes them."""
+    """At `RATE_HZ` without aliasing; channels with gaps, which no filter passes, interpolated."""
     gappy = [name for name in recording.channels if np.isnan(recording[name]).any()]
     complete = [name for name in recording.channels if name not in gappy]
     slow = Resample(RATE_HZ)(recording.select(complete))

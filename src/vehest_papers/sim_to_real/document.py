@@ -11,7 +11,7 @@ import pandas as pd
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.ranking import BASELINES
 from vehest.report import figures
-from vehest.report.document import REPORT, Column, Document, Figure, Table, as_code
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import REFERENCE, fixed, line_of
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
@@ -43,14 +43,14 @@ here."""
 CHANGES = (("wide", "fast"), ("fast", "rough"), ("more", "level"))
 """Pairs of parts of which one condition of the training differs."""
 OVERVIEW_CAPTION = (
-    "Errors of all steps on simulated cars, and on the whole recording of the real Ferrari: medians "
-    "over seeds, for FVU also the lowest and highest. β₁(0): weight of the integrated acceleration "
+    "Errors of all steps on simulated cars, and on the whole recording of the real Ferrari: "
+    "medians over seeds, for FVU also the lowest and highest. β₁(0): weight of the integrated acceleration "
     "at zero yaw rate (Eq. 7a). Below: baselines, and two values of Da Lio et al. 2023."
 )
 SPREAD_CAPTION = (
     "Unexplained fraction of the variance of v (FVU) on the real Ferrari, every seed. In brackets: "
-    "first, second and third choice. Diamonds: the seed with the lowest error on the simulated cars "
-    "that choose; ticks: medians."
+    "first, second and third choice. Diamonds: the seed with the lowest error on the simulated "
+    "cars that choose; ticks: medians."
 )
 COLUMNS = {
     "step": Column("trained on: estimator"),
@@ -81,7 +81,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     steps = [step for step in all_steps if step.models[0].estimator not in BASELINES]
     baselines = [step for step in all_steps if step.models[0].estimator in BASELINES]
     choices = choices_of(steps)
-    blocks = [
+    blocks: list[Block] = [
         _overview(steps, choices, baselines),
         _spread(steps, choices),
         _traces(choices[SHIPPED]),
@@ -179,7 +179,7 @@ def _overview(
 
 def _overview_row(step: Step, choices: Mapping[str, Choice]) -> dict[str, object]:
     recordings = {(span.dataset, span.recording) for span in step.artefacts.split.train}
-    validation, race_cars, other = step.median_criteria
+    validation, race_cars, other_simulator = step.median_criteria
     row: dict[str, object] = {
         "part": step.part,
         "step": step.label,
@@ -189,7 +189,7 @@ def _overview_row(step: Step, choices: Mapping[str, Choice]) -> dict[str, object
         "seeds": len(step.models),
         "validation_rmse_vy": validation,
         "race_cars_rmse_vy": race_cars,
-        "other_simulator_rmse_vy": other,
+        "other_simulator_rmse_vy": other_simulator,
         "other_simulator_fvu": step.other_fvu,
         "weight": float(np.median(step.weight)),
         "fvu_median": step.fvu,
@@ -233,8 +233,8 @@ def _traces(choice: Choice) -> Figure:
         np.degrees(scored.sideslip[window]),
     )
     caption = (
-        "Lateral velocity and sideslip angle of the real Ferrari: measured (black) and estimated by "
-        f"seed {model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with the "
+        "Lateral velocity and sideslip angle of the real Ferrari: measured (black) and estimated "
+        f"by seed {model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with the "
         "largest mean square of the measured sideslip."
     )
     drawn = figures.zoom_figure(

@@ -31,10 +31,10 @@ def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
         axes = figure.add_subplot()
         for position, row in enumerate(rows):
             values = row.values[np.isfinite(row.values)]
-            others = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
-            offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(others))
+            not_chosen = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
+            offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(not_chosen))
             axes.scatter(
-                others,
+                not_chosen,
                 position + offsets,
                 s=11,
                 color=row.line.colour,

@@ -20,7 +20,7 @@ from vehest_papers.kit.reading import sideslip_error
 from vehest_papers.trust.faults import is_other_vehicle
 
 TRAINED = "trained on"
-OTHER = "another"
+OTHER_CAR = "another"
 """Values of column ``car``: whether a test is of a car and tyre that bands were calibrated on."""
 METRICS = (
     "coverage_90_p10",
@@ -83,7 +83,7 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                     "estimator": estimator,
                     "variant": variant,
                     "estimator_title": as_text(models[0].title),
-                    "car": OTHER if is_other else TRAINED,
+                    "car": OTHER_CAR if is_other else TRAINED,
                     **{
                         metric: float(values["value"][metric])
                         for metric in (*COVERAGES, *METRICS)

@@ -21,10 +21,9 @@ DATA_CAPTION = (
     "health flags in time; median delays. False alarms: of health without faults, with the 95 % "
     "interval; samples outside the range of the training count."
 )
-KIND_CAPTION = "Detectable faults that health flags in time, by kind of fault: number and percent."
 UNDER_FAULTS_CAPTION = (
-    "Coverage of the 90 % band of β during a fault of 10 s, with the factor of health; medians over "
-    "the estimators whose error the fault changes."
+    "Coverage of the 90 % band of β during a fault of 10 s, with the factor of health; medians "
+    "over the estimators whose error the fault changes."
 )
 
 
@@ -83,29 +82,6 @@ def by_data(counted: pd.DataFrame, trials: Sequence[FaultTrials]) -> Table:
         "interval": Column("an hour"),
     }
     return Table("faults_by_data", DATA_CAPTION, pd.DataFrame(rows), columns)
-
-
-def by_kind(cases: pd.DataFrame) -> Table:
-    """Faults flagged in time, a row a kind, a column a data set."""
-    counted = summary(cases, "data", "fault")
-    titles = list(dict.fromkeys(counted["data"]))
-    rows = []
-    for kind, group in counted.groupby("fault", sort=False):
-        by_title = {row["data"]: row for row in group.to_dict("records")}
-        row = {"fault": kind}
-        for position, title in enumerate(titles):
-            row[f"data_{position}"] = _cell(by_title.get(title))
-        rows.append(row)
-    columns = {"fault": Column("fault")}
-    columns |= {f"data_{position}": Column(title) for position, title in enumerate(titles)}
-    return Table("faults_by_kind", KIND_CAPTION, pd.DataFrame(rows), columns)
-
-
-def _cell(row: Mapping[object, object] | None) -> str:
-    if row is None or not row["detectable"]:
-        return "–"
-    percent = fixed(float(str(row["in_time_percent"])), 0)
-    return f"{row['in_time']} of {row['detectable']} ({percent} %)"
 
 
 def bands_under_faults(parts: Mapping[str, PartArtefacts], cases: pd.DataFrame) -> pd.DataFrame:

@@ -150,11 +150,13 @@ def shares_if_shuffled(
     """`share_if_shuffled` of each row of the board [%]; NaN on other cars."""
     shares = []
     for (_, row), test in zip(board.iterrows(), scores, strict=True):
-        part = parts[row["part"]]
-        model = _model_of(part, row)
-        calibration = None if test is None else scores_of(part, model, "validation")
-        is_missing = calibration is None or test is None
-        shares.append(math.nan if is_missing else 100 * share_if_shuffled(calibration, test))
+        share = math.nan
+        if test is not None:
+            part = parts[row["part"]]
+            calibration = scores_of(part, _model_of(part, row), "validation")
+            if calibration is not None:
+                share = 100 * share_if_shuffled(calibration, test)
+        shares.append(share)
     return shares
 
 

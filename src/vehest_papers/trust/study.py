@@ -1,8 +1,9 @@
 """Study of trust: coverage of bands, on cars of the training and on others, and which sensor faults
 health flags in time.
 
-A part of the pipeline is a comparison on one car, or a lap of it. Faults are injected into the test
-ranges of each part at the evaluation rate, with health fitted to its training and validation ranges.
+A part of the pipeline is a comparison on one car, or a lap of it. Faults are injected into the
+test ranges of each part at the evaluation rate, with health fitted to its training and validation
+ranges.
 """
 
 from __future__ import annotations
@@ -58,7 +59,6 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         band_tables.reliability(board[is_trained]),
         band_tables.by_acceleration(parts, board[is_trained]),
         fault_tables.by_data(by_data, trials),
-        fault_tables.by_kind(cases),
     ]
     under_faults = fault_tables.bands_under_faults(parts, cases)
     if not is_trained.all():
@@ -74,7 +74,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "faults": cases,
         **{
             f"faults_by_{column}": fault_tables.summary(cases, "data", column)
-            for column in ("part", "channel", "severity")
+            for column in ("part", "fault", "channel", "severity")
         },
         **data_of_parts(parts),
     }
@@ -86,16 +86,16 @@ def _values(
     artefacts: StudyArtefacts, board: pd.DataFrame, together: pd.DataFrame, by_data: pd.DataFrame
 ) -> dict[str, object]:
     """Numbers and names that the template has places for."""
-    other = board[board["car"] == band_tables.OTHER]
+    on_other_car = board[board["car"] == band_tables.OTHER_CAR]
     return {
         "trained": band_tables.counts(board[board["car"] == band_tables.TRAINED]),
         "other": {
-            "coverage": _percent(other["coverage_90"].median()),
-            "lowest": _percent(other["coverage_90"].min()),
-            "without": _percent(other["without_widening"].median()),
-            "lowest_without": _percent(other["without_widening"].min()),
+            "coverage": _percent(on_other_car["coverage_90"].median()),
+            "lowest": _percent(on_other_car["coverage_90"].min()),
+            "without": _percent(on_other_car["without_widening"].median()),
+            "lowest_without": _percent(on_other_car["without_widening"].min()),
         }
-        if len(other)
+        if len(on_other_car)
         else None,
         "factor": f"{OTHER_VEHICLE:g}",
         "faults": [
