@@ -82,7 +82,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     }
     board = standings(parts, rankings)
     summary = _summary(board)
-    placed = [
+    placed: list[Block] = [
         Figure("transfer", FIGURE_CAPTION, _drawn(board)),
         Table("overview", OVERVIEW_CAPTION, summary, SUMMARY_COLUMNS),
         _errors(board),
