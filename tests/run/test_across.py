@@ -182,7 +182,8 @@ def test_bands_and_faults_are_listed_by_car(across):
     assert by_part["in_time"].item() == faults["in_time"].sum()
     text = (folder / "report.md").read_text(encoding="utf-8")
     assert "the median coverage is" in text
-    assert f"Of {faults['detectable'].sum()} detectable faults in" in text
+    in_time_percent = 100 * faults.loc[faults["detectable"], "in_time"].mean()
+    assert f"Health flags {in_time_percent:.1f} % of the detectable faults" in text
 
 
 def test_minutes_of_reference_are_columns_of_one_table(across):
@@ -217,9 +218,7 @@ def test_minutes_of_reference_are_columns_of_one_table(across):
         assert by_title[title]["longest"] == 1.0
     text = (folder / "report.md").read_text(encoding="utf-8")
     lowest = min(by_title.values(), key=lambda row: row["minutes_0.5"])
-    assert (
-        f"| {lowest['minutes_0.5']:.2f}° after 0.5 min: {lowest['title']}, from scratch |" in text
-    )
+    assert f"- My car, unseen: {lowest['minutes_0.5']:.2f}° with 0.5 min, " in text
     assert text.count("![") == 1
 
 

@@ -178,7 +178,7 @@ def by_acceleration(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) -> 
     """Coverage by lateral acceleration, a row a part."""
     rows = []
     for (key, title), group in board.groupby(["part", "title"], sort=False):
-        metrics = parts[key].metrics
+        metrics = parts[str(key)].metrics
         metrics = metrics[
             metrics["test_set"].isin(set(group["test_set"]))
             & (metrics["metric"] == "coverage_90")

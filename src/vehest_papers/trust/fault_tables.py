@@ -5,7 +5,7 @@ and what bands cover meanwhile.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 import pandas as pd
 
@@ -61,7 +61,7 @@ def by_data(counted: pd.DataFrame, trials: Sequence[FaultTrials]) -> Table:
         of_data = [trial for trial in trials if trial.data == row["data"]]
         drives = [drive for trial in of_data for drive in trial.nominal]
         rate = false_alarms_per_hour(drives, of_data[0].rate_hz)
-        alarms = {
+        alarms: dict[Hashable, object] = {
             "data": as_text(row["data"]),
             "hours": rate.hours,
             "alarms": rate.alarms,

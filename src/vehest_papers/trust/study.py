@@ -98,14 +98,7 @@ def _values(
         if len(on_other_car)
         else None,
         "factor": f"{OTHER_VEHICLE:g}",
-        "faults": [
-            {
-                "title": as_text(row["data"]),
-                "detectable": row["detectable"],
-                "in_time_percent": fixed(row["in_time_percent"], 1),
-            }
-            for row in by_data.to_dict("records")
-        ],
+        "in_time": [fixed(percent, 1) for percent in by_data["in_time_percent"]],
         "n_drives": len(together),
         "n_drives_contained": int((together["contained"] == "yes").sum()),
         "horizon": f"{HORIZON_SECONDS:g}",
