@@ -20,6 +20,7 @@ import torch
 from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, provenance
 from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
+from vehest.data.files import sha256_of
 from vehest.data.splits import VALIDATION
 from vehest.data.text_files import write_json
 from vehest.estimators.kernels.blas import single_blas_thread
@@ -140,6 +141,7 @@ def draw_report(
         **({"search_remarks": list(search_remarks)} if search_remarks else {}),
         **({"not_trained": artefacts.not_trained} if artefacts.not_trained else {}),
         **({"weights": FORMAT} if study.publish else {}),
+        **({"templates": templates} if (templates := template_digests(study.report)) else {}),
     }
     ingested = [
         artefact
@@ -183,6 +185,15 @@ def draw_report(
     return report, summary_of_leaderboard(
         study.title, module.leaderboard(artefacts.first), left_out, verdict
     )
+
+
+def template_digests(name: str) -> dict[str, str]:
+    """File name -> SHA-256 of each Markdown template beside the module of a study.
+
+    A report is drawn again where one of them changed; no published study becomes stale by it.
+    """
+    folder = Path(str(study_module(name).__file__)).parent
+    return {file.name: sha256_of(file) for file in sorted(folder.glob("*.md.j2"))}
 
 
 def _write(

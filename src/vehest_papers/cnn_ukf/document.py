@@ -16,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import MISSING, fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest_papers.cnn_ukf import (
     block_errors,
@@ -51,7 +52,6 @@ from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     claims_table,

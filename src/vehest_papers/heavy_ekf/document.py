@@ -16,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Document, as_code
 from vehest.report.style import fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import block_errors, conditions, laps, paper, region_map, tyres
 from vehest_papers.heavy_ekf.candidates import FILTERS, MIN_SPEED, Tuned
@@ -49,7 +50,6 @@ from vehest_papers.kit.block_rows import (
 )
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     claims_table,

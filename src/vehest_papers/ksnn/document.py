@@ -15,12 +15,12 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_text
 from vehest.report.style import MISSING, fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import recordings_of, words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     DECIDED,

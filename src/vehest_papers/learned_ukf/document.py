@@ -14,6 +14,7 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import MISSING, fixed, listed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import (
@@ -29,7 +30,6 @@ from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     claims_table,

@@ -13,8 +13,8 @@ import pandas as pd
 from vehest.data.errors import printable
 from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import fixed, significant
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.proving_ground import drawing, gates
 from vehest_papers.proving_ground.papers import profile_of
 from vehest_papers.proving_ground.tally import FLAGS, MIN_SPEED

@@ -1,4 +1,4 @@
-"""Reports from hand-written Markdown templates, in which numbers, tables and figures are filled in."""
+"""Reports from hand-written Markdown templates, with numbers, tables and figures filled in."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MARK = "\0"  # before and after the place of a table or figure
 
 
 def fill_template(path: Path, values: Mapping[str, Any], blocks: Iterable[Block]) -> list[Block]:
-    """Fill in a template: ``{{ name }}``, loops over rows, ``{{ table("name") }}``, ``{{ figure("name") }}``.
+    """Fill in a template: values, loops over rows, ``{{ table("name") }}``, ``{{ figure("name") }}``.
 
     Parameters
     ----------
