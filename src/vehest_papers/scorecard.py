@@ -53,6 +53,7 @@ from vehest_papers.kit.verdicts import (
     least_training,
 )
 
+DATA_KINDS = ("real", "simulated", "computed")
 PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
 TITLES = {
     "ksnn": "KS-NN",
@@ -94,8 +95,7 @@ CSV_COLUMNS = (
 LEGEND = (
     (
         "NNTF_UH, RATTE, …",
-        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` "
-        "describes each",
+        "the papers' names of their methods, described at the beginning of each paper's section",
     ),
     ("published", "value of the paper"),
     (
@@ -109,14 +109,14 @@ LEGEND = (
         "`rmse_sideslip` [deg] and the others: [metrics](../docs/evaluation.md#metrics)",
     ),
     (
-        "ratio",
-        "error of the first candidate of a claim over that of the second, all samples together; "
-        "below 1 the first one is better",
+        "mean of blocks' ratios",
+        "error of the first candidate of a claim over that of the second within each manoeuvre, "
+        "lap or segment (a block), averaged with the same weight for each; below 1 the first one "
+        "is better. It decides whether a difference is significant",
     ),
     (
-        "mean of blocks' ratios",
-        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same "
-        "weight for each",
+        "ratio",
+        "the same for all samples together; it is compared with the size that the paper states",
     ),
     ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
     (
@@ -124,6 +124,12 @@ LEGEND = (
         "from the errors by block and seed ([definitions, and how often they are "
         "right](../docs/scorecard.md)); in *italics* where the training has not been shown to be "
         "sufficient",
+    ),
+    (
+        "verdict on a value of a table",
+        "agrees: the 90 % interval of ours lies within ±10 % of the published value; lower, "
+        "higher: it lies outside; else inconclusive. Where ours are other data than the paper's, "
+        "a difference says nothing against the method",
     ),
 )
 """Columns of the page's tables and what they hold."""
@@ -139,18 +145,37 @@ class Study:
     rows: Sequence[tuple[Table, Row, Judgement]]
     is_published: bool  # whether there are errors by block
 
+    @property
+    def claims_of_paper(self) -> list[Claim]:
+        """Claims without the comparisons that we added."""
+        return [claim for claim in self.paper.claims if not claim.is_added]
+
     def counts(self) -> Counter[str]:
-        """Verdict -> number of the paper's claims, without comparisons that we added."""
+        """Verdict -> number of the paper's claims."""
+        return Counter(self.claims[claim.id].verdict for claim in self.claims_of_paper)
+
+    def provisional_counts(self) -> Counter[str]:
+        """Verdict -> number of the paper's claims whose training was not shown to suffice."""
         return Counter(
-            self.claims[claim.id].verdict for claim in self.paper.claims if not claim.is_added
+            self.claims[claim.id].verdict
+            for claim in self.claims_of_paper
+            if _is_provisional(self.claims[claim.id], least_training(claim, self.training)[1])
+        )
+
+    def counts_of_data(self) -> Counter[str]:
+        """Data -> number of the paper's claims that errors by block on these data decide."""
+        return Counter(
+            self.paper.parts[claim.part]
+            for claim in self.claims_of_paper
+            if self.claims[claim.id].n_blocks
         )
 
     def counts_of_training(self) -> Counter[str]:
         """Training -> number of the paper's claims that errors by block decide."""
         return Counter(
             state.state if state is not None else "not applicable"
-            for claim in self.paper.claims
-            if not claim.is_added and self.claims[claim.id].n_blocks
+            for claim in self.claims_of_paper
+            if self.claims[claim.id].n_blocks
             for _, state in [least_training(claim, self.training)]
         )
 
@@ -245,9 +270,24 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         "## Verdicts on the papers' claims",
         "",
-        *_table_of_counts(studies, "verdict", VERDICTS, [study.counts() for study in studies]),
+        *_table_of_counts(
+            studies,
+            "verdict",
+            VERDICTS,
+            [study.counts() for study in studies],
+            [study.provisional_counts() for study in studies],
+        ),
         "",
+        "*Provisional*: the training of a candidate was not shown to suffice, or its networks were "
+        "trained too shortly.",
         f"*Not assessed*: {NOT_PUBLISHED}, or not of this candidate.",
+        "",
+        "Data that decided the claims; simulated drives stand in for recordings that are not "
+        "public:",
+        "",
+        *_table_of_counts(
+            studies, "data", DATA_KINDS, [study.counts_of_data() for study in studies]
+        ),
         "",
         "Training of the least trained candidate of each claim that was assessed:",
         "",
@@ -265,12 +305,33 @@ def _page(studies: Sequence[Study], results: Path) -> str:
 
 
 def _table_of_counts(
-    studies: Sequence[Study], heading: str, words: Sequence[str], counts: Sequence[Counter[str]]
+    studies: Sequence[Study],
+    heading: str,
+    words: Sequence[str],
+    counts: Sequence[Counter[str]],
+    provisional: Sequence[Counter[str]] | None = None,
 ) -> list[str]:
-    """Number of claims of each paper, a row a word, with their sum."""
-    rows = [(word, *(str(number[word] or MISSING) for number in counts)) for word in words]
+    """Number of claims of each paper, a row a word, with their sum; of these, provisional ones."""
+    rows = [
+        (
+            word,
+            *(
+                _counted(n_claims[word], n_provisional[word])
+                for n_claims, n_provisional in zip(
+                    counts, provisional or [Counter()] * len(counts), strict=True
+                )
+            ),
+        )
+        for word in words
+    ]
     rows.append(("all", *(str(number.total()) for number in counts)))
     return _table((heading, *(_linked(study) for study in studies)), rows, n_text=1)
+
+
+def _counted(n_claims: int, n_provisional: int) -> str:
+    if not n_claims:
+        return MISSING
+    return f"{n_claims} ({n_provisional} provisional)" if n_provisional else str(n_claims)
 
 
 def _section(study: Study, results: Path) -> list[str]:
@@ -287,10 +348,20 @@ def _section(study: Study, results: Path) -> list[str]:
     ]
     if not study.is_published:
         lines += [f"Not assessed yet: {NOT_PUBLISHED}.", ""]
+    lines += [f"### Methods of {TITLES[paper.paper]}", ""]
+    lines += _table(
+        ("name", "method"),
+        [
+            (_text(name), _text(without_line_breaks(declared.description)))
+            for name, declared in paper.candidates.items()
+        ],
+        n_text=2,
+    )
+    lines.append("")
     for table in paper.tables:
         lines += _section_of_table(study, table)
     lines += [f"### Claims of {TITLES[paper.paper]}", ""]
-    lines += _table_of_claims(study, [claim for claim in paper.claims if not claim.is_added])
+    lines += _table_of_claims(study, study.claims_of_paper)
     if added := [claim for claim in paper.claims if claim.is_added]:
         lines += [f"### Beside the paper: {TITLES[paper.paper]}", ""]
         lines += ["Comparisons that the paper does not make; they are in no count above.", ""]
@@ -314,7 +385,7 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 f"{significant(row.published)}{unit}",
                 figures_in_words(judgement, unit, _text),
                 epochs_in_words(study.paper, row.candidate, state),
-                _verdict(judgement, state),
+                _in_italics(_of_value(judgement, row.published), judgement, state),
             )
         )
     about = without_line_breaks(study.paper.test_sets[table.test_set])
@@ -390,7 +461,7 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
                 figures_in_words(judgement, unit_of(claim), _text),
                 f"{origin}, {claim.test_set}" if origin else MISSING,
                 epochs_in_words(study.paper, name, state),
-                _verdict(judgement, state),
+                _in_italics(judgement.verdict, judgement, state),
                 reason or MISSING,
             )
         )
@@ -406,11 +477,27 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
     return [*_table(headings, cells), ""]
 
 
-def _verdict(judgement: Judgement, training: Training | None) -> str:
+def _in_italics(verdict: str, judgement: Judgement, training: Training | None) -> str:
     """The verdict, in italics where the training of a network was not shown to suffice."""
+    return f"*{verdict}*" if _is_provisional(judgement, training) else verdict
+
+
+def _is_provisional(judgement: Judgement, training: Training | None) -> bool:
     is_assessed = judgement.n_blocks > 0
     is_sufficient = training is None or training.state in ("sufficient", "not applicable")
-    return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
+    return is_assessed and not is_sufficient
+
+
+def _of_value(judgement: Judgement, published: float) -> str:
+    """The verdict on a table's value in words of its own: a difference on other data than the
+    paper's contradicts no claim.
+    """
+    ours = next(iter(judgement.values.values()), None)
+    if judgement.verdict == "reproduced":
+        return "agrees"
+    if judgement.verdict == "contradicted" and ours is not None:
+        return "lower" if ours.value < published else "higher"
+    return judgement.verdict
 
 
 def _csv_rows(study: Study) -> list[dict[str, str]]:
@@ -426,20 +513,20 @@ def _csv_rows(study: Study) -> list[dict[str, str]]:
             metric=row.metric,
             published={row.candidate: row.published},
         )
-        rows.append(_csv_row(study, claim, judgement, "table"))
+        of_value = {"row": "table", "verdict": _of_value(judgement, row.published)}
+        rows.append(_csv_row(study, claim, judgement) | of_value)
     for claim in study.paper.claims:
-        kind = "added comparison" if claim.is_added else "claim"
-        rows.append(_csv_row(study, claim, study.claims[claim.id], kind))
+        rows.append(_csv_row(study, claim, study.claims[claim.id]))
     return rows
 
 
-def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dict[str, str]:
+def _csv_row(study: Study, claim: Claim, judgement: Judgement) -> dict[str, str]:
     name, state = least_training(claim, study.training)
     declared = study.paper.candidates.get(name)
     of_paper = "" if declared is None or declared.epochs_paper is None else declared.epochs_paper
     return {
         "paper": study.paper.paper,
-        "row": kind,
+        "row": "added comparison" if claim.is_added else "claim",
         "id": claim.id,
         "text": without_line_breaks(claim.claim),
         "source": claim.source,

@@ -109,10 +109,10 @@ def figures_in_words(judgement: Judgement, unit: str, named: Callable[[str], str
     for name, figure in judgement.values.items():
         label = f"{named(name)} " if len(judgement.values) > 1 else ""
         words.append(f"{label}{figure_in_words(figure)}{unit}")
-    if judgement.size is not None:
-        words.append(f"ratio {figure_in_words(judgement.size)}")
     if judgement.order is not None:
         words.append(f"mean of blocks' ratios {figure_in_words(judgement.order)}")
+    if judgement.size is not None:
+        words.append(f"ratio {figure_in_words(judgement.size)}")
     return "; ".join(words) or MISSING
 
 

@@ -176,7 +176,8 @@ def training_rows(
         category = trained_as.split(",")[0]
         models += [
             model
-            for part in parts.values()
+            for name, part in parts.items()
+            if not DOUBLED.fullmatch(name)
             for model in part.models
             if category_of(model.estimator, model.variant) == category
         ]
