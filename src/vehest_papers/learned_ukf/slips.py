@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
@@ -40,7 +40,7 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
 
 def distribution(
     slips: Mapping[str, FloatArray], name: str, data: str, note: str
-) -> tuple[Figure, Table, pd.DataFrame]:
+) -> tuple[Figure, pd.DataFrame, pd.DataFrame]:
     """Density of each set's slip angle [deg], its percentiles, and the drawn values."""
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
@@ -82,13 +82,4 @@ def distribution(
         }
         for label, values in slips.items()
     ]
-    columns = {"set": Column("set"), "samples": Column("samples")} | {
-        f"p{p}": Column(f"{p} % below [deg]", decimals=1) for p in PERCENTILES
-    }
-    table = Table(
-        f"slip_percentiles_{name}",
-        "Size of the slip angle of the rear axle.",
-        pd.DataFrame(rows),
-        columns,
-    )
-    return Figure(f"figure_3_{name}", caption, figure), table, drawn
+    return Figure(f"figure_3_{name}", caption, figure), pd.DataFrame(rows), drawn
