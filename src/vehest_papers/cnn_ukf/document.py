@@ -34,7 +34,7 @@ from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
     KPIS,
-    LARGEST_SIDESLIP,
+    MAX_PAPER_SIDESLIP,
     TEST,
     Prepared,
     Run,
@@ -178,7 +178,7 @@ def _subjects(artefacts: StudyArtefacts) -> Subjects:
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     full = artefacts.parts[FULL]
-    within = runs_of(full, Prepared(full, until_sideslip=LARGEST_SIDESLIP, read=read))
+    within = runs_of(full, Prepared(full, until_sideslip=MAX_PAPER_SIDESLIP, read=read))
     return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), within, kind)
 
 
@@ -417,7 +417,7 @@ def _values(
         "recommendation": without_line_breaks(content.recommendation),
         "kind": subjects.kind,
         "manoeuvres": len(main.manoeuvres),
-        "beyond": _number_beyond(main, LARGEST_SIDESLIP),
+        "beyond": _number_beyond(main, MAX_PAPER_SIDESLIP),
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),

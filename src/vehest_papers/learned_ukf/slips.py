@@ -14,7 +14,7 @@ from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
 
-LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise
+MIN_SPEED = 0.5  # [m/s] below which a slip angle is noise
 LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)
@@ -33,7 +33,7 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
     parts = []
     for recording in recordings:
         vx, vy, yaw_rate = (recording[name] for name in ("vx_ref", "vy_ref", "yaw_rate_ref"))
-        moving = vx >= LEAST_SPEED
+        moving = vx >= MIN_SPEED
         parts.append(np.degrees(np.arctan2(vy - cg_to_rear_axle * yaw_rate, vx))[moving])
     return np.concatenate(parts)
 
@@ -72,7 +72,7 @@ def distribution(
         legend_above(figure, axes)
     caption = (
         "Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. "
-        f"Data: {data}. Samples with v_x of {LEAST_SPEED:g} m/s and more. {note}"
+        f"Data: {data}. Samples with v_x of {MIN_SPEED:g} m/s and more. {note}"
     )
     rows = [
         {
