@@ -93,7 +93,7 @@ def test_pairs_without_all_trainings_and_seeds_of_some_pairs_are_left_out():
 
 def test_ratio_over_pairs_is_the_planted_one_and_its_power_that_of_the_spread():
     errors = errors_of(complete(8))
-    table = pairs.ratios_table(errors).frame.set_index("over")
+    table = pairs.ratios_table(errors).set_index("over")
     assert table.loc[paper.GRU, "other_stop_raw"].startswith("0.5 [") or table.loc[
         paper.GRU, "other_stop_raw"
     ].startswith("0.500 [")

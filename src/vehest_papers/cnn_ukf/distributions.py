@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
@@ -116,7 +116,7 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
     return Figure(f"figure_{number}", caption, figure), pd.DataFrame(rows)
 
 
-def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
+def groups(runs: Runs, data: str) -> tuple[Figure, pd.DataFrame]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
     of_run = {
         candidate: [kpis_by_group(run.test) for run in seeds] for candidate, seeds in runs.items()
@@ -167,15 +167,8 @@ def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
         }
         for group in names
     ]
-    columns = {
-        "group": Column("manoeuvres"),
-        "n": Column("of them", decimals=0),
-        **{candidate: Column(candidate) for candidate in of_run},
-    }
     caption = (
         "MSE_nl by group of manoeuvres, median and range of seeds (Figure 6 of the paper). Data: "
         f"{data}."
     )
-    return Figure("figure_6", caption, figure), Table(
-        "figure_6", caption, pd.DataFrame(rows), columns
-    )
+    return Figure("figure_6", caption, figure), pd.DataFrame(rows)

@@ -35,7 +35,7 @@ from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
     KPIS,
-    LARGEST_SIDESLIP,
+    MAX_PAPER_SIDESLIP,
     TEST,
     Prepared,
     Run,
@@ -95,10 +95,6 @@ class Outcome:
     blocks: list[Block] = field(default_factory=list)
     data: dict[str, pd.DataFrame] = field(default_factory=dict)
     rows: list[BlockRow] = field(default_factory=list)
-
-    def add_files(self, *new: Table) -> None:
-        """Tables that the report links to and does not show."""
-        self.data |= {table.name: table.frame for table in new}
 
 
 @dataclass(frozen=True)
@@ -182,7 +178,7 @@ def _subjects(artefacts: StudyArtefacts) -> Subjects:
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     full = artefacts.parts[FULL]
-    within = runs_of(full, Prepared(full, until_sideslip=LARGEST_SIDESLIP, read=read))
+    within = runs_of(full, Prepared(full, until_sideslip=MAX_PAPER_SIDESLIP, read=read))
     return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), within, kind)
 
 
@@ -230,7 +226,8 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
     ]
     for name, candidates in (("networks_alone", ALONE), ("oracles", tables.ORACLES)):
         if among := subjects.among(candidates):
-            outcome.add_files(tables.accuracy(ManoeuvreErrors(among), {}, training, name, ""))
+            errors = ManoeuvreErrors(among)
+            outcome.data[name] = tables.accuracy(errors, {}, training, name, "").frame
     outcome.data["within_12_deg"] = kpi_table(subjects.within)
 
 
@@ -289,16 +286,16 @@ def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
             part, prepared, {name: subjects.parts[FULL][name] for name in _filters(subjects)}, kind
         ),
     ]
-    outcome.add_files(tables.networks_alone(main, outputs, "networks_full", ""))
+    outcome.data["networks_full"] = tables.networks_alone(main, outputs)
     local = pd.DataFrame()
     if paper.SMOOTH in subjects.runs:
         smooth = filter_of(load_model(chosen(subjects.runs[paper.SMOOTH]).model.model_folder))
         assert smooth is not None
         local = observability.local(smooth)
-        outcome.add_files(observability.observability_table(local))
+        outcome.data["observability"] = local
     if off.stiffness[perturbed.NOMINAL]:
         outcome.blocks.append(perturbed.figure_14(off, kind))
-        outcome.add_files(perturbed.perturbed_table(off, kind))
+        outcome.data["perturbed"] = perturbed.by_condition(off)
         outcome.data["stiffness"] = perturbed.values(off)
     learnt = None
     if LIMITED in subjects.parts:
@@ -342,9 +339,7 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
         outcome.blocks.append(
             traces.angles_of_networks(hybrids, prepared, warm_up, turn, subjects.kind)
         )
-    outcome.add_files(
-        tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", "")
-    )
+    outcome.data["networks_limited"] = tables.networks_alone(learnt.comparison, learnt.outputs)
 
 
 def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
@@ -366,8 +361,7 @@ def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
         traces.manoeuvre_of(part, prepared, group) for group in ("slalom", "spiral", "lap")
     )
     figure_5, outcome.data["errors_full"] = distributions.errors_figure(compared, 5, title, kind)
-    figure_6, by_group = distributions.groups(compared, title, kind)
-    outcome.add_files(by_group)
+    figure_6, outcome.data["figure_6"] = distributions.groups(compared, kind)
     of_four = {name: run for name, run in drawn.items() if name in paper.OF_FOUR} or drawn
     outcome.blocks += [
         figure_5,
@@ -400,16 +394,13 @@ def _files(outcome: Outcome, subjects: Subjects) -> None:
             f"seed, scaled. Data: {kind}."
         )
         outcome.blocks.append(loss_figure(losses, caption))
-    outcome.add_files(
-        tables.filters(
-            [of_part for name, of_part in titled.items() if name in (FULL, "free")], kind
+    outcome.data |= {
+        "filters": tables.filters([titled[name] for name in titled if name in (FULL, "free")]),
+        "scaling": tables.scaling(titled),
+        "budget": tables.budget(
+            [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()]
         ),
-        tables.scaling(titled, kind),
-        tables.budget(
-            [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()],
-            kind,
-        ),
-    )
+    }
     outcome.data |= {f"kpis_{name}": kpi_table(runs) for name, runs in parts.items()}
 
 
@@ -426,7 +417,7 @@ def _values(
         "recommendation": without_line_breaks(content.recommendation),
         "kind": subjects.kind,
         "manoeuvres": len(main.manoeuvres),
-        "beyond": _number_beyond(main, LARGEST_SIDESLIP),
+        "beyond": _number_beyond(main, MAX_PAPER_SIDESLIP),
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
-from vehest.report.document import Column, Table
 from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)
@@ -68,15 +67,3 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
                     }
                 )
     return pd.DataFrame(rows)
-
-
-def observability_table(local_table: pd.DataFrame) -> Table:
-    """`local` as it is shown."""
-    columns = {
-        "speed": Column("speed [m/s]", decimals=0),
-        "steer": Column("steering angle [deg]", decimals=1),
-        "measured": Column("measured"),
-        "rank": Column("rank", decimals=0),
-        "deviation": Column("deviation of V_y from 10 samples [m/s]", decimals=4),
-    }
-    return Table("observability", "Local observability in steady turns", local_table, columns)

@@ -22,7 +22,7 @@ from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import finite_cost, optuna_search
@@ -207,13 +207,13 @@ def figure_14(results: Perturbed, data: str) -> Figure:
     return Figure("figure_14", caption, figure)
 
 
-def perturbed_table(results: Perturbed, data: str) -> Table:
+def by_condition(results: Perturbed) -> pd.DataFrame:
     """MSE_nl of every filter as it is and under every perturbation, with intervals."""
     conditions: dict[str, Runs] = {"as identified": results.stiffness[NOMINAL]}
     conditions |= {
-        f"stiffness {words}": comparison
-        for words, comparison in zip(LABELS, results.stiffness, strict=True)
-        if comparison is not results.stiffness[NOMINAL]
+        f"stiffness {label}": runs
+        for label, runs in zip(LABELS, results.stiffness, strict=True)
+        if runs is not results.stiffness[NOMINAL]
     }
     conditions |= results.bodies
     if results.tuned:
@@ -229,17 +229,11 @@ def perturbed_table(results: Perturbed, data: str) -> Table:
                 **{candidate: comparison.text(candidate, MSE_NL) for candidate in runs},
             }
         )
-    columns = {"condition": Column("the filter takes")} | {
-        candidate: Column(candidate) for candidate in results.stiffness[NOMINAL]
-    }
-    caption = f"MSE_nl [deg²] with wrong tyres or body. Data: {data}."
-    return Table("perturbed", caption, pd.DataFrame(rows).fillna("–"), columns)
+    return pd.DataFrame(rows).fillna("–")
 
 
 def values(results: Perturbed) -> pd.DataFrame:
-    """MSE and MSE_nl of every run with every combination; columns: candidate, seed, front, rear,
-    mse, mse_nonlinear.
-    """
+    """MSE and MSE_nl of every run with every combination of stiffnesses, a row each."""
     return pd.DataFrame(
         [
             {"candidate": candidate, "seed": run.model.seed, "front": front, "rear": rear}

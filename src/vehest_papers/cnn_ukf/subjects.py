@@ -29,7 +29,7 @@ from vehest_papers.kit.reading import models_by_candidate, sideslip_error
 
 TEST = "test"
 CUTOFF_HZ = 5.0
-LARGEST_SIDESLIP = 0.21  # rad, 12°: beyond it no drive of the paper goes
+MAX_PAPER_SIDESLIP = 0.21  # rad, 12°: beyond it no drive of the paper goes
 OFFLINE = (
     RemoveOutliers(),
     LowPass(CUTOFF_HZ, design="fir"),

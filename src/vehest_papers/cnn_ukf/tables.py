@@ -15,7 +15,7 @@ from vehest.estimators.dugoff_ukf import LEVELS, SENSORS, TYRES
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
 from vehest.report.document import Column, Table
-from vehest.report.style import MISSING, fixed, significant
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.block_errors import network_squares
@@ -43,15 +43,6 @@ OutputsOf = Mapping[
 ]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 PROCESS = ("process_vy", "process_yaw_rate")
-LEVEL_HEADERS = {
-    "process_vy": "σ_Vy [m/s]",
-    "process_yaw_rate": "σ_ψ̇ [rad/s]",
-    "ay": "σ_ay [m/s²]",
-    "yaw_rate": "σ of the gyroscope [rad/s]",
-    "fy_front": "σ_Fyf [N]",
-    "fy_rear": "σ_Fyr [N]",
-    "force_factor": "factor of forces, linear",
-}
 
 
 def accuracy(
@@ -180,11 +171,14 @@ def _quantiles(parts: Sequence[FloatArray]) -> str:
     return " / ".join(f"{value:.2g}" for value in np.percentile(values, [5, 50, 95]))
 
 
-def networks_alone(
-    comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str
-) -> Table:
-    """Squared errors of the hybrids' networks, beside those of their filters, and the networks'
-    deviations.
+def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf) -> pd.DataFrame:
+    """Errors of the hybrids' networks and of their filters, and the networks' deviations.
+
+    Returns
+    -------
+    DataFrame
+        ``candidate``; ``network`` and ``filter``, MSE with its interval [deg²]; ``rms`` of the
+        network's error and median ``sigma`` [deg] in non-linear driving.
     """
     rows = []
     for candidate, seeds in outputs.items():
@@ -204,19 +198,16 @@ def networks_alone(
                 "sigma": float(np.median(distrust[is_nonlinear])),
             }
         )
-    columns = {
-        "candidate": Column("method"),
-        "network": Column("MSE of β_DD [deg²]"),
-        "filter": Column("MSE of β [deg²]"),
-        "rms": Column("RMS of β_DD's error from 4 m/s² on [deg]", decimals=3),
-        "sigma": Column("median σ_DD there [deg]", decimals=3),
-    }
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives;
-    ``parts``: title and runs.
+def filters(parts: Sequence[tuple[str, Runs]]) -> pd.DataFrame:
+    """Tyres and levels of noise of the filters, a row for each seed, after those of the paper.
+
+    Parameters
+    ----------
+    parts
+        Title and runs of each part.
     """
     rows: list[dict[str, object]] = [
         {
@@ -240,26 +231,10 @@ def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
                     rows.append(
                         row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS}
                     )
-    for row in rows:
-        texts = {level: significant(float(str(row[level]))) for level in LEVELS}
-        row |= {f"shown_{level}": text for level, text in texts.items()}
-    columns = {
-        "part": Column("part"),
-        "candidate": Column("method"),
-        "seed": Column("seed", decimals=0),
-    }
-    for axle in ("front", "rear"):
-        columns |= {
-            f"cornering_stiffness_{axle}": Column(f"C, {axle} [N/rad]", decimals=0),
-            f"friction_{axle}": Column(f"μ₀, {axle}", decimals=3),
-            f"reduction_{axle}": Column(f"e_r, {axle} [s/m]", decimals=4),
-        }
-    columns |= {f"shown_{level}": Column(header) for level, header in LEVEL_HEADERS.items()}
-    caption = f"Tyres and levels of noise of the filters. Data: {data}."
-    return Table("filters", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
+def scaling(parts: Mapping[str, tuple[str, Runs]]) -> pd.DataFrame:
     """p₁ and p₂ of Eq. 11 of each set."""
     rows = []
     for part, (title, runs) in parts.items():
@@ -278,14 +253,10 @@ def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
                     "p2": p2,
                 }
             )
-    columns = {"part": Column("part"), "seed": Column("seed")}
-    columns |= {"paper_p1": Column("p₁, paper", decimals=3), "p1": Column("p₁, ours", decimals=3)}
-    columns |= {"paper_p2": Column("p₂, paper", decimals=3), "p2": Column("p₂, ours", decimals=3)}
-    caption = f"Scaling of the ensemble's variance (Eq. 11) in rad². Data: {data}."
-    return Table("scaling", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table:
+def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]]) -> pd.DataFrame:
     """Seeds, epochs and parameters, by part and candidate."""
     rows = []
     for title, part, runs in parts:
@@ -306,17 +277,7 @@ def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table
                     "n_parameters": metrics.get((*keys[0], "n_parameters"), math.nan),
                 }
             )
-    columns = {
-        "part": Column("part"),
-        "candidate": Column("method"),
-        "n_seeds": Column("seeds", decimals=0),
-        "epochs": Column("epochs of each seed, best in brackets"),
-        "lost": Column("lost sequences and skipped steps", decimals=0),
-        "n_parameters": Column("parameters", decimals=0),
-    }
-    return Table(
-        "budget", f"What was spent: seeds and epochs. Data: {data}.", pd.DataFrame(rows), columns
-    )
+    return pd.DataFrame(rows)
 
 
 def _epochs(runs: Sequence[Run]) -> str:

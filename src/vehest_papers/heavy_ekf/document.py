@@ -122,7 +122,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "twin_cells": every_cell(twin),
         "noise_levels": _noise_levels(trucks, twin),
         "rear_slip": _slips_by_truck(trucks),
-        "ranges": methods.ranges_table(artefacts, "ranges", "", {}).frame,
+        "ranges": methods.ranges(artefacts),
         BLOCKS: frame(rows, BlockRow),
         TRAINING: frame(trained, TrainingRow),
     }

@@ -33,17 +33,14 @@ from vehest.vehicle.rational_tyres import rational_axle
 from vehest_papers.heavy_ekf import paper
 
 RATE = 20.0  # Hz, as in the paper
-FINER = 20  # steps of the plant a sample: 400 Hz
+SUBSTEPS = 20  # steps of the plant a sample: 400 Hz
 SECONDS = 120.0
 TRUCK = SingleTrackParameters(
     7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0
 )  # as in conf/vehicle/heavy_truck.yaml
 CURVES = np.array([paper.CURVES[name] for name in ("c1_front", "c2_front", "c1_rear", "c2_rear")])
-TRACK = 2.08
-CG_HEIGHT = 0.85  # m, likewise; both assumed there
-PAYLOAD = 1978.0
-PAYLOAD_BEHIND = 1.0
-PAYLOAD_HEIGHT = 1.4  # kg, a quarter; m behind the centre of gravity and above the road; assumed
+PAYLOAD = 1978.0  # kg, a quarter of the mass; assumed
+PAYLOAD_BEHIND = 1.0  # m behind the centre of gravity; assumed
 CROSSFALL = math.radians(1.0)
 DRY = 1.0
 WET = 0.6
@@ -55,15 +52,15 @@ NOISE = {
 }  # a sample, white; assumed
 SLIP_GAIN = 4.0
 TURN_GAIN = 10.0  # 1/s
-LARGEST_STEER = 0.7
-FASTEST_STEER = 1.0  # rad, rad/s
+MAX_STEER = 0.7  # rad
+MAX_STEER_RATE = 1.0  # rad/s
 FRONT_SHARE = 0.98  # of the front axle's largest force, which the driver does not ask more of
 SPEEDS = (12.5, 26.0)  # m/s, mean of a drive: from the laps at 45 km/h to the fast one
 BEND_SECONDS = (4.0, 9.0)
 REST_SECONDS = (1.0, 3.0)
 WET_SECONDS = (12.0, 25.0)
 RAMP_SECONDS = 1.5
-SMALLEST_BEND = 0.4  # of the largest rear slip of a drive
+MIN_BEND_SHARE = 0.4  # of the largest rear slip of a drive
 
 
 @dataclass(frozen=True)
@@ -88,13 +85,12 @@ class Plant:
     car: SingleTrackParameters
     load_front: float
     load_rear: float
-    cg_height: float
 
     @classmethod
     def of(cls, *, payload: bool) -> Plant:
         """The truck, with or without its payload."""
         if not payload:
-            return cls(TRUCK, 1.0, 1.0, CG_HEIGHT)
+            return cls(TRUCK, 1.0, 1.0)
         mass = TRUCK.mass + PAYLOAD
         behind = PAYLOAD * PAYLOAD_BEHIND / mass
         inertia = (
@@ -102,30 +98,12 @@ class Plant:
         )
         front = TRUCK.cg_to_front_axle + behind
         rear = TRUCK.cg_to_rear_axle - behind
-        height = (TRUCK.mass * CG_HEIGHT + PAYLOAD * PAYLOAD_HEIGHT) / mass
         at_front = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle)
         at_rear = mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
         car = replace(
             TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear
         )
-        return cls(car, float(at_front), float(at_rear), float(height))
-
-    @property
-    def roll_over(self) -> float:
-        """Lateral acceleration at which the inner wheels lift, g t/(2 h) [m/s²]; neither springs
-        nor tyres give.
-        """
-        return GRAVITY * TRACK / (2.0 * self.cg_height)
-
-    @property
-    def slides_at(self) -> float:
-        """Lateral acceleration that the axles' largest forces can make on a dry road, Σ c₂ √(2c₁)/2
-        F_z/F_z0 / M [m/s²].
-        """
-        loads = np.array([self.load_front, self.load_rear])
-        return float(np.sum(loads * CURVES[1::2] * np.sqrt(2.0 * CURVES[::2]) / 2.0)) / float(
-            self.car.mass
-        )
+        return cls(car, float(at_front), float(at_rear))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +145,7 @@ def course(
     """A course of bends to either side, of which one at least asks for the whole slip, at a speed
     that wavers.
     """
-    step = 1.0 / (RATE * FINER)
+    step = 1.0 / (RATE * SUBSTEPS)
     time = np.arange(round(seconds / step)) * step
     slip = np.zeros(len(time))
     at = 2.0
@@ -175,7 +153,7 @@ def course(
     n_bends = 0
     while at < seconds - BEND_SECONDS[0]:
         length = float(generator.uniform(*BEND_SECONDS))
-        share = 1.0 if n_bends % 4 == 0 else float(generator.uniform(SMALLEST_BEND, 1.0))
+        share = 1.0 if n_bends % 4 == 0 else float(generator.uniform(MIN_BEND_SHARE, 1.0))
         rise = (
             np.clip((time - at) / RAMP_SECONDS, 0.0, 1.0),
             np.clip((at + length - time) / RAMP_SECONDS, 0.0, 1.0),
@@ -213,7 +191,7 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     plant = Plant.of(payload=conditions.payload)
     planned = course(conditions, np.random.default_rng([seed, 4]), seconds)
     states, steer, lateral = driven(plant, planned)
-    sampled = slice(None, None, FINER)
+    sampled = slice(None, None, SUBSTEPS)
     sideslip, yaw_rate = states[sampled].T
     speed = planned.speed[sampled]
     clean = np.stack([yaw_rate, speed, lateral[sampled], steer[sampled]], axis=1)
@@ -259,7 +237,7 @@ def driven(plant: Plant, planned: Course) -> tuple[FloatArray, FloatArray, Float
         planned.slip_rate,
         planned.friction,
         planned.road,
-        1.0 / (RATE * FINER),
+        1.0 / (RATE * SUBSTEPS),
         states,
         steer,
         lateral,
@@ -283,8 +261,8 @@ def _drive(  # type: ignore[no-untyped-def]
         target = _steering(
             car, tyres, u, mu, pull, slip[k], slip_rate[k], states[k, 0], states[k, 1]
         )
-        moved = min(max(target - angle, -FASTEST_STEER * step), FASTEST_STEER * step)
-        angle = min(max(angle + moved, -LARGEST_STEER), LARGEST_STEER)
+        moved = min(max(target - angle, -MAX_STEER_RATE * step), MAX_STEER_RATE * step)
+        angle = min(max(angle + moved, -MAX_STEER), MAX_STEER)
         steer[k] = angle
         b0, r0, lateral[k] = rates(car, tyres, u, mu, pull, angle, states[k, 0], states[k, 1])
         if k + 1 == len(speed):

@@ -21,7 +21,7 @@ BASELINE_NAMES: Mapping[str, str] = {
     "zero": "zero",
     "static map": "static_map",
 }  # name in a report -> name in blocks.csv
-MOST_IMPROVED = 0.03  # by doubled epochs, up to which a training was long enough
+MAX_IMPROVEMENT = 0.03  # by doubled epochs, up to which a training was long enough
 
 TrainingState = Literal[
     "not trained", "insufficient", "not checked", "sufficient", "not applicable"
@@ -150,7 +150,7 @@ def checked_training(
         float(np.mean([errors[seed] for seed in seeds])) for errors in (validation, doubled)
     )
     state: TrainingState = (
-        "sufficient" if after >= (1.0 - MOST_IMPROVED) * before else "insufficient"
+        "sufficient" if after >= (1.0 - MAX_IMPROVEMENT) * before else "insufficient"
     )
     words = (
         f"twice the epochs change the validation error by {100.0 * (after / before - 1.0):+.1f} %"

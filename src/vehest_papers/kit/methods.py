@@ -4,11 +4,10 @@ the ranges that were used.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from vehest.report.document import Column, Table
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
@@ -17,17 +16,6 @@ def absent_parts(artefacts: StudyArtefacts) -> str:
     """A sentence after a space on the parts whose recordings are missing; empty where none is."""
     titles = "; ".join(artefacts.titles[name] for name in artefacts.absent)
     return f" Not in this report, since the recordings are missing: {titles}." if titles else ""
-
-
-def not_trained(artefacts: StudyArtefacts) -> str:
-    """A sentence after a space on planned trainings that are not done, by part; empty where all
-    are.
-    """
-    counts = {name: len(names) for name, names in artefacts.not_trained.items() if names}
-    if not counts:
-        return ""
-    parts = "; ".join(f"{artefacts.titles[name]}: {number}" for name, number in counts.items())
-    return f" **Not complete:** {sum(counts.values())} planned trainings are not done ({parts})."
 
 
 def scoring(part: PartArtefacts, reading: str = "") -> str:
@@ -55,39 +43,19 @@ def provenance(lines: Sequence[str]) -> str:
     return bullets("## Appendix: how it was made", lines)
 
 
-def ranges_table(
-    artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]
-) -> Table:
-    """Ranges of training, validation and tests, a row for each part.
-
-    Parameters
-    ----------
-    tests
-        Test set -> its title, where that differs from its name.
-    """
-    rows = [
-        {
-            "part": artefacts.titles[key],
-            "kind": words_of_kinds(part),
-            "train": spans_in_words(part.split.train),
-            "validation": spans_in_words(part.split.validation),
-            "tests": "; ".join(
-                f"{tests.get(test, test)}: {spans_in_words(spans)}"
-                for test, spans in part.split.tests.items()
-            ),
-        }
-        for key, part in artefacts.parts.items()
-    ]
-    titles = {
-        "part": "part",
-        "kind": "data",
-        "train": "training",
-        "validation": "validation",
-        "tests": "tests",
-    }
-    return Table(
-        name,
-        caption,
-        pd.DataFrame(rows),
-        {column: Column(title) for column, title in titles.items()},
+def ranges(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """Ranges of training, validation and tests, a row for each part."""
+    return pd.DataFrame(
+        [
+            {
+                "part": artefacts.titles[key],
+                "kind": words_of_kinds(part),
+                "train": spans_in_words(part.split.train),
+                "validation": spans_in_words(part.split.validation),
+                "tests": "; ".join(
+                    f"{test}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()
+                ),
+            }
+            for key, part in artefacts.parts.items()
+        ]
     )

@@ -17,7 +17,7 @@ from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
-MOST_NAMED = 12
+MAX_RANGES_NAMED = 12
 
 
 def recordings_of(part: PartArtefacts, spans: Iterable[Span]) -> list[Recording]:
@@ -76,7 +76,7 @@ def spans_in_words(spans: Sequence[Span]) -> str:
         )
     return (
         ", ".join(words)
-        if len(words) <= MOST_NAMED
+        if len(words) <= MAX_RANGES_NAMED
         else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
     )
 

@@ -33,7 +33,7 @@ AT_LOW_YAW_RATE = (
     *paper.STRUCTURED,
 )
 BIASED = (paper.LSTM, *paper.STRUCTURED)
-HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
+MAX_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def at_low_yaw_rate(
             ]
             share = float(np.concatenate(masks).mean())
             segments.setdefault(category, []).append(masked_segments(scored, masks, rate))
-    return segments if 0.0 < share < HIGHEST_SHARE else {}, share
+    return segments if 0.0 < share < MAX_SHARE else {}, share
 
 
 def _reference(scheme: Scheme, span: Span) -> Recording:

@@ -17,11 +17,6 @@ from vehest_papers.kit.spectra import (
     process_noise,
 )
 
-READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
-HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
-AY_WIDTH = 1.0
-LEAST_SAMPLES = 50
-
 
 @dataclass(frozen=True)
 class Statistics:

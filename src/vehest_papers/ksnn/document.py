@@ -129,7 +129,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             for trial in artefacts.trials
         ],
     }
-    data = {"pairs_ratios": ratios_table(errors).frame} if len(errors) else {}
+    data = {"pairs_ratios": ratios_table(errors)} if len(errors) else {}
     data |= {"windows": windows} if len(windows) else {}
     data |= {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
     data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}

@@ -29,14 +29,14 @@ from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.linear_system import LocalModels, decomposed_estimate
 from vehest_papers.ksnn.schemes import Scheme, segments_on
-from vehest_papers.ksnn.sensitivities import CHANNELS, HIGHEST_HZ, YAW_RATES, sensitivity_of
+from vehest_papers.ksnn.sensitivities import CHANNELS, MAX_HZ, YAW_RATES, sensitivity_of
 
 BANDS_HZ = tuple(
     float(hz) for hz in 10.0 ** (np.arange(-10, 9) / 10.0)
 )  # centres of thirds of an octave, 0.1 to 6.3 Hz
-LEAST_SEGMENTS = 8  # of a spectrum
-LEAST_STRUCTURES = 8  # of a rank correlation
-LONGEST_WINDOW = 60  # samples of the longest windows that networks are trained on
+MIN_SEGMENTS = 8  # of a spectrum
+MIN_STRUCTURES = 8  # of a rank correlation
+MAX_WINDOW = 60  # samples of the longest windows that networks are trained on
 WEIGHTS = ("weights",)  # the only block of what is measured of trained weights
 
 
@@ -143,7 +143,7 @@ def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
         for name, category in scheme.structures().items()
         if category != paper.LUENBERGER and name in errors
     ]
-    if len(names) < LEAST_STRUCTURES:
+    if len(names) < MIN_STRUCTURES:
         return None
     counts = dict(
         zip(
@@ -202,11 +202,11 @@ def _noise_ratios(claim: Claim, parts: Parts, channel: str) -> ByBlock | None:
     ratios = []
     for yaw_rate in YAW_RATES if observer is not None else ():
         assert observer is not None
-        passed = sensitivity_of(observer, yaw_rate).band_gains(HIGHEST_HZ)[place]
+        passed = sensitivity_of(observer, yaw_rate).band_gains(MAX_HZ)[place]
         if passed:  # an observer that is reset at this yaw rate passes nothing
             ratios.append(
                 [
-                    sensitivity_of(network, yaw_rate).band_gains(HIGHEST_HZ)[place] / passed
+                    sensitivity_of(network, yaw_rate).band_gains(MAX_HZ)[place] / passed
                     for network in networks
                 ]
             )
@@ -251,7 +251,7 @@ def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
         of_seeds = [
             band_powers(scheme, model, claim.test_set) for model in _models(scheme, category)
         ]
-        if not of_seeds or len(of_seeds[0][0]) < LEAST_SEGMENTS:
+        if not of_seeds or len(of_seeds[0][0]) < MIN_SEGMENTS:
             return None
         names = of_seeds[0][0]
         powers.append(np.stack([values for _, values in of_seeds]))
@@ -407,10 +407,10 @@ def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def after_longest_window(scheme: Scheme, model: EvaluatedModel, test: str) -> list[Scored]:
-    """Estimate and reference where a window of `LONGEST_WINDOW` samples is full."""
+    """Estimate and reference where a window of `MAX_WINDOW` samples is full."""
     spans = scheme.part.split.tests[test]
     recordings = recordings_of(scheme.part, spans)
-    seconds = LONGEST_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
+    seconds = MAX_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
     return [
         scored.at(scored.time > recording.start_time + seconds)
         for scored, recording in zip(scheme.part.scored(model, test), recordings, strict=True)

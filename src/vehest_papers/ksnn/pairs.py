@@ -199,8 +199,16 @@ def errors_table(errors: pd.DataFrame, measure: str) -> Table:
 WORDS = {"stop": "at the stop", "converged": "at convergence"}
 
 
-def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> Table:
-    """FVU of one candidate over that of each other, and the smallest detectable ratio."""
+def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> pd.DataFrame:
+    """FVU of one candidate over that of each other, and the smallest detectable ratio.
+
+    Returns
+    -------
+    DataFrame
+        ``over``: the other candidate. ``TEST_TRAINING_MEASURE``: geometric mean of the ratio with
+        its interval over pairs; below 1 the candidate is better. ``detectable``: smallest ratio
+        above 1 that so many pairs detect at a power of 80 % on the other car at the stop.
+    """
     cells = [
         ("other", "stop", "raw"),
         ("other", "stop", "best_gain"),
@@ -228,17 +236,8 @@ def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> Tabl
         detectable = detectable_ratio(ratios[cells[0]])
         row["detectable"] = f"{detectable:.2f}" if np.isfinite(detectable) else MISSING
         rows.append(row)
-    columns = {"over": Column("over")}
-    for test, training, measure in cells:
-        gain = ", best gain" if measure == "best_gain" else ""
-        columns[f"{test}_{training}_{measure}"] = Column(f"{test} car, {WORDS[training]}{gain}")
-    columns["detectable"] = Column("detectable at a power of 80 %")
-    caption = (
-        f"FVU of {candidate} over that of another candidate (below 1 it is better), 95 % interval "
-        "over pairs. Last column: smallest ratio above 1 that so many pairs detect on the other "
-        "car at the stop. SIMULATED."
-    )
-    return Table("pairs_ratios", caption, pd.DataFrame(rows, columns=[*columns]), columns)
+    names = ["over", *("_".join(cell) for cell in cells), "detectable"]
+    return pd.DataFrame(rows, columns=names)
 
 
 def errors_figure(errors: pd.DataFrame) -> Figure:

@@ -17,7 +17,7 @@ from vehest_papers.ksnn.noise_sensitivity import (
 
 # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
 YAW_RATES = (0.2, 0.4)
-HIGHEST_HZ = 10.0
+MAX_HZ = 10.0
 CHANNELS = ("ay", "ax")
 
 

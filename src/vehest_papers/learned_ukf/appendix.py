@@ -11,13 +11,13 @@ from typing import Any
 import pandas as pd
 
 from vehest.data.splits import Span
-from vehest.report.document import Block, Column, Table, as_code
+from vehest.report.document import Block, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
 from vehest_papers.kit.block_rows import TRAINING
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
-from vehest_papers.learned_ukf import paper, slips, tables
+from vehest_papers.learned_ukf import slips, tables
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.filtering import loaded
 from vehest_papers.learned_ukf.trials import trials_table
@@ -34,25 +34,14 @@ def appendix_of_part(
     files.
     """
     kind = words_of_kinds(part).upper()
-    state = (
-        "Root mean square errors by state, median and range of seeds; in brackets what the paper "
-        f"reports, on its own files. Data: {kind}."
-    )
     consistent = (
         "Consistency of the filters: normalised estimation errors squared over vx, vy and yaw "
         "rate (NEES) and normalised innovations squared (NIS), 1 for a consistent filter and "
         "above 1 for one too sure of itself; share of vy's errors within one and two of the "
         f"filter's own standard deviations. Data: {kind}."
     )
-    budget = (
-        f"What was spent: seeds, and epochs as medians of seeds. {paper.NNTF_UH_LOW} is "
-        f"{paper.NNTF_UH} with another start and shares its training. Data: {kind}."
-    )
-    for table in (
-        tables.by_state(runs, list(SETS), f"by_state_{name}", state),
-        tables.budget(part, runs, f"budget_{name}", budget),
-    ):
-        data[table.name] = table.frame
+    data[f"by_state_{name}"] = tables.by_state(runs, list(SETS))
+    data[f"budget_{name}"] = tables.budget(part, runs)
     return [
         "## Appendix: consistency of the filters",
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
@@ -85,8 +74,7 @@ def provenance(
         remarks = " ".join(f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks)
         table = trials_table(artefacts.trials)
         blocks += ["## Appendix: trials", *([remarks] if remarks else []), table]
-    ranges = _ranges(artefacts, main)
-    data[ranges.name] = ranges.frame
+    data["data"] = _ranges(artefacts, main)
     names = sorted({*data, TRAINING})
     files = ", ".join(f"[{name}](tables/{name}.csv)" for name in names)
     return [*blocks, methods.provenance(lines), f"Further tables: {files}."]
@@ -111,7 +99,8 @@ def _flat(settings: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, An
             yield f"{head}{key}", value
 
 
-def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Table:
+def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> pd.DataFrame:
+    """Ranges of each part with their minutes and sequences."""
     rows: list[dict[str, object]] = []
     for name, part in main.items():
         row: dict[str, object] = {
@@ -128,19 +117,7 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
                 f"min{_sequences(part, label)}"
             )
         rows.append(row)
-    columns = {
-        "part": Column("part"),
-        "kind": Column("data"),
-        "train": Column("training"),
-        "validation": Column("validation"),
-    }
-    columns |= {test: Column(f"test, {tyre}") for test, tyre in SETS.items()}
-    caption = (
-        f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in "
-        f"all and learns on about {fixed(paper.MINUTES_LEARNT, 1)} min of tyre A "
-        f"({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
-    )
-    return Table("data", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def minutes(part: PartArtefacts, spans: Sequence[Span]) -> float:
@@ -178,6 +155,6 @@ def _slips(
         f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts "
         "from."
     )
-    figure, table, drawn = slips.distribution(angles, name, source, note)
-    data |= {f"slip_density_{name}": drawn, table.name: table.frame}
+    figure, percentiles, drawn = slips.distribution(angles, name, source, note)
+    data |= {f"slip_density_{name}": drawn, f"slip_percentiles_{name}": percentiles}
     return ["## Appendix: slip angles", figure]

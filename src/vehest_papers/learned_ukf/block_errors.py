@@ -50,7 +50,7 @@ DUPLICATE_NAMES = (
 )  # parts whose candidates have the names of others
 SCRATCH = "scratch"
 LENGTH = re.compile(r"length_(\d+)(_samples)?")
-LONGEST = 500  # samples of a sequence, which both ways of Figure 7 share
+MAX_STEPS = 500  # samples of a sequence, which both ways of Figure 7 share
 WHEEL_SPEED = {"rim_speed": "wheel_speed"}  # name of a state -> name in a metric
 SWAPPED = f"{AFTER} predicting, {BEFORE} observing"
 
@@ -69,7 +69,7 @@ def candidate_name(part: str, candidate: str) -> str:
     if length is None:
         return BASELINE_NAMES.get(candidate, candidate)
     steps, by_samples = length.groups()
-    if int(steps) == LONGEST:
+    if int(steps) == MAX_STEPS:
         return f"{candidate}, {steps} steps"
     return f"{candidate}, {steps} steps, constant {'samples' if by_samples else 'batch'}"
 

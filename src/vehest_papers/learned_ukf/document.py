@@ -49,7 +49,7 @@ from vehest_papers.learned_ukf import (
     traces,
 )
 from vehest_papers.learned_ukf.appendix import appendix_of_part, minutes, provenance
-from vehest_papers.learned_ukf.budgets import Candidate, budgets_table
+from vehest_papers.learned_ukf.budgets import Candidate, budgets
 from vehest_papers.learned_ukf.candidates import SETS, chosen, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.filtering import drives_of, loaded, lost_sequences
 from vehest_papers.learned_ukf.lengths import figure_7, lengths
@@ -59,7 +59,6 @@ TEMPLATE = Path(__file__).with_name("report.md.j2")
 MAIN = "real"
 LENGTH = "length_"
 VARIANTS = ("diagonal", block_errors.SCRATCH, "curvature")  # parts with a variant of a candidate
-ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 COMPARED_FIRST = (paper.GRU, paper.NNTF)  # with NNTF_UH, in the answer
 OVERVIEW_CANDIDATES = (
     paper.NNTF_UH,
@@ -219,7 +218,7 @@ def _outcome(
     }
     _likelihood(outcome, name, part, beside, kind)
     _prediction(outcome, name, part, source, data)
-    _variants(name, part, beside, kind, data)
+    _variants(name, part, beside, data)
     _lengths(outcome, beside, blocks, kind, data)
     groups = models_by_candidate(part)
     drawn_models: dict[str, EvaluatedModel] = {
@@ -249,20 +248,8 @@ def _accuracy(
     data: dict[str, pd.DataFrame],
 ) -> None:
     outcome.front.append(tables.overview(blocks, name, kind))
-    for test, tyre in SETS.items():
-        remark = (
-            "which was trained on"
-            if test == "tyre_a"
-            else "unseen; the paper's are of tyre C and do not compare"
-        )
-        caption = (
-            f"Table {ROMAN[test]} of the paper: {tyre}, {remark}. Ours: {kind.upper()}, means over "
-            "seeds, 95 % intervals over sequences and seeds; the 99th percentile is that of each "
-            "sequence, averaged. Baselines take vx from the rims and the yaw rate from the "
-            "gyroscope."
-        )
-        table = f"table_{1 if test == 'tyre_a' else 2}_{name}"
-        data[table] = tables.accuracy(blocks, name, test, table, caption).frame
+    for number, test in enumerate(SETS, start=1):
+        data[f"table_{number}_{name}"] = tables.accuracy(blocks, name, test)
 
 
 def _friction(outcome: Outcome, name: str, part: PartArtefacts, source: str, kind: str) -> None:
@@ -340,7 +327,6 @@ def _variants(
     name: str,
     part: PartArtefacts,
     beside: Mapping[str, PartArtefacts],
-    kind: str,
     data: dict[str, pd.DataFrame],
 ) -> None:
     """What the variants of a candidate were trained on, with the candidates that they are compared
@@ -358,8 +344,7 @@ def _variants(
     compared: dict[str, Candidate] = {
         title: (part, groups[title]) for title in (paper.NNTF_UH, paper.PC) if title in groups
     }
-    table = budgets_table(compared | variants, name, kind.upper())
-    data[table.name] = table.frame
+    data[f"budgets_{name}"] = budgets(compared | variants)
 
 
 def _lengths(
@@ -373,9 +358,8 @@ def _lengths(
         title: study_part for title, study_part in beside.items() if title.startswith(LENGTH)
     }
     if trained:
-        figure, table = figure_7(lengths(trained), blocks, kind.upper())
+        figure, data["sequence_length"] = figure_7(lengths(trained), blocks, kind.upper())
         outcome.appendix += ["## Appendix: length of the training sequences", figure]
-        data[table.name] = table.frame
 
 
 def _likelihood(

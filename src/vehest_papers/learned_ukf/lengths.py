@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key
@@ -92,7 +92,7 @@ def of_way(trained: Sequence[Length], way: str) -> list[Length]:
 
 def figure_7(
     trained: Sequence[Length], blocks: Mapping[Key, BlockErrors], data: str
-) -> tuple[Figure, Table]:
+) -> tuple[Figure, pd.DataFrame]:
     """The figure and its table, with 95 % intervals over sequences and seeds."""
     rows = []
     for way, words in WAYS.items():
@@ -154,20 +154,4 @@ def figure_7(
         "through the filter. An epoch goes once through the drives, so a smaller batch "
         f"takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
-    columns = {
-        "way": Column("held constant"),
-        "steps": Column("samples", decimals=0),
-        "batch": Column("sequences in a batch", decimals=0),
-    }
-    columns |= {
-        "epochs": Column("epochs", decimals=0),
-        "batches": Column("batches an epoch", decimals=0),
-    }
-    columns |= {
-        "epoch_samples": Column("filter steps an epoch", decimals=0),
-        "in_a_row": Column("of them one after another", decimals=0),
-    }
-    columns |= {f"words.{test}": Column(f"MSE (weighted), {SETS[test]}") for test in tests}
-    return Figure("figure_7", caption, figure), Table(
-        "sequence_length", "What Figure 7 draws.", frame, columns
-    )
+    return Figure("figure_7", caption, figure), frame

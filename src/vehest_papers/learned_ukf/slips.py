@@ -9,12 +9,12 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
 
-LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise
+MIN_SPEED = 0.5  # [m/s] below which a slip angle is noise
 LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)
@@ -33,14 +33,14 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
     parts = []
     for recording in recordings:
         vx, vy, yaw_rate = (recording[name] for name in ("vx_ref", "vy_ref", "yaw_rate_ref"))
-        moving = vx >= LEAST_SPEED
+        moving = vx >= MIN_SPEED
         parts.append(np.degrees(np.arctan2(vy - cg_to_rear_axle * yaw_rate, vx))[moving])
     return np.concatenate(parts)
 
 
 def distribution(
     slips: Mapping[str, FloatArray], name: str, data: str, note: str
-) -> tuple[Figure, Table, pd.DataFrame]:
+) -> tuple[Figure, pd.DataFrame, pd.DataFrame]:
     """Density of each set's slip angle [deg], its percentiles, and the drawn values."""
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
@@ -72,7 +72,7 @@ def distribution(
         legend_above(figure, axes)
     caption = (
         "Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. "
-        f"Data: {data}. Samples with v_x of {LEAST_SPEED:g} m/s and more. {note}"
+        f"Data: {data}. Samples with v_x of {MIN_SPEED:g} m/s and more. {note}"
     )
     rows = [
         {
@@ -82,13 +82,4 @@ def distribution(
         }
         for label, values in slips.items()
     ]
-    columns = {"set": Column("set"), "samples": Column("samples")} | {
-        f"p{p}": Column(f"{p} % below [deg]", decimals=1) for p in PERCENTILES
-    }
-    table = Table(
-        f"slip_percentiles_{name}",
-        "Size of the slip angle of the rear axle.",
-        pd.DataFrame(rows),
-        columns,
-    )
-    return Figure(f"figure_3_{name}", caption, figure), table, drawn
+    return Figure(f"figure_3_{name}", caption, figure), pd.DataFrame(rows), drawn
