@@ -228,7 +228,8 @@ class CarFilter(nn.Module):
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """States and covariances of training sequences that start from ``start``, (B, 5).
 
-        Covariances are (B, T, 5, 5); both are differentiable. Gradients reach back ``steps`` samples; none: all.
+        Covariances are (B, T, 5, 5); both are differentiable. Gradients reach back ``steps``
+        samples; none: all.
         """
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
