@@ -390,7 +390,7 @@ def _without_texts(
         cell
         for column in removed.columns
         for cell in column.cast(pa.string()).to_pylist()
-        if not re.match(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
+        if not re.search(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
     }
     return table.filter(pa.array(~is_text)), tuple((np.flatnonzero(is_text) + 1).tolist()), cells
 
