@@ -1263,10 +1263,9 @@ def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_on
             "heading_error": d["r"] / 3.0,
         }
     )
-    assert left_out(tmp_path, table)[0] == {"yaw_rate": "r [rad/s]"}
-    table = table.rename(columns={"r [rad/s]": "r", "dpsi [rad]": "dpsi"})
-    assert "dpsi" not in left_out(tmp_path, table)[1]
-    table = table.rename(columns={"r": "r [rad/s]"})
+    without_units = table.rename(columns={"r [rad/s]": "r", "dpsi [rad]": "dpsi"})
+    with pytest.raises(VehestError, match='--answer "r=yaw_rate rad/s"'):
+        left_out(tmp_path, without_units)
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "r [rad/s]"}
     assert '--answer "Uy=vy_ref m/s"' in open_questions["Uy"].text
