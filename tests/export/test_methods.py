@@ -15,6 +15,7 @@ from dugoff_drive import TYRES, driven
 from every_estimator import drive_for, fitted
 from example_package import forget_examples, install_examples
 from real_drives import real_drive
+from slide_drive import slide_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
@@ -253,6 +254,12 @@ def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
     estimator = estimator_class("self_calibrating").from_config(config)
     rows = rows_at_low_speed(estimator)
     check(built(estimator, precision, tmp_path), estimator, rows, largest)
+
+
+def test_self_calibrating_filter_agrees_in_a_slide(tmp_path):
+    estimator = estimator_class("self_calibrating").from_config({"cg_to_rear_axle": 1.3})
+    rows = slide_after(rows_at_low_speed(estimator))
+    check(built(estimator, "double", tmp_path), estimator, rows, DOUBLE)
 
 
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
