@@ -54,7 +54,7 @@ def test_numbers_come_out_as_they_went_in(tmp_path, options):
         assert values[name].dtype == np.float64
 
 
-def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_path):
+def test_missing_values_are_nan_and_integers_of_any_width_are_read(tmp_path):
     content = {
         "a": pa.array([1, None, 3], pa.uint8()),
         "b": pa.array([1.5, 2.5, None], pa.float16()),

@@ -113,7 +113,7 @@ def test_samples_are_immutable_copies_and_estimators_receive_no_references():
         ({"kind": "reel"}, "real or simulated"),
     ],
 )
-def test_what_cannot_be_a_recording_is_refused(changes, what):
+def test_invalid_recordings_are_refused(changes, what):
     arguments = {
         "id": "r",
         "vehicle": "car",
@@ -126,9 +126,7 @@ def test_what_cannot_be_a_recording_is_refused(changes, what):
 
 @PROPERTY
 @given(st.integers(1, 60), RATES, STARTS, st.integers(1, 20))
-def test_held_estimates_are_the_latest_that_are_not_in_the_future(
-    length, rate_hz, start_time, finer
-):
+def test_resampled_estimates_are_the_latest_not_in_the_future(length, rate_hz, start_time, finer):
     values = np.arange(float(length))
     estimate = Estimate("r", "ekf", rate_hz, start_time, {"vy": values, "sideslip": values})
     ticks = np.arange(-finer, (length + 1) * finer)  # sample k of the estimate is tick k·finer
@@ -159,7 +157,7 @@ def test_a_covariance_has_a_row_a_name(shape, names):
         )
 
 
-def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
+def test_covariances_are_resampled_like_their_quantities_and_read_by_name():
     covariance = np.arange(27.0).reshape(3, 3, 3)
     estimate = Estimate(
         "r",

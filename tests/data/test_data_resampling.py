@@ -61,7 +61,7 @@ def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
 
 
 @pytest.mark.parametrize(("rate", "new_rate"), [ratio for ratio in RATIOS if ratio[1] < ratio[0]])
-def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate, new_rate):
+def test_frequencies_above_the_new_nyquist_are_attenuated_by_60_db(rate, new_rate):
     seconds = 200 / new_rate
     time = np.arange(round(seconds * rate)) / rate
     for frequency in np.linspace(new_rate / 2, rate / 2, 23):

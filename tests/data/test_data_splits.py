@@ -139,12 +139,12 @@ def test_plain_values_make_a_split_with_tests_alone():
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
-def test_a_misspelt_split_is_refused_in_one_line(changes, what):
+def test_misspelt_splits_are_refused_in_a_single_line(changes, what):
     assert what in refusal(BASE | changes)
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
-def test_every_split_that_is_shipped_is_one(file):
+def test_shipped_splits_are_valid(file):
     """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
 
     def cruising(dataset):
@@ -230,7 +230,7 @@ def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
     assert asked == ["d"]
 
 
-def test_a_condition_keeps_whole_stretches_that_last():
+def test_conditions_select_segments_of_the_minimum_duration():
     # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
     ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
     keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
@@ -247,7 +247,7 @@ def test_a_condition_keeps_whole_stretches_that_last():
     ),
     st.integers(0, 30),
 )
-def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces, shortest):
+def test_conditions_match_a_plain_loop_over_samples(pieces, shortest):
     ay = [value for value, length in pieces for _ in range(length)]
     expected = set()
     run = []
@@ -315,7 +315,7 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
         ),
     ],
 )
-def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
+def test_invalid_patterns_and_conditions_are_refused_in_a_single_line(entry, what):
     named = {} if "recording" in entry else {"recordings": "train_*"}
     assert what in refusal(BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200}))
 
@@ -323,7 +323,7 @@ def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry
 @pytest.mark.parametrize(
     "entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}]
 )
-def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
+def test_patterns_and_conditions_require_recordings(entry):
     assert "its patterns and the like need the recordings of data set 'd'" in refusal(
         BASE | {"train": [entry]}
     )
@@ -406,7 +406,7 @@ def catalogue_of(*recordings):
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_one_round_and_count_from_either_end():
+def test_laps_last_a_round_and_count_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4
@@ -430,7 +430,7 @@ def test_laps_last_one_round_and_count_from_either_end():
     assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
-def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_none():
+def test_laps_are_full_turns_of_ovals_and_circles_and_roads_have_none():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
     bend = (
@@ -459,7 +459,7 @@ def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_non
     )
 
 
-def test_percentages_follow_one_another_over_every_recording():
+def test_percentages_are_consecutive_over_every_recording():
     one = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
     other = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
     config = {
@@ -559,13 +559,13 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
     ],
     ids=str,
 )
-def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
+def test_invalid_portions_are_refused_in_a_single_line(changes, what):
     assert what in refusal(
         BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0])
     )
 
 
-def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():
+def test_folds_are_never_scraps_and_gaps_stay_complete():
     """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
@@ -618,7 +618,7 @@ def total(spans):
 
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
 @pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
-def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
+def test_limited_minutes_have_their_duration_from_any_offset(seconds, at):
     kept = limit_minutes(SPANS, seconds, at)
     assert total(kept) == pytest.approx(seconds)
     assert all(
@@ -633,7 +633,7 @@ def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
         assert not any(one.overlaps(other) for other in kept[position + 1 :])
 
 
-def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
+def test_minutes_begin_at_their_offset_and_leave_tests_unchanged():
     assert limit_minutes(SPANS, 60.0, 0.5) == (
         Span("d", "one", 10.0, 25.0),
         Span("d", "two", 115.0, 160.0),
@@ -685,7 +685,7 @@ def sets_of(spans):
 
 @pytest.mark.parametrize("place", ["", "_sim"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_schemes_learn_on_one_car_stop_on_the_other_or_the_same_and_test_on_both(scheme, place):
+def test_schemes_train_and_validate_on_their_cars_and_test_on_both(scheme, place):
     found = split(scheme + place)
     assert (sets_of(found.train), sets_of(found.validation)) == SCHEMES[scheme]
     third = {"j1": ["J-1"] * 2} if place else {}

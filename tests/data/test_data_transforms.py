@@ -222,7 +222,7 @@ def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x, lever_y, yaw
     assert before > 0.1
 
 
-def test_mounting_correction_of_one_sample_knows_the_centripetal_part():
+def test_mounting_correction_of_a_single_sample_includes_the_centripetal_part():
     recording = recorded(ax=np.array([1.0]), ay=np.array([2.0]), yaw_rate=np.array([0.5]))
     corrected = MountingCorrection(lever_x=2.0, lever_y=-1.0)(recording)
     assert corrected["ax"].tolist() == [1.0 + 0.25 * 2.0]
@@ -286,7 +286,7 @@ def test_transforms_are_built_from_plain_values():
         ({"name": "low_pass", "cutoff_hz": 5, "zero": 1}, "transform 'low_pass': "),
     ],
 )
-def test_a_misspelt_transform_is_refused_in_one_line(config, what):
+def test_misspelt_transforms_are_refused_in_a_single_line(config, what):
     assert what in refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
@@ -453,7 +453,7 @@ def lap(rate_hz=100.0, n_samples=400):
     ],
     ids=str,
 )
-def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
+def test_excessive_requests_are_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
     changed = transform_from_config(
         {key: value for key, value in config.items() if value != "long"}
@@ -463,7 +463,7 @@ def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limi
     assert "recording 'lap'" in message
 
 
-def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch):
+def test_chunked_and_spectral_computations_equal_the_direct_computation(monkeypatch):
     whole = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
     monkeypatch.setattr(transforms, "VALUES_AT_ONCE", 40)
     np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)

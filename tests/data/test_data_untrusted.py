@@ -93,7 +93,7 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ),
     ],
 )
-def test_a_refusal_is_one_line_that_says_what_the_type_of_the_key_takes(content, message):
+def test_refusals_name_the_type_of_the_key_in_a_single_line(content, message):
     of_a_file = message.startswith("'f'")
     options = {} if of_a_file else {"error": ConfigurationError, "group": "it"}
     with pytest.raises(DataError if of_a_file else ConfigurationError) as caught:
@@ -123,12 +123,12 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
         ("a: *nothing", "cannot be read as YAML"),
     ],
 )
-def test_yaml_that_is_none_is_one_line(text, message):
+def test_invalid_yaml_is_refused_in_a_single_line(text, message):
     with pytest.raises(DataError, match=message):
         parse_yaml(text, "'f'")
 
 
-def test_honest_yaml_with_anchors_is_read_and_json_that_is_none_is_one_line():
+def test_yaml_with_anchors_is_read_and_invalid_json_is_refused():
     for text in ("[" * 100000, b"\xff\xfe"):
         assert "cannot be read as JSON" in refusal(lambda text=text: parse_json(text, "'f'"))
     assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {
@@ -194,7 +194,7 @@ def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more()
 
 
 @given(st.text(max_size=300))
-def test_whatever_a_name_holds_it_stays_one_component(name):
+def test_file_names_stay_a_single_path_component(name):
     made = file_name(name, ".csv")
     assert Path(made).name == made
     assert not made.startswith(".")
@@ -207,7 +207,7 @@ def test_different_names_stay_different(one, other):
     assert (file_name(one) == file_name(other)) == (one == other)
 
 
-def test_plain_names_stay_and_escapes_for_the_terminal_are_shown():
+def test_plain_names_stay_and_terminal_escapes_are_printed():
     assert file_name("ksnn-linear_bias_p2-seed0", ".csv") == "ksnn-linear_bias_p2-seed0.csv"
     assert printable("a\x1b[31mb\r\n\u202e") == "a\\x1b[31mb\\r\\n\\u202e"
     assert printable("größe β °") == "größe β °"

@@ -15,7 +15,7 @@ def recording():
     return Recording("lap <1>", "car", 50.0, 4.0, channels, gappy=frozenset({"ay"}))
 
 
-def test_repr_says_size_and_channels_on_one_line(recording):
+def test_repr_has_size_and_channels_on_a_single_line(recording):
     assert repr(recording) == "<Recording 'lap <1>': 0.06 s at 50 Hz; vx, ay>"
     estimate = Estimate("lap", "zero", 50.0, 4.0, dict.fromkeys(("vy", "sideslip"), np.zeros(3)))
     assert repr(estimate) == ("<Estimate of 'lap' by zero: 0.06 s at 50 Hz; vy, sideslip>")

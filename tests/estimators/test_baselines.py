@@ -47,7 +47,7 @@ def steady_drive(car, seconds=30.0):
 CAR = SingleTrackParameters(1000.0, 1600.0, 1.2, 1.3, 8.0e4, 1.1e5)
 
 
-def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_sheet_is_exact_on_one():
+def test_static_map_identifies_and_data_sheet_computes_a_linear_single_track():
     estimator, record = fitted("static_map", steady_drive(CAR))
     assert estimator.values["b"] == pytest.approx(CAR.cg_to_rear_axle, rel=1e-9)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
@@ -70,7 +70,7 @@ def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
 
-def test_prior_map_is_the_static_map_with_the_numbers_that_the_self_calibrating_filter_starts_from():
+def test_prior_map_is_the_static_map_with_prior_parameters():
     """At the filter's centre of gravity, for a car of full size and for a small one whose tyres slip more."""
     drive = steady_drive(CAR)
     for wheelbase, compliance in ((2.7, 0.0045), (0.3, 0.0135)):
@@ -89,7 +89,7 @@ def test_prior_map_is_the_static_map_with_the_numbers_that_the_self_calibrating_
         new("prior_map", wheelbase=2.4, cg_to_rear_axle=3.0)
 
 
-def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_constant_it_finds():
+def test_kinematic_integration_solves_its_equation_and_fits_the_time_constant():
     drive = planar_drive(20.0)
     estimator = new("kinematic")
     estimator.values = {"time_constant": 2.5}

@@ -17,9 +17,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.trust.health import SLOW_KERNEL
 
 
-def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_without_compilation(
-    tmp_path, monkeypatch
-):
+def test_learned_filters_compile_until_their_code_is_cached(tmp_path, monkeypatch):
     monkeypatch.setattr(
         planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path)))
     )
@@ -63,7 +61,7 @@ def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(t
     assert first == second
 
 
-def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only():
+def test_code_with_reordered_sums_is_compiled_in_a_single_way():
     """`fastmath` outside `kernels.compiling` would bring back a first run with digits of its own."""
     source = Path(vehest.__file__).parent
     decorated = [

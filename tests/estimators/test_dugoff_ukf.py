@@ -78,7 +78,7 @@ def test_the_filter_follows_the_car_and_knows_how_well(inputs):
     assert set(estimate["nis_dof"]) == ({4.0} if inputs == "full" else {2.0})
 
 
-def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_with_a_hysteresis():
+def test_drives_of_any_length_are_independent_and_force_trust_has_hysteresis():
     drives = [
         dugoff_drive(seconds, seed).without_references()
         for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))
@@ -132,7 +132,7 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     )
 
 
-def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
+def test_correlated_errors_count_as_fewer_measurements_and_states_are_restored():
     drive = dugoff_drive(2.0, 7).without_references()
     first = estimator_with().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
     assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
@@ -165,7 +165,7 @@ def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
     assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5
 
 
-def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_scored():
+def test_levels_come_from_moving_samples_and_are_tuned_on_the_scored_reference():
     drive = dugoff_drive(12.0, straight=4.0)
     is_standing = np.arange(1200) >= 700
     quiet = {
@@ -236,7 +236,7 @@ def test_stages_search_wide_bounds_and_then_close_to_the_best():
     assert search.cost == search.starts[:, -1].min()
 
 
-def test_what_makes_no_sense_or_is_not_installed_is_refused(monkeypatch):
+def test_invalid_settings_and_missing_packages_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     drives = [dugoff_drive(2.0)]
     with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):

@@ -111,7 +111,7 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 
 @pytest.mark.parametrize("size", [0, 40, -8])
-def test_truncated_weights_are_one_clear_error(tmp_path, size):
+def test_truncated_weights_are_a_clear_error(tmp_path, size):
     assert "holds no model" in refusal(lambda: load_model(tmp_path), MissingError)
     save_model(fitted_once("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
@@ -119,7 +119,7 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
     assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
-def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(
+def test_wrong_rate_missing_channel_gaps_and_unknown_names_are_refused(
     drive,
 ):
     estimator = fitted_once("ksnn", "float64")
@@ -143,7 +143,7 @@ def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_
     )
 
 
-def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
+def test_models_of_other_versions_are_refused_and_unversioned_ones_load(tmp_path, monkeypatch):
     estimator = fitted_once("luenberger", "float64")
     save_model(estimator, tmp_path)
     description = tmp_path / "model.yaml"
@@ -158,7 +158,7 @@ def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, m
     assert load_model(tmp_path).gain == estimator.gain
 
 
-def test_a_number_that_is_given_is_not_fitted(drive):
+def test_configured_numbers_are_not_fitted(drive):
     estimator = estimator_class("luenberger").from_config({"gain": 7.0})
     assert estimator.n_parameters == 1
     estimator.fit(FitData([drive], [drive]), DirectSearchSettings(grid=2, max_evaluations=10))
@@ -166,7 +166,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
     assert estimator.threshold >= 0.0
 
 
-def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
+def test_recordings_start_from_individual_or_shared_states(monkeypatch, drive):
     assert "no state to start from" in refusal(
         lambda: fitted_once("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError
     )
@@ -290,7 +290,7 @@ OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=fal
 NO_TRAINING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
-def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
+def test_training_without_epochs_keeps_the_start_and_foreign_settings_are_refused():
     from vehest.inference.models import pretrained_folder
 
     drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
@@ -318,7 +318,7 @@ def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_
         )
 
 
-def test_the_model_counts_as_an_input_and_is_found_by_name(place):
+def test_models_are_inputs_and_are_resolved_by_name(place):
     common = ("estimator=ksnn", "split=mine", "training.max_epochs=1", "tracking=none", *OF_SHIPPED)
     assert place("train", *common)[0] == 0
     code, out, _ = place("train", *common, "training.start_from=pretrained")

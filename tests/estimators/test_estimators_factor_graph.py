@@ -79,7 +79,7 @@ def states_of(estimate):
     return np.stack([estimate["sideslip"], estimate["yaw_rate"]], axis=1)
 
 
-def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_long_one():
+def test_factor_graph_equals_least_squares_and_the_filter_over_a_long_window():
     estimator = factor_graph()
     drive = drive_with_gaps(12.0)
     expected = least_squares(estimator, drive, 0, len(drive) - 1, np.zeros(2), 100.0)

@@ -20,7 +20,7 @@ def kalman(**config):
     return estimator_class("kalman").from_config(config)
 
 
-def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recording_itself():
+def test_levels_are_those_of_high_passed_training_or_recording_signals():
     drives = [linear_drive(60.0, seed=seed, noise={**NOISE, "steer": 1e-3})[0] for seed in (1, 2)]
     estimator = kalman()
     assert "has not been fitted yet" in refusal(lambda: estimator.online(), ConfigurationError)
@@ -46,7 +46,7 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
     assert "cannot run along with a drive" in refusal(lambda: offline.online(), ConfigurationError)
 
 
-def test_levels_that_are_given_are_not_read_and_need_no_training():
+def test_configured_levels_are_not_read_and_need_no_training():
     estimator = kalman(noise={"ay": 0.7})
     estimator.fit(FitData([linear_drive(60.0)[0]], []), NoTraining())
     assert estimator.values["ay"] == 0.7
@@ -123,7 +123,7 @@ def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed()
         ),
     ],
 )
-def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
+def test_unreadable_levels_are_a_clear_error(name, samples, message):
     drive = linear_drive(30.0)[0]
     wrong = type(drive)(
         "linear",

@@ -52,7 +52,7 @@ def readable(estimator, samples):
     )
 
 
-def test_slopes_and_peak_of_the_rational_tyre_are_those_of_differentiation_and_closed_form():
+def test_rational_tyre_slopes_and_peak_match_differentiation_and_closed_form():
     values = torch.tensor([0.06, np.log(0.008), np.log(7e4), np.log(0.7)], dtype=torch.float64)
     axle_force = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
     slopes = torch.func.jacrev(
@@ -124,7 +124,7 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
 
 
 @pytest.mark.parametrize("tyres", KINDS)
-def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_forms(tyres, drive):
+def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres, drive):
     """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
     estimator = rational(tyres, largest_sideslip=np.radians(1.5))
     short = drive.cut(0.0, 8.0)
@@ -169,7 +169,7 @@ def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncerta
     assert (extended["nis_dof"] == 2).all()
 
 
-def test_changed_tyres_and_friction_are_found_and_help():
+def test_changed_tyres_and_friction_are_identified_and_reduce_the_error():
     """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and half the error of fixed tyres."""
     worn = rational_drive(120.0, seed=2, stiffness=0.85)
     adaptive = rational().estimate([worn])[0]
@@ -192,7 +192,7 @@ def test_changed_tyres_and_friction_are_found_and_help():
     )
 
 
-def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(drive):
+def test_tyre_states_are_constant_straight_ahead_and_adapt_in_bends(drive):
     """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
     estimator = rational(adapt_above=2.0)
     filtered = estimator.filter_samples(drive.stack(estimator.channels))
@@ -218,7 +218,7 @@ def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(d
     )
 
 
-def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_the_start(drive):
+def test_tyre_parameters_stay_inside_bounds_wider_than_the_initial_uncertainty(drive):
     absurd = changed(drive, {"ay": -3.0 * drive["ay"], "yaw_rate": 2.0 * drive["yaw_rate"]})
     for tyres in ("linear", "rational_adaptive", "rational_friction"):
         estimator = rational(tyres, bound=1.5, noise={**LEVEL, "tyres": 0.5})
@@ -233,7 +233,7 @@ def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_th
 
 
 @pytest.mark.parametrize("kind", ["extended", "unscented"])
-def test_a_car_that_stands_or_reverses_rolls_without_slip_and_its_tyres_are_held(kind, drive):
+def test_standing_and_reversing_cars_roll_without_slip_and_adapt_no_tyres(kind, drive):
     vx = np.interp(drive.time[:200], [0, 3, 5, 7, 10], [20.0, 0.0, 0.0, -2.0, 20.0])
     slow = changed(drive.cut(0.0, 10.0), {"vx": vx, "steer": np.full(200, 0.1)})
     estimator = rational(filter=kind)
@@ -280,7 +280,7 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
 
 
 @pytest.mark.parametrize("fault", ["slip", "force"])
-def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerometer_is_off(fault):
+def test_stiffness_intervals_cover_the_truth_with_offset_sensors(fault):
     """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals show neither."""
     drive = rational_drive(60.0, seed=4)
     wrong = {
@@ -293,7 +293,7 @@ def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerom
         assert abs(record.metrics[name] - CURVES[name]) < record.metrics[f"{name}_interval"]
 
 
-def test_levels_of_the_unscented_filter_are_found_through_the_extended_one_within_limits():
+def test_unscented_levels_are_searched_through_the_extended_filter_within_limits():
     train = rational_drive(30.0, seed=9)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert estimator.fit(FitData([train], []), QUICK).metrics["levels_at_limits"] == 0
@@ -334,7 +334,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
     )
 
 
-def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
+def test_levels_of_the_data_need_no_search_and_full_settings_no_fit():
     train = rational_drive(30.0, seed=6)
     estimator = estimator_class("rational_ekf").from_config({"noise": {"tyres": 0.02}})
     record = estimator.fit(FitData([train], []), NoiseTuningSettings(method="data"))
@@ -352,7 +352,7 @@ def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
 @pytest.mark.skipif(
     importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'"
 )
-def test_optuna_finds_the_minimum_for_its_seed_and_levels_in_their_box_that_get_better():
+def test_optuna_reaches_the_minimum_and_improves_levels_within_their_box():
     train = rational_drive(30.0, seed=9)
     few_trials, many_trials = (
         estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2)

@@ -52,7 +52,7 @@ def _phase(estimator, training, train, validation):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(
+def test_validation_loss_is_the_weighted_squared_error_without_dropped_samples(
     name,
 ):
     """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
@@ -116,7 +116,7 @@ def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(t
     assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
-def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropout_keeps_the_mean():
+def test_sequences_start_at_random_within_recordings_and_dropout_keeps_the_mean():
     estimator = _estimator("velocity_gru")
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, QUICK, recordings, recordings[:1])
@@ -201,7 +201,7 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
         assert torch.allclose(first, second, rtol=1e-3, atol=1e-6)
 
 
-def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
+def test_mirrored_sequences_change_the_sign_of_lateral_quantities():
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
     estimator = _estimator("velocity_lstm")
     drives = _drives(estimator, DATA.train[:1])
@@ -291,7 +291,7 @@ def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
     )
 
 
-def test_recordings_too_short_or_with_gaps_are_one_clear_error():
+def test_recordings_too_short_or_with_gaps_are_a_clear_error():
     with pytest.raises(
         DataError,
         match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it",

@@ -124,7 +124,7 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
 
 
 @EVERY_FILTER
-def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name):
+def test_gated_estimates_recover_after_a_jump_of_the_truth(name):
     gated = vy(estimator(name, 6.0), drive(name))
     free = vy(estimator(name), drive(name))
     back = round((JUMP + 3.0) * drive(name).rate_hz)
@@ -133,7 +133,7 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
 
 
 @EVERY_FILTER
-def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(
+def test_gate_that_refuses_nothing_changes_only_the_name_of_the_variant(
     name,
 ):
     assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
@@ -166,7 +166,7 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
         assert n_accepted[round(SPIKE * recording.rate_hz)] < n_accepted.max()
 
 
-def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
+def test_gates_share_trainings_of_learned_filters_and_need_none_otherwise():
     with pytest.raises(
         ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"
     ):
@@ -230,7 +230,7 @@ def motion(steps):
         *product(FILTERS, (infinite,)),
     ],  # others take an infinite value
 )
-def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
+def test_steps_after_a_refused_step_are_unaffected_by_it(name, wrong):
     stepper = ready(name)
     samples = rows(name)
     calm = stepper.online()

@@ -199,7 +199,7 @@ def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
+def test_estimates_from_pure_noise_stay_finite_and_bounded(dtype):
     """20 s of nothing but noise, with the deviations and worse of a wild drive."""
     generator = np.random.default_rng(0)
     scales = {
@@ -223,7 +223,7 @@ def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
     assert min(estimate["vx"].min(), estimate["friction"].min()) >= 0.05 - 1e-6
 
 
-def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
+def test_weights_and_drives_that_do_not_fit_are_a_clear_error():
     assert "do not fit its settings: 'dynamics.network.0.bias'" in refusal(
         lambda: estimator(width=8).load_weights(trained().weights())
     )

@@ -142,7 +142,7 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
     assert found["best_validation_loss"] < loss()
 
 
-def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_where_the_filter_has_it():
+def test_pre_training_has_the_loss_of_the_formulas_and_the_filters_process_noise():
     """Eqs. 5 and 6, with the distrust as a standard deviation."""
     estimator, _ = end_to_end()
     samples = estimator.network.samples(
@@ -260,7 +260,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(name, tmp_path):
         assert np.array_equal(values, estimator.weights()[key]), key
 
 
-def test_what_makes_no_sense_is_said():
+def test_invalid_settings_are_named():
     with pytest.raises(DataError, match="no training recording is 900 samples long"):
         estimator_of("cnn_ukf").fit(DATA, EndToEndSettings(steps=900, identification=NOTHING))
     estimator = estimator_of("cnn_ukf")
@@ -285,7 +285,7 @@ def test_what_makes_no_sense_is_said():
         ("adaptive_process", cnn_ukf.PROCESS),
     ],
 )
-def test_what_is_taken_away_is_the_same_at_every_sample(away, held):
+def test_removed_variances_are_constant_over_samples(away, held):
     estimator = estimator_of("cnn_ukf", **{away: False})
     estimator.fit(DATA, TRAININGS["cnn_ukf"])
     assert estimator.variant == f"full_no_{away}"
@@ -330,7 +330,7 @@ def test_a_loss_in_degrees_is_the_same_in_another_unit():
     )
 
 
-def test_one_recording_decides_less_where_recordings_count():
+def test_a_single_recording_weighs_less_where_recordings_count():
     quiet = (0.01 * 100, 100)
     wild = (4.0 * 100, 100)
     assert error_over([quiet] * 9 + [wild], "samples") == pytest.approx(0.409)

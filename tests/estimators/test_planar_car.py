@@ -89,7 +89,7 @@ def through_the_filter(car, compiled, dtype):
 
 
 @pytest.mark.parametrize("kind", CARS)
-def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
+def test_compiled_filter_has_values_and_gradients_of_the_readable_filter(kind):
     car = a_car(kind)
     (readable_mean, gradients), (mean, compiled_gradients) = (
         through_the_filter(car, compiled, torch.float64) for compiled in (False, True)

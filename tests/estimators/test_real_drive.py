@@ -58,7 +58,7 @@ def _estimate_of_drive(name, recording, **config):
     return accuracy([score(estimate, Resample(20.0)(recording), span, Protocol(20.0))])
 
 
-def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(
+def test_kalman_filter_and_factor_graph_reproduce_the_published_ferrari_drive(
     ferrari,
 ):
     """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""

@@ -103,7 +103,7 @@ def test_intraclass_correlation_of_planted_variances():
     assert math.isnan(intraclass_correlation(values, np.zeros(len(values), dtype=int)))
 
 
-def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
+def test_coverage_intervals_contain_the_truth_with_correlated_blocks():
     """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
     rng = np.random.default_rng(3)
     n_covered = 0
@@ -115,7 +115,7 @@ def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
     assert n_covered / 2000 >= 0.95 - 0.015
 
 
-def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count():
+def test_interval_of_full_coverage_matches_single_sample_blocks_and_counts_edges():
     low, high = proportion_interval(np.full(10, 50.0), np.full(10, 50.0))
     assert low == pytest.approx(0.025 ** (1.0 / 10.0))  # Clopper & Pearson for 10 of 10
     assert high == 1.0
@@ -126,7 +126,7 @@ def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count
     assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75
 
 
-def test_true_bands_cover_what_they_say():
+def test_true_bands_have_their_nominal_coverage():
     rng = np.random.default_rng(4)
     parts = [part_of(rng), part_of(rng)]
     banded_errors = banded(parts, BANDS)
@@ -182,7 +182,7 @@ def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
     }
 
 
-def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
+def test_figures_by_lateral_acceleration_omit_rare_ranges():
     part = part_of(np.random.default_rng(5))
     names = {
         "ay_0_2": (0.0, 2.0),
@@ -227,7 +227,7 @@ def figures_of_kalman(factor):
     return accuracy(parts)
 
 
-def test_a_kalman_filter_is_consistent_on_its_own_model_and_not_with_half_the_noise():
+def test_kalman_filter_is_consistent_with_true_but_not_with_half_the_noise():
     right = figures_of_kalman(1.0)
     sure = figures_of_kalman(0.5)
     assert right["nees"] == pytest.approx(1.0, abs=0.1)

@@ -198,7 +198,7 @@ def test_bound_of_a_long_drive_is_the_same_in_chunks(
     assert 0 < floor.sideslip < 104
 
 
-def test_white_and_slow_noise_are_told_apart_and_their_times_found():
+def test_white_and_correlated_noise_are_distinguished():
     """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2 that lasts 8 s."""
     generator = np.random.default_rng(4)
     n = 48_000

@@ -44,7 +44,7 @@ def coloured(generator, n, memory=0.95):
     )[400:]
 
 
-def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
+def test_segments_reproduce_the_metrics(tmp_path):
     generator = np.random.default_rng(0)
     parts = [scored(0.1 * coloured(generator, n), coloured(generator, n)) for n in (330, 95)]
     segments = segments_of(parts, RATE)
@@ -127,7 +127,7 @@ def test_block_length_is_that_of_another_library(memory):
     assert politis_white_length([values]) == _length(covariances, window, 900)
 
 
-def test_many_ranges_are_blocks_few_are_cut_and_equal_values_are_blocks_of_their_own():
+def test_blocks_are_ranges_where_many_and_cuts_where_few():
     generator = np.random.default_rng(1)
     many_ranges = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
     assert list(block_labels(many_ranges, many_ranges.squared_error_vy[None])) == [

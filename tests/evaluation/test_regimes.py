@@ -39,7 +39,7 @@ def estimate_with(recording, error):
     )
 
 
-def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
+def test_regimes_are_detected_where_the_drive_has_them():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     assert tuple(masks) == REGIMES
     for group in (("straight", "turning"), tuple(AY_BANDS), ("transient", "steady")):
@@ -54,7 +54,7 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     assert masks["steady"][(time < 9.7) | ((time > 11.5) & (time < 19.7)) | (time > 21.8)].all()
 
 
-def test_regimes_of_a_range_are_those_of_the_whole_drive():
+def test_regimes_of_a_range_equal_those_of_the_full_drive():
     regimes = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     cut = regimes_of(stepped_drive(), Span("d", "steps", 5.0, 20.5), Protocol(RATE, 0.0, 1.5))
     for name, mask in cut.items():

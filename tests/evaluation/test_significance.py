@@ -46,7 +46,7 @@ def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_se
     assert 0.91 <= median <= 0.99
 
 
-def test_shift_is_significant_and_one_lucky_training_of_three_is_not():
+def test_shift_is_significant_and_a_single_lucky_training_is_not():
     generator = np.random.default_rng(2)
     hard = np.repeat(20.0 * generator.random(N_SEQUENCES), LENGTH)
     first, second = (hard + losses(generator, 3, 0.1) for _ in range(2))
@@ -64,7 +64,7 @@ def test_shift_is_significant_and_one_lucky_training_of_three_is_not():
     )
 
 
-def test_one_seed_and_white_noise_are_a_paired_t_test():
+def test_single_seed_and_white_noise_give_a_paired_t_test():
     generator = np.random.default_rng(3)
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
@@ -80,7 +80,7 @@ def test_one_seed_and_white_noise_are_a_paired_t_test():
     assert result.mean.p_value == pytest.approx(expected.pvalue, rel=0.1)
 
 
-def test_equal_losses_do_not_differ_and_one_block_is_refused():
+def test_equal_losses_do_not_differ_and_a_single_block_is_refused():
     losses_of_both = np.arange(10.0)[None]
     result = compared(losses_of_both, losses_of_both, [2, 1, 2, 2, 2, 1])
     assert result.mean.dof == 6 - 1
@@ -146,7 +146,7 @@ def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
     assert 0.92 < covered / 2000 < 0.98
 
 
-def test_mean_of_one_seed_has_student_s_interval():
+def test_mean_of_a_single_seed_has_the_student_interval():
     values = np.random.default_rng(3).normal(size=(1, 9))
     contrast = mean_contrast(values)
     test = stats.ttest_1samp(values[0], 0.0)
@@ -157,7 +157,7 @@ def test_mean_of_one_seed_has_student_s_interval():
     assert paired.p_value == pytest.approx(expected.pvalue)
 
 
-def test_paired_seeds_leave_out_what_both_trainings_share():
+def test_paired_seeds_cancel_the_shared_variation():
     rng = np.random.default_rng(4)
     shared = rng.normal(size=(3, 1))
     first = shared + 0.1 * rng.normal(size=(3, 20))

@@ -16,7 +16,7 @@ IN_FAULTS = 1e-7  # of bands beside faults: Python's own covariances lose digits
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("faults", [False, True], ids=["vectors", "faults"])
-def test_double_agrees_with_python_and_gives_every_reason_alike(tmp_path, family, faults):
+def test_double_agrees_with_python_in_values_and_reasons(tmp_path, family, faults):
     largest, others = Export(family, "double", tmp_path).agreement(faults=faults)
     assert largest[:2].max() <= TOLERANCES["double"]
     assert largest[2:].max() <= (IN_FAULTS if faults else TOLERANCES["double"])
@@ -50,7 +50,7 @@ def test_a_model_that_was_never_calibrated_has_the_limits_of_any_car_and_no_band
     assert np.isnan(np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)[:, 2:4]).all()
 
 
-def test_samples_that_a_clock_shows_to_be_missing_are_those_that_vehest_missing_stands_for(
+def test_samples_missing_by_the_clock_equal_calls_of_vehest_missing(
     tmp_path,
 ):
     export = Export("kalman", "double", tmp_path).write()

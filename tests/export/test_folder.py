@@ -18,7 +18,7 @@ from vehest.trust.record import write_trust
 pytestmark = pytest.mark.export
 
 
-def test_an_export_builds_and_passes_its_own_vectors(tmp_path):
+def test_export_builds_and_passes_its_test_vectors(tmp_path):
     tool("make")
     tool("gcc")
     export_model(model("dugoff_ukf"), trust("dugoff_ukf"), tmp_path / "c", "float", 200.0)
@@ -31,7 +31,7 @@ def test_an_export_builds_and_passes_its_own_vectors(tmp_path):
     assert "| 2 | CHANNEL is frozen |" in readme
 
 
-def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path):
+def test_export_replaces_only_an_earlier_export(tmp_path):
     out = tmp_path / "c"
     export_model(model("zero"), trust("zero"), out)
     assert (out / "vehest_health.c").exists()
@@ -58,7 +58,7 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
         ({"bus_rate_hz": float("nan")}, "too slow"),
     ],
 )
-def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, words):
+def test_refused_exports_leave_nothing(tmp_path, options, words):
     with pytest.raises(ConfigurationError, match=words):
         export_model(model("zero"), None, tmp_path / "c", **options)
     assert not list(tmp_path.iterdir())
@@ -77,7 +77,7 @@ def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(
     )
 
 
-def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path):
+def test_export_command_accepts_a_model_folder_and_states_its_inputs(tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     save_model(model("kinematic"), folder)

@@ -286,7 +286,7 @@ def test_every_family_but_the_factor_graph_can_be_exported():
     assert set(exportable()) == set(estimator_names()) - {"factor_graph"}
 
 
-def test_what_cannot_be_exported_is_said_in_one_line():
+def test_refusals_of_export_are_a_single_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
     assert "cannot run along with a drive" in refusal(
         lambda: method_files(offline, "double"), ConfigurationError

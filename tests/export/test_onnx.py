@@ -83,7 +83,7 @@ def test_a_network_runs_in_onnxruntime_as_in_python(name, config, dtype, largest
     assert np.isnan([own["vy"] for own in said]).sum() == estimator.warm_up_steps
 
 
-def test_a_file_says_what_it_is(tmp_path):
+def test_onnx_file_describes_itself(tmp_path):
     estimator = fitted("ksnn", "float32", window=8)
     write_onnx(estimator, tmp_path / "model.onnx")
     model = onnx.load(tmp_path / "model.onnx")
@@ -103,7 +103,7 @@ def test_a_file_says_what_it_is(tmp_path):
     )
 
 
-def test_what_is_no_network_is_refused(tmp_path):
+def test_estimators_without_a_network_are_refused(tmp_path):
     with pytest.raises(
         ConfigurationError,
         match="estimator 'kalman' is no network that ONNX could hold; these are: ksnn, gru",

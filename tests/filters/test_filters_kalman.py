@@ -107,7 +107,7 @@ def test_filter_and_smoother_are_the_posterior_of_all_states_at_once(missing, se
     assert np.abs(smoothed_means(model, result) - mean).max() < 1e-10
 
 
-def test_predictions_stand_where_nothing_is_measured():
+def test_unmeasured_samples_keep_the_prediction():
     model, measurements, initial = example(5, seed=6)
     measurements[2] = np.nan
     result = kalman_scan(model, measurements, initial)

@@ -232,7 +232,7 @@ def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
     assert torch.isfinite(slopes[0][0]).all()
 
 
-def test_sequences_shared_out_are_what_they_are_together():
+def test_sequences_filtered_in_shares_equal_those_filtered_together():
     """Each in two pieces, one after the other."""
 
     def halves(work, sequences):
@@ -250,7 +250,7 @@ def test_sequences_shared_out_are_what_they_are_together():
         assert torch.allclose(a, b, rtol=1e-13, atol=0)
 
 
-def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gradients():
+def test_scan_with_noise_functions_matches_the_filter_and_has_no_gradients():
     measurements, inputs, first = measured_pendulum(20, 2)
 
     def noise(base):
@@ -279,7 +279,7 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
         scanned.steps.filtered.mean.sum().backward()
 
 
-def test_one_sample_at_a_time_it_is_the_same_filter():
+def test_stepper_matches_the_scan():
     measurements, inputs, first = measured_pendulum(20, 1)
     measurements[0, 4, 0] = measurements[0, 9] = torch.nan
     model = pendulum_with_radar()
@@ -306,7 +306,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter():
         ), k
 
 
-def test_one_step_alone_is_the_model():
+def test_moved_is_the_transition_with_its_gradient():
     gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
     model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
     states, inputs = (

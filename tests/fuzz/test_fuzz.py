@@ -36,7 +36,7 @@ def rows_of(folder, *options):
         return list(csv.DictReader(stream))
 
 
-def test_two_hundred_malformed_inputs_end_with_a_result_or_one_line(tmp_path):
+def test_two_hundred_malformed_inputs_end_with_a_result_or_a_single_line(tmp_path):
     rows = rows_of(tmp_path, "--inputs", "200", "--jobs", "2")
     assert len(rows) == 200
     honest = [row for row in rows if row["honest"] == "True"]
@@ -86,7 +86,7 @@ def test_an_outcome_is_judged_by_exit_code_lines_and_files(tmp_path, honest, end
     assert judge(case, Command(("ingest",), targets=("out.csv",)), ended)[0] == verdict
 
 
-def test_what_is_written_is_seen_in_the_folders(tmp_path):
+def test_written_files_are_detected_in_the_folders(tmp_path):
     for name in ("same", "longer", "gone"):
         (tmp_path / name).write_text("a")
     before = snapshot(tmp_path)

@@ -41,7 +41,7 @@ def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate():
     assert np.isnan([x[2], y[2]]).all()
 
 
-def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
+def test_bars_share_an_axis_from_zero_and_outliers_are_cut():
     one, two, far, none = bars_of(
         [0.2, 0.4, 50.0, np.nan], [0.1, 0.3, 40.0, np.nan], [0.4, 0.5, 60.0, np.nan]
     )

@@ -40,7 +40,7 @@ def test_best_estimator_is_recommended_with_interval_and_chosen_seed(
     assert (found[1].estimator, found[1].seed) == ("ksnn", 1)
 
 
-def test_of_two_that_are_alike_neither_is_significantly_worse(part):
+def test_of_two_equal_estimators_neither_is_significantly_worse(part):
     twins = [
         replace(model, variant="twin", title="Its twin")
         for model in part.models
@@ -213,7 +213,7 @@ def test_families_that_lack_channels_are_named_with_them(part):
     assert not any(line.startswith(("lstm:", "ksnn:", "zero:")) for line in lines)
 
 
-def test_the_terminal_says_what_the_report_says(part):
+def test_terminal_and_report_state_the_same(part):
     artefacts = StudyArtefacts(
         "toy",
         "A toy study",

@@ -109,7 +109,7 @@ def test_errors_over_filtered_rows_follow_the_signals(chromium, toy):
         )
 
 
-def test_browser_unpacks_what_was_packed(chromium, toy):
+def test_browser_unpacks_the_packed_columns(chromium, toy):
     path, _, document = toy
     opened(chromium, path)
     (explorer,) = [
@@ -136,7 +136,7 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
         assert all(shown == pytest.approx(view) for shown in views(chromium))
 
 
-def test_dragging_over_one_trace_zooms_all(chromium, hour):
+def test_dragging_over_a_trace_zooms_all(chromium, hour):
     from selenium.webdriver import ActionChains
 
     opened(chromium, hour)
@@ -160,7 +160,7 @@ def test_errors_can_be_taken_over_the_segment_in_view(chromium, hour):
     )
 
 
-def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium, toy):
+def test_leaderboard_sorts_by_its_bars_and_prints_the_command(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     open_appendices(chromium)
@@ -257,7 +257,7 @@ SERIES = (
 )
 
 
-def test_legend_names_what_is_drawn_and_the_reference_lies_below_the_estimates(chromium, hour):
+def test_legend_names_the_lines_and_the_reference_lies_below_the_estimates(chromium, hour):
     opened(chromium, hour)
     drawn = [f"Estimator {i}" for i in range(1, 5)]
     assert chromium.execute_script(LEGEND) == ["reference", *drawn, "90 % band of Estimator 1"]
@@ -277,7 +277,7 @@ def test_strip_of_sensor_health_has_a_legend(chromium, hour):
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
 
 
-def test_appendices_are_one_folded_list_at_the_end(chromium, toy):
+def test_appendices_are_a_folded_list_at_the_end(chromium, toy):
     opened(chromium, toy[0])
     after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
     found = chromium.execute_script(after)

@@ -187,7 +187,7 @@ def written(artefacts, tmp_path_factory):
     return folder
 
 
-def test_seed_is_chosen_on_validation_and_the_lower_one_in_a_tie(
+def test_seed_is_chosen_on_validation_and_the_lower_seed_in_a_tie(
     artefacts,
 ):
     row = row_of(leaderboard(artefacts), "ksnn")
@@ -412,7 +412,7 @@ def words_of(artefacts):
     return "\n\n".join(block for block in comparison(artefacts).blocks if isinstance(block, str))
 
 
-def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(artefacts):
+def test_verdict_names_the_best_and_recommends_only_above_both_baselines(artefacts):
     """KS-NN alone, then with a twin of itself, then without the baselines, then baselines alone."""
     text = words_of(artefacts)
     best = leaderboard(artefacts).iloc[0]
@@ -465,9 +465,7 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
         assert row["rmse_sideslip_low"] < row["rmse_sideslip_median"] < row["rmse_sideslip_high"]
 
 
-def test_report_says_how_it_was_made_and_on_its_first_page_whether_data_are_real(
-    artefacts, written
-):
+def test_report_states_its_provenance_and_the_kind_of_data(artefacts, written):
     for kind, words in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         verdict, forest, _, busiest = comparison(replace(artefacts, kinds={"toy": kind})).blocks[:4]
         assert f"on test set `test` ({kind}; " in forest.caption
@@ -569,7 +567,7 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
         assert (report / file).read_bytes() == (written / file).read_bytes(), file
 
 
-def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path):
+def test_content_of_the_page_is_in_no_other_file(tmp_path):
     frame = pd.DataFrame({"train_seconds": [1.5]})
     document = Document(
         "Words", ["Only words.", Table("first", "First.", pd.DataFrame({"a": [1]}))]
@@ -741,7 +739,7 @@ def test_table_columns_have_common_decimals_and_dashes_for_missing_values():
     assert (decimals_for([0.31, 0.44, 12.0]), decimals_for([math.nan])) == (3, 0)
 
 
-def test_each_family_has_one_hue_with_contrast_on_dark_and_light_pages():
+def test_each_family_has_a_hue_with_contrast_on_dark_and_light_pages():
     assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
     assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [

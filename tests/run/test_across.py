@@ -110,7 +110,7 @@ def test_errors_of_all_folds_count_together(across):
     }
 
 
-def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across):
+def test_vehicles_are_listed_side_by_side_including_failed_ones(across):
     code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
     assert code == 5, err
     assert "steer" in err
@@ -130,7 +130,7 @@ def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across):
     )
 
 
-def test_bands_and_faults_are_told_apart_by_car(across):
+def test_bands_and_faults_are_separate_per_car(across):
     across.change(
         "conf/dataset/other.yaml", **DATASET | {"name": "other", "vehicle": "another car"}
     )
@@ -187,6 +187,6 @@ def test_a_pipeline_of_folds_has_a_part_a_fold(across):
     ],
     ids=str,
 )
-def test_a_report_that_does_not_suit_is_refused_in_one_line(across, content, says):
+def test_unsuitable_reports_are_refused_in_a_single_line(across, content, says):
     across.change("pipelines/odd.yaml", study="odd", **content)
     across.refused("run", "odd", code=2, says=says)

@@ -142,7 +142,7 @@ def test_a_run_calibrates_each_model_once_and_shows_it(place):
     assert f" 4 {STAGE}" in line
 
 
-def test_missing_calibration_is_made_again(evaluated, tmp_path):
+def test_missing_calibration_is_recomputed(evaluated, tmp_path):
     place, model, evaluation = evaluated
     found = calibration_of(model, place.folder / "outputs")
     (found.folder / "trust.yaml").unlink()
@@ -192,7 +192,7 @@ def test_a_damaged_calibration_is_an_error_and_not_a_model_without_bands(evaluat
         assert trust_of(model, place.folder / "outputs") is None, "of another model, by its name"
 
 
-def test_a_damaged_model_is_not_taken_for_one_without_a_calibration(evaluated):
+def test_damaged_models_are_distinct_from_uncalibrated_models(evaluated):
     place, model, _ = evaluated
     (model / "manifest.json").write_text("{")
     with pytest.raises(DataError, match=r"manifest\.json"):

@@ -70,7 +70,7 @@ def test_command_line_precedes_record_data_set_and_default(
     assert settings_after(self_calibrating, car, record=of_the_same_car)[:2] == (2.4, 1.07)
 
 
-def test_the_default_wheelbase_is_remarked_only_where_none_is_known(self_calibrating):
+def test_default_wheelbase_is_remarked_only_without_a_configured_wheelbase(self_calibrating):
     assumed = "the wheelbase is assumed to be 2.7 m"
     assert assumed in settings_after(self_calibrating)[2]
     for known in (
@@ -115,7 +115,7 @@ def test_estimate_compare_and_identify_use_the_wheelbase_of_the_data_set(place):
     assert yaml.safe_load(Path("car.yaml").read_text(encoding="utf-8"))["wheelbase"] == 0.33
 
 
-def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
+def test_null_wheelbase_in_a_training_is_that_of_its_only_car():
     config = {"estimator": {"name": "data_sheet", "wheelbase": None, "cg_to_rear_axle": None}}
     first, second, other = (
         TABLE | {"name": "one", "car": {"wheelbase": wheelbase, "cg_to_rear_axle": rear}}
@@ -370,9 +370,7 @@ def test_calibrations_keep_the_cars_of_their_data_sets(model, tmp_path):
         (CarValues(), CarValues(2.7, 1500.0), ""),
     ],
 )
-def test_cars_differ_by_wheelbase_and_mass_beyond_what_sources_and_load_explain(
-    car, other, difference
-):
+def test_cars_differ_by_wheelbase_and_mass_beyond_sources_and_load(car, other, difference):
     assert car.difference_to(other) == difference
 
 

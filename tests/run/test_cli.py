@@ -37,7 +37,7 @@ def _statuses(err):
     ]
 
 
-def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
+def test_pipeline_reuses_artefacts_and_reruns_only_changed_stages(place):
     out, err = place.once("run", "small", "tracking=none")
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
@@ -62,7 +62,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     assert not any(" ingest " in line or " downsample " in line for line in done)
 
 
-def test_two_processes_give_the_same_numbers_as_one_and_a_dry_run_makes_nothing(place):
+def test_two_processes_give_the_same_numbers_and_a_dry_run_writes_nothing(place):
     place.change("pipelines/small.yaml", sweeps=PIPELINE["sweeps"][1:])
     assert ("would", "ingest") in _statuses(place.done("run", "small", "--dry-run")[1])
     assert place.files() == set()
@@ -75,7 +75,7 @@ def test_two_processes_give_the_same_numbers_as_one_and_a_dry_run_makes_nothing(
         ).read_bytes()
 
 
-def test_a_failed_job_is_reported_and_the_others_are_kept(place):
+def test_failed_jobs_are_reported_and_other_results_remain(place):
     sweeps = [
         PIPELINE["sweeps"][0],
         [
@@ -112,7 +112,7 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     assert not (place.folder / "results").exists()
 
 
-def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
+def test_reports_show_present_results_and_name_missing_ones(place):
     place.once("run", "small", "tracking=none")
     place.refused(
         "report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run"
@@ -142,7 +142,7 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     assert reason == NO_TIME
 
 
-def test_train_eval_estimate_report_one_by_one(place):
+def test_train_eval_estimate_and_report_run_as_separate_commands(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
     trained = place.told("train", *arguments)
     assert (
@@ -248,7 +248,7 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     )
 
 
-def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
+def test_doctor_names_the_purpose_of_an_absent_extra(place, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
@@ -285,7 +285,7 @@ def test_help_shows_choices_and_answers_quickly(place):
         ),
     ],
 )
-def test_bad_tables_are_one_clear_line_whatever_reads_them(place, change, says):
+def test_bad_tables_are_a_single_clear_line_with_every_command(place, change, says):
     path = place.folder / "raw" / "one.csv"
     change(pd.read_csv(path)).to_csv(path, index=False)
     for command in (
@@ -297,7 +297,7 @@ def test_bad_tables_are_one_clear_line_whatever_reads_them(place, change, says):
     assert place.files() == set()
 
 
-def test_empty_and_truncated_files_and_degrees_taken_as_radians_are_one_clear_line(place):
+def test_empty_and_truncated_files_and_wrong_units_are_a_single_clear_line(place):
     path = place.folder / "raw" / "one.csv"
     channels = DATASET["channels"] | {"yaw_rate": {"column": "Yaw", "unit": "rad/s"}}
     place.change("conf/dataset/mine.yaml", channels=channels)
@@ -376,7 +376,7 @@ TESTED = [{"recording": "three"}]
         ({"tests": {"t": []}}, TRAIN, 2, "test set 't' is empty"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(place, changes, command, code, says):
+def test_invalid_input_is_refused_in_a_single_line(place, changes, command, code, says):
     if changes:
         place.change(
             "conf/split/mine.yaml" if "tests" in changes else "pipelines/small.yaml", **changes
@@ -385,7 +385,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(place, changes, command, cod
     assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
 
 
-def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_nothing(
+def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothing(
     place, monkeypatch
 ):
     place.once(
@@ -435,7 +435,7 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     place.refused("ingest", "mine", code=4, says="no data root is set")
 
 
-def test_truncated_artefact_is_made_again(place):
+def test_truncated_artefacts_are_recomputed(place):
     arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none")
     weights = Path(place.told(*arguments)["model"]) / "model.safetensors"
     whole = weights.read_bytes()
@@ -443,9 +443,7 @@ def test_truncated_artefact_is_made_again(place):
     assert (place.told(*arguments)["skipped"], weights.read_bytes() == whole) == (False, True)
 
 
-def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(
-    place, monkeypatch
-):
+def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypatch):
     outputs = place.folder / "outputs"
 
     class OneEvaluation(TimeLimit):

@@ -200,7 +200,7 @@ def test_an_estimate_without_its_description_is_read_with_a_warning(drive, tmp_p
     assert capsys.readouterr().err == ""
 
 
-def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):
+def test_a_winner_is_named_only_above_the_baselines(drive, tmp_path):
     estimates = {
         name: read_estimate_table(written(tmp_path, name, drive, size), drive)
         for name, size in (("good", 0.01), ("bad", 0.6))
@@ -296,7 +296,7 @@ def test_columns_of_another_tool_are_read_by_their_stated_names_units_and_signs(
 
 
 @pytest.mark.parametrize("shift", [12.345, -3.2, 1.7e9])
-def test_a_shift_by_correlation_is_the_one_that_was_put_in(drive, tmp_path, capsys, shift):
+def test_shift_by_correlation_is_the_simulated_shift(drive, tmp_path, capsys, shift):
     file = carmaker(tmp_path, drive, shift)
     columns = parse_columns(["time=Clock", "sideslip=-Beta_CarMaker:deg"])
     read = read_estimate_table(file, drive, columns, parse_shift("auto"))
@@ -337,7 +337,7 @@ def test_a_wrong_shift_is_refused(text):
     assert says in refusal(lambda: parse_shift(text), ConfigurationError)
 
 
-def test_what_is_missing_in_a_table_is_said_with_the_accepted_names(drive, tmp_path, monkeypatch):
+def test_missing_columns_of_a_table_are_named_with_accepted_names(drive, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table = pd.DataFrame({"time": drive.time, "Beta_CarMaker": drive["vy_ref"]})
     table.to_csv("mine.csv", index=False)

@@ -39,7 +39,7 @@ def test_every_estimator_composes_with_any_split(
     )
 
 
-def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
+def test_local_configuration_precedes_and_extends_the_packaged_configuration(elsewhere):
     (elsewhere / "conf" / "estimator").mkdir(parents=True)
     (elsewhere / "conf" / "estimator" / "gru.yaml").write_text(
         "name: gru\nrate_hz: 20\nwindow: 10\nn_states: 3\n"
@@ -73,7 +73,7 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
         ([], r"dataset is not chosen; dataset=… \(choices: .*tabular"),
     ],
 )
-def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
+def test_wrong_overrides_are_a_single_helpful_line(elsewhere, overrides, message):
     said = refusal(
         lambda: compose_config("train" if overrides else "ingest", overrides), ConfigurationError
     )
@@ -97,7 +97,7 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
         ("estimatr=ksnn", "estimator"),
     ],
 )
-def test_a_misspelt_option_of_any_group_is_answered_with_what_was_meant(elsewhere, override, meant):
+def test_misspelt_options_of_any_group_get_a_suggestion(elsewhere, override, meant):
     said = refusal(
         lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", override]),
         ConfigurationError,
@@ -264,7 +264,7 @@ def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, 
     assert place("data", "show", "mine")[0] == 0
 
 
-def test_jobs_with_the_same_choices_share_what_is_composed_but_no_values(elsewhere, monkeypatch):
+def test_jobs_with_the_same_choices_share_compositions_but_no_values(elsewhere, monkeypatch):
     composed = []
     compose = config.compose
     monkeypatch.setattr(config, "compose", lambda *a, **k: composed.append(a) or compose(*a, **k))
@@ -301,7 +301,7 @@ def test_references_of_an_override_are_bounded_too(elsewhere):
 
 
 @pytest.mark.parametrize("estimator", choices("estimator"))
-def test_config_prints_what_it_composes_with_comments(elsewhere, estimator):
+def test_config_prints_the_composed_configuration_with_comments(elsewhere, estimator):
     config = compose_config("train", [f"estimator={estimator}", "seed=3"])
     assert yaml.safe_load(config_as_commented_yaml(config)) == config
 

@@ -36,7 +36,7 @@ def described(place):
     return place, drive
 
 
-def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_own(described):
+def test_measurements_contain_the_estimate_in_a_separate_group(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mf4")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
@@ -56,7 +56,7 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
         )["health_reason"].fillna("").tolist()
 
 
-def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
+def test_mat_files_contain_log_and_estimate_on_the_same_clock(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
@@ -69,7 +69,7 @@ def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
     assert len(found["vehest_band_sideslip"]) == len(found["time"]) == len(drive)
 
 
-def test_tables_and_older_measurements_do_not_become_one_of_mdf_4(described):
+def test_tables_and_older_measurements_are_not_written_as_mdf_4(described):
     place, drive = described
     place.refused(
         "estimate",

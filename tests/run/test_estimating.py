@@ -134,9 +134,7 @@ def in_parts(monkeypatch, seconds=7.0):
 
 
 @pytest.mark.parametrize("name", ["own", "self_calibrating", "pretrained"])
-def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(
-    saved, monkeypatch, name
-):
+def test_estimates_in_parts_have_the_bits_and_figures_of_the_full_drive(saved, monkeypatch, name):
     speed = np.array(drive_of(4)["vx"])
     lost = slice(1200, 1500)
     speed[
@@ -182,7 +180,7 @@ def calibrated_model(name):
 
 @pytest.mark.parametrize("end", [".parquet", ".csv"])
 @pytest.mark.parametrize("name", estimator_names())
-def test_every_family_estimates_a_file_in_parts_as_the_whole(place, monkeypatch, name, end):
+def test_every_family_estimates_a_file_in_parts_like_the_full_file(place, monkeypatch, name, end):
     folder, drive = calibrated_model(name)
     table = pd.DataFrame({"time": drive.time, **drive.channels})
     if end == ".csv":
@@ -223,7 +221,7 @@ def test_bad_rows_have_the_same_line_in_parts_and_nothing_is_written(
     assert not [*saved.folder.glob("*out*")]
 
 
-def test_online_says_what_estimate_says_of_the_whole_drive(model):
+def test_online_estimates_equal_those_of_the_full_drive(model):
     drive = drive_of(4)
     channels = {name: drive[name].copy() for name in model.channels}
     channels["ay"][1000:1100] = channels["ay"][1000]  # a second that stands still
@@ -291,7 +289,7 @@ def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_
         (lambda text: yaml.safe_dump({**yaml.safe_load(text), "bands": {"vy": "wide"}}), "bands"),
     ],
 )
-def test_a_damaged_trust_file_is_one_clear_line(saved, damage, message):
+def test_damaged_trust_files_are_a_single_clear_line(saved, damage, message):
     lap()
     file = saved.folder / "own" / TRUST
     file.write_text(damage(file.read_text(encoding="utf-8")), encoding="utf-8")

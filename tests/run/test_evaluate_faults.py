@@ -90,7 +90,7 @@ def test_fault_start_is_drawn_between_20_and_40_percent_of_each_range():
     assert FaultSettings("bias", "ay", "mild", start=4.0).within(10.0, 100.0, 7).onset == 14.0
 
 
-def test_a_fault_that_makes_no_sense_is_one_line(trained):
+def test_invalid_faults_are_refused_in_a_single_line(trained):
     for overrides, says in (
         (("fault=frozn",), "fault=frozn is not there; did you mean frozen?"),
         (
@@ -156,7 +156,7 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     assert faulted > unharmed, "what stands still is passed over, and the estimate fades"
 
 
-def test_errors_under_a_fault_are_those_of_an_estimate_made_by_hand(place):
+def test_errors_under_a_fault_equal_those_of_a_direct_estimate(place):
     """v = 0 has the error v; what it is while the fault lasts follows from the reference alone."""
     overrides = ("split=mine", "estimator=zero", "tracking=none")
     assert place("train", *overrides)[0] == 0

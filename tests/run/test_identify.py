@@ -107,7 +107,7 @@ def test_a_drive_that_steady_cornering_explains_better_than_the_bank_tells_nothi
     assert calibrated(model, found).settings == model.settings
 
 
-def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
+def test_drives_weigh_by_their_information_and_contradictions_widen_intervals():
     prior = Normal(1.0, 2.0)
     likelihoods = {"a": (3.0, 1.0), "b": (3.2, 0.5)}
     posteriors = {}
@@ -129,7 +129,7 @@ def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
     assert together(prior, {"d": prior}) == Number(prior.mean, prior.deviation)
 
 
-def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
+def test_delays_widen_affected_intervals_independent_of_the_number_of_drives():
     prior = Normal(0.0, 1.0)
     sure = Normal(0.2, 1e-3, 0.5)
     for drives in ({"a": sure}, dict.fromkeys("abcd", sure)):
@@ -230,7 +230,7 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
         (1.0, 0.1, "does not reach 25 m/s"),
     ],
 )
-def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
+def test_wheelbases_excluded_by_the_drive_are_reported(scale, wheelbase, words):
     """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
     time = np.arange(0.0, 60.0, 1.0 / RATE)
     speed = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0])
@@ -265,7 +265,7 @@ def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
         ("av21", 3.0),
     ],
 )
-def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(
+def test_wheelbases_of_real_cars_are_accepted_and_small_cars_are_not_large_ones(
     data_root, dataset, wheelbase
 ):
     config = compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
@@ -288,7 +288,7 @@ def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large
         ("just text", "no record of a car"),
     ],
 )
-def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(elsewhere, change, words):
+def test_damaged_records_of_a_car_are_refused_in_a_single_line(elsewhere, change, words):
     number = {"value": 0.01, "deviation": 0.01}
     numbers = {
         "leakage": number,

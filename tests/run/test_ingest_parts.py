@@ -39,7 +39,7 @@ def failing(monkeypatch, name, error):
     monkeypatch.setattr(TabularSource, "read", fails)
 
 
-def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monkeypatch):
+def test_parts_finished_before_a_failure_are_not_recomputed(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
         code, _, err = place("ingest", "mine")

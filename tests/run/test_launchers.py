@@ -69,7 +69,7 @@ def test_progress_has_no_more_bars_than_fit_a_terminal():
         assert len(bars.tasks) == console.MAX_BARS
 
 
-def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
+def test_artefacts_transfer_with_their_digest_and_damaged_ones_are_refused(tmp_path):
     made = made_in(tmp_path / "here")
     there = tmp_path / "there" / "train" / made.folder.name
     files = pack({made.folder})[made.folder]
@@ -118,7 +118,7 @@ def test_a_machine_with_other_versions_or_without_the_output_root_does_nothing(t
     assert not list(tmp_path.iterdir())
 
 
-def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch):
+def test_files_of_another_host_are_ignored_for_a_day(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "_host", lambda: "0" * 8)
     growing = aside_of(tmp_path / "model")
     growing.write_text("half")
@@ -132,7 +132,7 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert not old.exists()
 
 
-def test_without_ray_one_line_names_the_extra_to_install(place, monkeypatch):
+def test_without_ray_a_single_line_names_the_extra_to_install(place, monkeypatch):
     place.refused(
         "run",
         "small",

@@ -56,7 +56,7 @@ def test_model_without_training_is_the_same_for_every_split(
     }
 
 
-def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
+def test_filters_with_levels_from_training_are_not_tested_on_that_data(steered):
     arguments = ("estimator=kalman", "tracking=none", "split=cut")
     out, err = steered.done("train", *arguments, "--json")
     assert (json.loads(out)["n_parameters"], "3 parameters" in err) == (3, True)

@@ -7,7 +7,7 @@ import pytest
 from vehest.data.store import read_recording
 
 
-def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):
+def test_errors_at_an_unknown_point_are_listed_with_the_best_lever_arm(place):
     place.change("conf/dataset/mine.yaml", reference_point="unknown")
     place.change(
         "pipelines/levers.yaml",

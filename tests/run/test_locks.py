@@ -60,7 +60,7 @@ def test_lock_ends_with_its_process_and_waiting_names_the_holder_once(
     lock.release()
 
 
-def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, monkeypatch):
+def test_a_single_process_compiles_for_calibration_and_others_wait(tmp_path, monkeypatch):
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: kernel == group.FLOOR_KERNEL)
     asked = iter([False, False, True])
     with (
@@ -76,7 +76,7 @@ def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, m
         pass
 
 
-def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
+def test_names_invalid_for_files_are_separate_locks(tmp_path):
     first = Lock(tmp_path, "train", "../a/b")
     second = Lock(tmp_path, "train", ".._a_b")
     assert first.take()
@@ -118,7 +118,7 @@ def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
 COMMAND = [sys.executable, "-m", "vehest"]
 
 
-def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
+def test_runs_wait_for_artefacts_of_another_run_and_continue(place):
     assert place("ingest", "mine")[0] == 0
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
     with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
@@ -229,7 +229,7 @@ def test_three_runs_at_once_make_each_artefact_and_mlflow_run_once(
     assert not list((together / "checkpoints").rglob("*"))
 
 
-def test_a_training_made_again_leaves_its_evaluation_up_to_date(place):
+def test_recomputed_trainings_leave_their_evaluation_up_to_date(place):
     arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
     place.told("train", *arguments)
     assert [

@@ -88,7 +88,7 @@ def _shows_only_text(text):
     ],
     ids=lambda own: str(own)[:50],
 )
-def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
+def test_wrong_usage_is_a_single_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
 
 
@@ -196,7 +196,7 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     assert (code, r"'other\udcff.csv' is neither" in line) == (2, True)
 
 
-def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(place):
+def test_recordings_with_names_that_are_not_utf_8_complete_a_study(place):
     name = os.fsdecode(b"one\xff")
     (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{name}.csv")
     place.change(
@@ -259,7 +259,7 @@ def test_limit_of_jobs_counts_expanded_ranges(place):
         expand(["seed=range(4)"])
 
 
-def test_overrides_that_cannot_be_read_are_one_line_and_long_honest_ones_are_read():
+def test_unreadable_overrides_are_a_single_line_and_long_valid_ones_are_read():
     for override, words in (
         ("training.x=" + "[" * 2_000 + "]" * 2_000, "cannot be read"),
         ("output='a\0b'", "output must name a folder"),
@@ -334,7 +334,7 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
         ValueError("no space"),
     ],
 )
-def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
+def test_full_disks_are_identified_under_every_library_error(tmp_path, error):
     full = not isinstance(error, ValueError)
     said = f"no room left to write '{tmp_path / 'target'}'" if full else "no space"
 
@@ -372,7 +372,7 @@ def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
         (ValueError("x" * 100_000), 1, "…"),
     ],
 )
-def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, words):
+def test_internal_errors_are_a_single_line(place, monkeypatch, error, code, words):
     def fail():
         raise error
 

@@ -53,7 +53,7 @@ def held(position):
     return yaml.safe_load(Path(FILES[position]).read_text(encoding="utf-8"))
 
 
-def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
+def test_enter_accepts_proposals_and_values_of_the_car_are_used(log):
     said = log.typed("lap.csv", answers=["", "2.7", "1500", "15", "-0.3", "simulated"])
     for words in (
         "yaw_rate: column 'Gyro', deg/s: ay vs. vx·yaw_rate: correlation",
@@ -105,7 +105,7 @@ def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, 
     assert held(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
 
 
-def test_an_answer_that_is_none_is_asked_again(log):
+def test_invalid_answers_are_requested_again(log):
     said = log.typed(
         "lap.csv", answers=["perhaps", "no", "-3", "", "", "", "front", "90", "", "toy", ""]
     )
@@ -191,7 +191,7 @@ def test_json_says_all_of_it_to_a_script(log):
     assert [Path(file).read_text() for file in FILES] == before
 
 
-def test_run_takes_what_was_written(log):
+def test_run_accepts_the_written_configuration(log):
     log.new("lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500", "--steering-ratio", "15")
     code, _, err = log("run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
@@ -227,7 +227,7 @@ def test_nothing_half_written_stays(log):
     assert not list(Path().rglob(f"{ASIDE_PREFIX}*"))
 
 
-def test_what_cannot_be_done_is_one_line(log, monkeypatch):
+def test_refusals_of_new_are_a_single_line(log, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     for words, code, said in (
         (("my_car", "nowhere.csv", "--yes"), 4, "there is no file 'nowhere.csv'"),
@@ -268,7 +268,7 @@ def test_without_a_speed_no_pipeline_is_written(
     assert (err, "lacks vx, ay" in out) == ("", True)
 
 
-def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(log):
+def test_short_recordings_stay_undivided_and_too_few_are_refused_with_a_remedy(log):
     names = [f"turn_{number}" for number in range(10)]
     for number, name in enumerate(names):
         log.write(f"{name}.csv", usual(drive(seed=number)).iloc[:400])
@@ -318,7 +318,7 @@ def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothi
     assert log("run", "my_car", "--dry-run")[0] == 0
 
 
-def test_an_estimator_of_ones_own_is_compared_too(log, monkeypatch):
+def test_estimators_of_the_user_are_compared_too(log, monkeypatch):
     own = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
     _, err = log.new(*own, code=2)
     assert (

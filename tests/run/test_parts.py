@@ -77,7 +77,7 @@ def change_parts(place, change):
     place.change(BOTH, parts=change(parts) or parts)
 
 
-def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
+def test_parts_run_as_a_single_study_and_the_next_run_skips_all(parts_place):
     place = parts_place
     out, err = place.done("run", "both", "--json", "tracking=none")
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
@@ -137,7 +137,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     )
 
 
-def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
+def test_study_modules_without_an_overview_are_refused(parts_place, monkeypatch):
     monkeypatch.setattr(
         "vehest_papers.ksnn.documents",
         lambda artefacts: {"report": Document(artefacts.title, ["no tables"])},
@@ -189,7 +189,7 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
     assert "simulated" not in made_here.lower()
 
 
-def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
+def test_pipelines_based_on_another_state_only_changes(parts_place):
     both = read_study("both")
     turned = read_study("turned")
     assert [part.split for part in both.parts.values()] == ["forth", "back", "other"]

@@ -24,7 +24,7 @@ from vehest.trust.record import read_trust
 ROOT = Path(__file__).parents[2]
 
 
-def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place):
+def test_estimate_without_a_model_uses_and_names_the_pretrained_model(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
     said = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
@@ -75,7 +75,7 @@ def test_named_model_is_used_and_a_folder_is_no_recording(
     place.refused("estimate", "own", says="comes after the model")
 
 
-def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
+def test_pretrained_model_is_small_and_the_choice_of_the_published_study():
     folder = pretrained_folder()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
     row = make_pretrained.chosen_step()
@@ -138,7 +138,7 @@ def bands_on(name, data_root):
     return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
 
 
-def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
+def test_documentation_has_the_coverage_of_pretrained_bands_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
     told = re.search(
         r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % of the drive is valid",
@@ -154,7 +154,7 @@ def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_car
     assert bands_on("roboracer", data_root)[2] < 0.01
 
 
-def test_a_step_of_a_window_network_is_the_batch_estimate_one_sample_later():
+def test_step_of_a_window_network_is_the_batch_estimate_of_the_next_sample():
     """The figures of docs/export.md: KS-NN, GRU and LSTM predict t(k+1) from samples up to t(k)."""
     table = pd.read_csv(ROOT / "docs" / "examples" / "lap.csv")
     channels = {

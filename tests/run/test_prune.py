@@ -64,7 +64,7 @@ def name_of(artefact):
     return f"{artefact.stage}/{artefact.folder.name}"
 
 
-def test_artefacts_of_present_versions_are_kept(root):
+def test_artefacts_of_present_versions_stay(root):
     assert root.found() == {}
     inputs = {
         artefact.folder.name: artefact.digest
@@ -82,7 +82,7 @@ def test_artefacts_of_present_versions_are_kept(root):
     assert root.found() == {}
 
 
-def test_what_other_code_has_made_is_found(root):
+def test_artefacts_of_other_code_are_listed(root):
     old = root.add(
         "train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16
     )
@@ -110,14 +110,14 @@ def test_damaged_recordings_are_unused_and_outdated_ones_keep_their_artefacts(ro
     assert root.found() == {name_of(root.ingested): OUTDATED, name_of(root.rated): DAMAGED}
 
 
-def test_checkpoints_of_finished_models_are_found_and_others_are_not(root):
+def test_only_checkpoints_of_finished_models_are_listed(root):
     for name in (root.model.folder.name, "another-seed0-0123456789ab"):
         (root.output / "checkpoints" / name).mkdir(parents=True)
         (root.output / "checkpoints" / name / "checkpoint.safetensors").write_text("state")
     assert root.found() == {f"checkpoints/{root.model.folder.name}": SUPERFLUOUS}
 
 
-def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not(root):
+def test_files_of_killed_processes_are_listed_and_of_living_ones_are_not(root):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     dead = root.output / "train" / f"{ASIDE_PREFIX}{ended.pid}-1-one"
@@ -131,7 +131,7 @@ def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not
     assert root.found() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}
 
 
-def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
+def test_links_and_foreign_files_stay(root, tmp_path):
     elsewhere = Root(tmp_path / "elsewhere")
     old = elsewhere.add("train", "old", {"estimator": {"name": "luenberger"}}, {}, "0" * 16)
     (root.output / "train" / old.folder.name).symlink_to(old.folder)
@@ -147,7 +147,7 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
     assert root.found() == {}
 
 
-def test_yes_removes_what_was_listed_and_a_dry_run_nothing(elsewhere, root, capsys):
+def test_yes_removes_the_listed_artefacts_and_a_dry_run_nothing(elsewhere, root, capsys):
     outdated = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
     assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err

@@ -159,7 +159,7 @@ def other_code_of(changed):
     )
 
 
-def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
+def test_equal_results_of_other_code_are_recorded_as_of_that_code(published, place, monkeypatch):
     shutil.rmtree(place.folder)
     shutil.copytree(published, place.folder)
     shutil.rmtree(place.folder / "outputs" / "finished")
@@ -193,7 +193,7 @@ def test_published_results_are_up_to_date_by_study_and_by_file(
     assert verdict(checked) == (3, "small: stale: configuration (split)")
 
 
-def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked):
+def test_changed_settings_of_an_estimator_make_the_study_stale_and_are_named(checked):
     checked.change(
         "pipelines/small.yaml",
         sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]],
@@ -246,7 +246,7 @@ def test_changed_code_and_changed_data_are_distinguished(checked, monkeypatch):
     )
 
 
-def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked):
+def test_state_is_undetermined_without_keys_pipeline_or_results(checked):
     file = checked.folder / "results" / "small" / PROVENANCE
     about = json.loads(file.read_text())
     file.write_text(json.dumps({name: value for name, value in about.items() if name != "keys"}))
@@ -350,7 +350,7 @@ def test_weights_that_were_changed_after_they_were_published_are_refused_by_name
     assert (code, "was changed after it was published" in " ".join(err.split())) == (3, True)
 
 
-def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
+def test_changed_files_of_an_output_root_are_named_and_recomputed(checked):
     checked.done(*RUN)
     output = checked.folder / "outputs"
     before = {}

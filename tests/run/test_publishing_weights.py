@@ -186,7 +186,7 @@ def test_a_kill_while_writing_leaves_the_file_of_before_or_after(pair, when):
     assert os.listdir(file.parent) == [file.name]
 
 
-def test_what_is_not_published_as_it_is_or_somewhere_else_is_refused(pair):
+def test_publishing_changed_results_or_to_another_place_is_refused(pair):
     pair.refused(*RUN, "training.max_epochs=1", code=2, says="leave out 'training.max_epochs=1'")
     pair.change("pipelines/pair.yaml", publish=False)
     pair.refused(*RUN, code=2, says="it needs publish: true")
@@ -268,7 +268,7 @@ def test_an_incomplete_study_is_stale_once_its_configuration_changes(pair, monke
     )
 
 
-def test_what_is_missing_is_announced_before_it_is_trained(pair, monkeypatch):
+def test_missing_trainings_are_announced_before_they_start(pair, monkeypatch):
     with monkeypatch.context() as patch:
         stop_once_published(patch, 3)
         pair(*RUN)

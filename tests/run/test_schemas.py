@@ -144,7 +144,7 @@ def test_model_is_read_with_its_types_and_finite_numbers(model, tmp_path):
     ],
     ids=str,
 )
-def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model, changes, says):
+def test_invalid_descriptions_are_a_single_line_with_file_and_key(model, changes, says):
     path = model / "model.yaml"
     text = (
         changes
@@ -174,7 +174,7 @@ def with_header(header, length=None):
         ),
     ],
 )
-def test_weights_that_are_none_are_one_line(model, kind, says):
+def test_invalid_weights_are_a_single_line(model, kind, says):
     file = model / "model.safetensors"
     if isinstance(kind, bytes):
         file.write_bytes(kind)
@@ -213,9 +213,7 @@ def made(output, label="mine"):
         ("link", "or is a link"),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
-    tmp_path, changes, says
-):
+def test_invalid_manifests_are_a_single_line_and_their_artefact_is_absent(tmp_path, changes, says):
     artefact = made(tmp_path)
     path = artefact.folder / "manifest.json"
     content = json.loads(path.read_text())
@@ -236,7 +234,7 @@ def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
     assert find(plan(tmp_path)) is None
 
 
-def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path):
+def test_models_without_ranges_in_their_manifest_are_a_single_line(tmp_path):
     artefact = made(tmp_path)
     entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
     told = replace(
@@ -289,7 +287,7 @@ def said_of(path, change, read):
         (b"[" * 100_000, ""),
     ],
 )
-def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
+def test_metadata_of_recordings_are_checked(tmp_path, changes, says):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     for read in (read_recording, is_stored_recording)[: 1 + isinstance(changes, bytes)]:
@@ -321,7 +319,7 @@ def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
         ({"mode": "psychic"}, "mode 'psychic' is not one of"),
     ],
 )
-def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, says):
+def test_sizes_of_an_estimate_are_checked_against_its_columns(tmp_path, changes, says):
     path = tmp_path / "estimate.parquet"
     channels = {"vy": np.zeros(5), "sideslip": np.zeros(5)}
     covariance = np.tile(np.eye(2), (5, 1, 1))
@@ -333,7 +331,7 @@ def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, sa
     assert says in said_of(path, lambda content: changed(content, **changes), read_estimate)
 
 
-def test_tables_that_are_damaged_are_one_line(tmp_path):
+def test_damaged_tables_are_a_single_line(tmp_path):
     path = tmp_path / "fit.csv"
     for text in (
         b"metric\n1\n",
@@ -433,7 +431,7 @@ BOMB = "\n".join(
     ],
     ids=lambda own: str(own)[:40],
 )
-def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path, changes, says):
+def test_invalid_pipelines_are_a_single_line(tmp_path, changes, says):
     path = tmp_path / "mine.yaml"
     path.write_bytes(
         changes
@@ -482,7 +480,7 @@ def test_no_root_file_in_conf_reaches_hydras_search_path(conf, text):
         (b"defaults:\n  - ../../elsewhere", "Could not load 'dataset/../../elsewhere'"),
     ],
 )
-def test_a_file_in_conf_that_is_none_is_one_line(conf, text, says):
+def test_invalid_files_in_conf_are_a_single_line(conf, text, says):
     (conf / "dataset" / "mine.yaml").write_bytes(text)
     assert says in refusal(lambda: compose_config("ingest", ["dataset=mine"]), ConfigurationError)
 
@@ -524,7 +522,7 @@ def test_shared_groups_are_read_with_their_types():
         assert said.startswith(f"evaluation.{says}")
 
 
-def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
+def test_integers_stay_integers_where_any_type_is_allowed():
     assert protocol_from_config({"rate_hz": 20}).rate_hz == 20.0
     low_pass = {"name": "low_pass", "cutoff_hz": 5.0}
     assert Preparation(transforms=(low_pass,)).as_plain()["transforms"] == [low_pass]

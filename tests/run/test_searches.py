@@ -123,7 +123,7 @@ def test_a_search_is_repeated_where_a_trial_or_the_metric_is_another(tuned, chan
     assert len(pd.read_csv(SEARCHES)) == 2
 
 
-def test_a_damaged_file_is_one_line(tuned):
+def test_damaged_search_files_are_a_single_line(tuned):
     tuned.done(*RUN)
     table = pd.read_csv(SEARCHES)
     table.assign(validation="low").to_csv(SEARCHES, index=False)
@@ -141,12 +141,12 @@ def test_a_damaged_file_is_one_line(tuned):
         ({"search": {"values": [1]}}, "values"),
     ],
 )
-def test_what_is_no_search_is_refused(tuned, changes, says):
+def test_invalid_searches_are_refused(tuned, changes, says):
     change_part(tuned, "pace", **changes)
     tuned.refused(*RUN, code=2, says=says)
 
 
-def test_every_search_of_a_paper_is_over_what_its_parts_train():
+def test_searches_of_papers_cover_the_trainings_of_their_parts():
     study = read_study("learned_ukf")
     jobs = jobs_of(study, [])
     assert {name: len(trials) for name, trials in study.searches.items()} == {

@@ -273,7 +273,7 @@ def test_failing_combinations_are_named_and_the_others_go_on(place):
     assert "## What failed" in (Path(outcome["folder"]) / "report.md").read_text()
 
 
-def test_a_single_combination_over_one_seed_has_no_interval_and_no_heat_map(place):
+def test_single_combinations_and_seeds_have_no_interval_and_no_heat_map(place):
     out, _ = place.done("sweep", *QUICK, "estimator.n_hidden=0", "seed=4", "--quiet")
     assert "KS-NN linear no bias, P = 2" in out
     assert "±" not in out.split("data\n", 1)[1]

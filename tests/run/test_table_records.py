@@ -65,7 +65,7 @@ def test_a_table_is_up_to_date_until_its_content_script_or_stage_changes(
     assert outcome() == (3, "tables: stale: code (a.csv: train gru)\n")
 
 
-def test_a_table_without_a_record_and_one_that_is_gone_are_named(table, outcome):
+def test_tables_without_a_record_and_removed_tables_are_named(table, outcome):
     (table.parent / "b.csv").write_text("rmse\n")
     assert outcome() == (3, "tables: stale: data (b.csv without a record)\n")
     (table.parent / "b.csv").unlink()
@@ -73,7 +73,7 @@ def test_a_table_without_a_record_and_one_that_is_gone_are_named(table, outcome)
     assert outcome() == (3, "tables: stale: data (a.csv: content)\n")
 
 
-def test_rows_without_keys_leave_the_state_not_known(table, outcome):
+def test_rows_without_keys_leave_the_state_undetermined(table, outcome):
     other = table.with_name("b.csv")
     other.write_text("rmse\n")
     record_tables([other], "make b", [], "rows of gru")
@@ -82,9 +82,7 @@ def test_rows_without_keys_leave_the_state_not_known(table, outcome):
     assert outcome() == (0, "tables: up to date\n")
 
 
-def test_keys_of_rows_that_stay_are_those_with_which_they_were_made(
-    place, table, outcome, monkeypatch
-):
+def test_unchanged_rows_retain_their_original_keys(place, table, outcome, monkeypatch):
     gru = {"gru": "train gru"}
     script = f"script {SCRIPT}"
     record_tables([table], "make a", [script], rows=RowKeys(gru | {"lstm": "train lstm"}, {}))
@@ -122,7 +120,7 @@ def test_a_trial_outside_results_is_not_recorded(tmp_path):
     assert not (tmp_path / PROVENANCE).exists()
 
 
-def test_a_record_without_the_raw_files_is_refused_and_the_former_one_stays(place, table):
+def test_records_without_raw_files_are_refused_and_the_former_record_stays(place, table):
     file = table.parent / PROVENANCE
     former = file.read_text()
     assert set(json.loads(former)["keys"]["a.csv: data mine"]) == {"code", "data"}
@@ -154,9 +152,7 @@ def test_keys_of_the_unseen_cars_can_be_recorded(tmp_path):
         assert today_of(f"report.md: {name}", tmp_path) is not None
 
 
-def test_commands_of_own_car_run_without_the_recordings_that_its_record_needs(
-    tmp_path, monkeypatch
-):
+def test_commands_of_the_car_benchmark_run_without_recordings_of_its_record(tmp_path, monkeypatch):
     monkeypatch.setenv("VEHEST_DATA", "recordings")
     environments = []
 

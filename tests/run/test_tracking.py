@@ -80,7 +80,7 @@ def _is_whole(client, run):
     )
 
 
-def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
+def test_runs_missed_by_an_absent_server_are_logged_by_the_next_run(place, monkeypatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
         _, err = place.done("run", "small")
@@ -120,7 +120,7 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypat
     assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
 
 
-def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place):
+def test_repeated_trainings_are_the_same_run_unless_the_outcome_differs(place):
     assert (place(*TRAIN)[0], place(*TRAIN, "--force")[0]) == (0, 0)
     [run] = _local(place, "train")
     tracker = Tracker({"name": "mlflow"}, place.folder / "outputs", pytest.fail)
@@ -141,7 +141,7 @@ def test_a_store_that_is_gone_is_filled_again(place):
 FULL = "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); vehest.cli.main()"
 
 
-def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place):
+def test_runs_untracked_because_of_a_full_disk_are_logged_by_the_next_run(place):
     assert place(*TRAIN, "tracking=none")[0] == 0
     full = _in_process(FULL, *TRAIN)
     assert full.returncode == 0, full.stderr
@@ -261,7 +261,7 @@ def test_training_goes_on_when_the_tracking_server_is_away(place):
     assert (err.count("logging to MLflow"), "going on without tracking" in err) == (1, True)
 
 
-def test_a_server_that_hears_and_never_answers_is_given_up(place, monkeypatch):
+def test_servers_that_never_answer_are_abandoned(place, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
@@ -316,7 +316,7 @@ def test_an_output_root_of_any_name_has_its_store(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a?b", "a%20b", "a\udcffb"])
-def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(tmp_path, name):
+def test_output_roots_invalid_for_mlflow_are_a_single_line(tmp_path, name):
     warnings = []
     output = tmp_path / name / "outputs"
     Tracker({"name": "mlflow"}, output, warnings.append).log(_small_artefact(tmp_path / "model"))
@@ -327,7 +327,7 @@ def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(
     assert not list(tmp_path.rglob("*.db*"))
 
 
-def test_a_store_that_links_to_itself_is_one_warning(tmp_path):
+def test_stores_that_link_to_themselves_are_a_single_warning(tmp_path):
     warnings = []
     output = tmp_path / "outputs"
     output.mkdir()

@@ -125,7 +125,7 @@ QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
 
 
 @pytest.mark.parametrize("name", [name for name in estimator_names() if name != "data_sheet"])
-def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
+def test_fit_fails_without_each_required_channel(name):
     config = compose_config("train", [f"estimator={name}", *QUICK.get(name, ())])
     estimator = new_estimator(config["estimator"])
     training = settings_from_config(estimator.training_type, config["training"], "training")
@@ -217,7 +217,7 @@ def test_every_transform_that_is_promised_makes_its_channel(channels, rate_hz):
 
 
 @pytest.mark.parametrize("channels", LOGS.values(), ids=list(LOGS))
-def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels):
+def test_supplying_all_missing_channels_makes_estimators_usable(channels):
     recording = log(channels)
     before = rows(recording)
     entries = {
@@ -253,7 +253,7 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
+def test_supplying_all_missing_settings_makes_estimators_usable(name):
     contents = [summary_of(log(FULL))]
     plain = usability(name, compose_config("train", [f"estimator={name}"]), contents)
     expected = "no" if name == "data_sheet" else "with settings"
@@ -342,7 +342,7 @@ def test_table_names_all_estimators_and_json_says_the_same(place):
     )
 
 
-def test_bare_file_is_told_by_its_columns(place):
+def test_bare_files_are_assessed_by_their_columns(place):
     lap = log({"vx", "yaw_rate", "ay"})
     table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
     table.to_csv("lap.csv", index=False)
@@ -377,7 +377,7 @@ def test_training_without_a_channel_is_refused_with_a_working_remedy(place):
     place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
 
 
-def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
+def test_unusable_candidates_are_listed_at_once_and_others_are_evaluated(place):
     add_logged(place, FULL - {"ax", "steer"})
     add_study(
         place,
@@ -491,7 +491,7 @@ def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     )
 
 
-def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
+def test_candidates_at_an_unavailable_rate_hide_no_other(place):
     add_logged(place, FULL)
     add_study(
         place,
@@ -550,7 +550,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
 
 
-def test_available_rates_are_kept_and_lowered_ones_explained():
+def test_available_rates_remain_and_lowered_rates_are_explained():
     def at(rate_hz):
         return RecordingSummary("lap", rate_hz, frozenset())
 
@@ -641,7 +641,7 @@ def test_plugins_that_fail_are_named_and_the_others_are_listed():
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
+def test_new_car_lists_requirements_of_plugins_without_a_settings_file(place):
     place.add_steered()
     logs = [f"raw/steered/{name}.csv" for name in ("first", "second")]
     said, _ = place.done("new", "my_car", *logs, "--yes")
@@ -658,7 +658,7 @@ def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
 
 @pytest.mark.usefixtures("plugins")
 @pytest.mark.parametrize("name", PLUGINS)
-def test_a_study_that_names_a_plugin_that_fails_is_one_line_and_trains_nothing(place, name):
+def test_studies_naming_a_broken_plugin_are_a_single_line_and_train_nothing(place, name):
     add_logged(place, FULL)
     place.done("ingest", "logged")
     place.change(f"conf/estimator/{name}.yaml", name=name)
@@ -669,7 +669,7 @@ def test_a_study_that_names_a_plugin_that_fails_is_one_line_and_trains_nothing(p
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
+def test_broken_study_modules_are_a_single_line(place):
     place.change(
         "pipelines/odd.yaml",
         study="odd",

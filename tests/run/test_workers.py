@@ -72,7 +72,7 @@ def until_stopped(should_stop, on_progress):
     return "best so far"
 
 
-def test_a_killed_worker_fails_its_own_task_alone(tmp_path):
+def test_killed_workers_fail_only_their_task(tmp_path):
     others_run = tmp_path / "others_run"
     other_failed = tmp_path / "other_failed"
     tasks = [

@@ -57,7 +57,7 @@ def mix(role, dataset="sim_bmw"):
     )
 
 
-def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_the_papers():
+def test_mix_of_manoeuvres_and_car_parameters_are_those_of_the_paper():
     roles = Counter(role_of(name) for name in source().drives)
     assert sum(roles.values()) == 216
     assert set(roles) == {"train", "validation", "test"}
@@ -147,7 +147,7 @@ def split(name):
     )
 
 
-def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_7():
+def test_splits_select_drives_by_name_and_the_limited_split_trains_below_7():
     for name in ("sim_bmw", "sim_bmw_limited"):
         parts = {
             "train": split(name).train,

@@ -223,7 +223,7 @@ def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
+def test_j_turn_reaches_the_configured_steady_turn(car):
     trip = moderate(car, "j-turn")
     motion = trip.motion
     drawn = trip.drawn
@@ -239,7 +239,7 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     assert reached - drawn["begin"] < drawn["steer_time"] + 0.3
 
 
-def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
+def test_spiral_tightens_slowly_to_both_sides_in_turn():
     trip = moderate("bmw_545i", "spiral")
     motion = trip.motion
     side = side_of(trip)
@@ -300,7 +300,7 @@ def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
     assert (trip.flags.completed, trip.flags.stood, trip.flags.left_road) == (True, True, False)
 
 
-def test_fast_lap_has_the_papers_mean_and_top_speed_and_says_what_is_reached():
+def test_fast_lap_has_the_papers_speeds_and_names_the_reachable_limit():
     # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan that has them exactly.
     trip = go("heavy_truck", name="fast_lap")
     duration = len(trip.motion) / 100.0
@@ -324,7 +324,7 @@ def oversteering():
     return replace(base, name="oversteering", overrides={**base.overrides, "tire_rear": rear})
 
 
-def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
+def test_spin_is_recorded_and_flagged_until_a_second_after_the_stand():
     trip = go(oversteering(), **SPINNING)
     flags = trip.flags
     motion = trip.motion

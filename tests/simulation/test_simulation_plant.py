@@ -392,7 +392,7 @@ def test_tyre_forces_account_for_all_accelerations(moment):
     assert np.abs(motion.ay).max() > 8.0
 
 
-def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
+def test_yaw_moment_turns_left_and_is_limited_by_the_brakes_of_a_side():
     plant = MultiBodyPlant(FERRARI)
     p = plant.parameters
     state = plant.initial_state(0.0, 0.0, 0.0, 30.0)
@@ -409,7 +409,7 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     )  # the tyres already resist
 
 
-def test_gravity_on_a_bank_pulls_alike_and_friction_halves_what_is_reached():
+def test_bank_pulls_all_masses_equally_and_half_friction_halves_grip():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
     plant = MultiBodyPlant(FERRARI)
     across = road_gravity(bank=0.1, grade=0.0)[1]
@@ -529,7 +529,7 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     assert away.spun  # it has been in a spin, whatever it does now
 
 
-def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_rolls_over():
+def test_rollovers_and_non_finite_states_are_errors():
     with pytest.raises(SimulationError, match="rolled over") as raised:
         turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
     assert raised.value.exit_code == 3

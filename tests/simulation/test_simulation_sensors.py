@@ -124,7 +124,7 @@ def differing_channels(first, second):
     return {name for name in first if not np.array_equal(first[name], second[name])}
 
 
-def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of_the_body():
+def test_ideal_sensors_measure_the_exact_motion():
     motion = weaving()
     channels = measure(motion, PRESETS["ideal"], seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
@@ -267,7 +267,7 @@ def test_delay_of_a_sine_is_its_phase(delay):
     )
 
 
-def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
+def test_delay_repeats_the_start_and_shifts_integer_samples_exactly():
     ramp = 5.0 + np.arange(50.0)
     delayed_ramp = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.03)), seed=0)["vx"]
     np.testing.assert_array_equal(delayed_ramp, np.concatenate([[5.0, 5.0, 5.0], ramp[:-3]]))
@@ -399,7 +399,7 @@ def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity(
     )  # nose going down: what is below goes back
 
 
-def test_reference_and_car_err_apart():
+def test_errors_of_reference_and_car_sensors_are_independent():
     channels = measure(
         motion_of(20_000, vx=20.0),
         only(vx=LOUD, yaw_rate=LOUD, reference=Reference("gnss", vx=LOUD, yaw_rate=LOUD)),
@@ -438,7 +438,7 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     assert differing_channels(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
-def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_other():
+def test_error_streams_of_sensors_are_independent():
     motion = motion_of(500, ay=3.0)
     ay = {
         kind: measure(motion, only(ay=level), seed=7)["ay"] - 3.0
@@ -482,13 +482,13 @@ def test_switching_off_takes_parts_wholes_and_kinds():
 @pytest.mark.parametrize(
     "name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""]
 )
-def test_switching_off_what_there_is_not_names_what_there_is(name):
+def test_switching_off_an_unknown_part_lists_the_parts(name):
     assert "cannot switch off" in refusal(
         lambda: switched_off(SensorLevels(), name), ConfigurationError
     )
 
 
-def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
+def test_seed_determines_every_sample_independent_of_the_duration():
     motion = weaving()
     first, again, second = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
     assert differing_channels(first, again) == set()
@@ -526,7 +526,7 @@ def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
         ),
     ],
 )
-def test_configurations_mean_what_they_say(spelt, meant):
+def test_sensor_configurations_are_parsed(spelt, meant):
     assert sensor_levels_from_config(yaml.safe_load(spelt)) == meant
 
 
@@ -553,13 +553,13 @@ def test_configurations_mean_what_they_say(spelt, meant):
         ),
     ],
 )
-def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt, said):
+def test_invalid_sensor_configurations_are_refused_in_a_single_line(spelt, said):
     assert said in refusal(
         lambda: sensor_levels_from_config(yaml.safe_load(spelt)), ConfigurationError
     )
 
 
-def test_density_is_found_beside_a_resonance_and_jolts():
+def test_noise_density_is_measured_despite_resonance_and_jolts():
     noise = measure(motion_of(60_000), only(ay=SensorLevel(noise=0.02)), seed=0)["ay"]
     assert noise_density(noise, 100.0) == pytest.approx(0.02, rel=0.05)
     shaken = noise + 0.3 * np.sin(2.0 * np.pi * 21.0 * np.arange(60_000) / 100.0)

@@ -93,7 +93,7 @@ def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
 
 
 @each_vehicle
-def test_grip_is_what_the_car_reaches_in_steady_state(name):
+def test_grip_is_the_steady_state_limit(name):
     plant = plant_of(name)
     assert ramp_of(name).ay.max() == pytest.approx(plant.grip, rel=0.055)
     assert ramp_steer(plant, 15.0).ay.max() == pytest.approx(plant.grip, rel=0.055)
@@ -215,7 +215,7 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
     ).read_text(encoding="utf-8")
 
 
-def test_overrides_reach_the_plant_and_cars_without_stated_shifts_pull_to_neither_side():
+def test_overrides_reach_the_plant_and_cars_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
         after = plant.advance(
@@ -309,7 +309,7 @@ def test_sideslip_stays_lower_with_control_than_without(name, friction):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
+def test_largest_moment_is_within_the_braking_limit_of_both_sides(name):
     plant = plant_of(name)
     rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
     forces = plant.motion(

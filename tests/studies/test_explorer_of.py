@@ -51,7 +51,7 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     assert np.isnan(found[lengths[0] : lengths[0] + 5]).all()
 
 
-def test_health_is_shown_at_the_rate_of_the_model_alone(tmp_path):
+def test_health_is_drawn_at_the_rate_of_the_model_only(tmp_path):
     drive = measured_drive(3)
     part, model = comparison_on(drive, tmp_path, RATE)
     pieces = list(pieces_of(SPANS, lambda span: drive, part.protocol))

@@ -120,7 +120,7 @@ def test_members_equal_training_each_alone(name):
     ("name", "one_by_one"),
     [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)],
 )
-def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one_by_one):
+def test_members_are_batched_where_torch_can_batch_every_layer(name, one_by_one):
     members, _ = fit(NETWORKS[name], [0, 1])
     assert (members[0].network in _UNBATCHABLE) is one_by_one
 
@@ -210,7 +210,7 @@ class Frozen(Perceptron):
         return super().forward(windows) + self.offset
 
 
-def test_frozen_parameters_and_buffers_stay_each_member_s_own():
+def test_frozen_parameters_and_buffers_stay_per_member():
     together, _ = fit(Frozen, [0, 1], learning_rate=1e-2)
     for seed, member in enumerate(together):
         with torch.random.fork_rng():

@@ -133,7 +133,7 @@ def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true
     assert off[:, 4].unique().numel() == len(off)
 
 
-def test_a_share_of_sequences_is_seen_in_a_mirror():
+def test_a_share_of_sequences_is_mirrored():
     learned = estimator()
     drives(learned)
     parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
@@ -159,7 +159,7 @@ def test_a_share_of_sequences_is_seen_in_a_mirror():
         assert is_mirrored == allowed
 
 
-def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its_starts():
+def test_truncated_training_keeps_estimates_and_cuts_gradients():
     learned = estimator()
     sequences = drives(learned)
     results = {}
@@ -200,7 +200,7 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     ) == pytest.approx(expected, rel=1e-9)
 
 
-def test_noise_starts_where_residuals_say_or_as_given():
+def test_noise_starts_from_residuals_or_settings():
     learned = estimator(dynamics="pacejka", noise="constant")
     parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
     learned.filter.to(torch.float64).begin_noise(parts, 0.0)

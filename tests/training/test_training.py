@@ -42,7 +42,7 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
+def test_batched_members_equal_separate_trainings_in_float64(name, config):
     settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
     together, records = _fit(name, config, [0, 1, 2, 3], settings)
     assert len({record.metrics["epochs"] for record in records}) > 1, (
@@ -120,7 +120,7 @@ def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
-def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error():
+def test_diverging_training_and_invalid_settings_are_clear_errors():
     for config, message in (
         ({"learning_rate": -1.0}, "learning_rate must be positive"),
         ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
@@ -272,7 +272,7 @@ def _loop_with_all_its_weights(averaging):
     return network, losses
 
 
-def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_reach_the_optimiser():
+def test_averaged_weights_match_a_plain_loop_and_never_reach_the_optimiser():
     settings = SupervisedSettings(dtype="float64", max_epochs=4, learning_rate=1e-2, averaging=0.9)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
     network, losses = _loop_with_all_its_weights(0.9)
@@ -285,7 +285,7 @@ def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_re
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
 
 
-def test_epoch_of_some_steps_validates_after_each_of_them_and_one_of_many_is_a_pass(monkeypatch):
+def test_epochs_of_n_steps_validate_after_n_steps_within_the_pass(monkeypatch):
     steps = []
     plain_step = supervised.Adam.step
     monkeypatch.setattr(

@@ -122,7 +122,7 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     assert torch.equal(_flat(uninterrupted), _flat(resumed))
 
 
-def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finished(tmp_path):
+def test_checkpoints_are_per_member_and_skip_finished_phases(tmp_path):
     first = _network()
     second = _network()
     records = train_phases(_two_phases(first), 3, FitContext([tmp_path]))
@@ -167,7 +167,7 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
         assert value.requires_grad
 
 
-def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
+def test_best_validation_is_selected_and_progress_counts_over_all_phases():
     network = _network()
     validated_epochs = []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])

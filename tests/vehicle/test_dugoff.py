@@ -73,7 +73,7 @@ def test_braking_loads_the_front_axle():
 
 
 @BOTH_CURVES
-def test_the_compiled_track_is_the_readable_one(tyres):
+def test_compiled_track_matches_the_readable_track(tyres):
     track = dugoff_track(tyres)
     readable = TorchModel(track.transition, track.observation)
     compiled = CompiledDugoffTrack(track)

@@ -59,7 +59,7 @@ def test_runge_kutta_is_an_independent_integrator(car):
     assert 10.0 < errors[0] / errors[1] < 24.0
 
 
-def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
+def test_rates_and_accelerations_of_a_rolling_car_match_the_equations(car):
     state = tensor(4.0, 0.0, 0.0, 4.0)
     inputs = tensor(0.0, 0.0)
     car_rates = rates(car, state, inputs)
@@ -81,7 +81,7 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     assert car_rates.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
 
 
-def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_for(car):
+def test_loads_carry_the_weight_and_curvature_parameters_are_optional(car):
     state = tensor(3.0, -0.6, 2.5, 3.4)
     inputs = tensor(0.2, 8.0)
     mirror = tensor(1.0, -1.0, -1.0, 1.0)
