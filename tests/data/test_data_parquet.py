@@ -90,8 +90,8 @@ def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_
         group = table.metadata.row_group(0)
         pages = sum(largest_page(stream, group.column(k)) for k in range(3))
     with use_limits(Limits(memory=2_400_000 + pages - 10 * size - 1)):
-        assert f"unpacks to {2_400_000 + pages} bytes" in (said := refused(zeros))
-        assert said.endswith("if that is meant, raise it: limits.memory=NUMBER")
+        assert f"unpacks to {2_400_000 + pages} bytes" in (message := refused(zeros))
+        assert message.endswith("if that is meant, raise it: limits.memory=NUMBER")
         assert set(read(zeros, "time", "vx")) == {"time", "vx"}
     file = written(tmp_path, {f"c{k}": [1.0] for k in range(300)})
     with use_limits(Limits(text_bytes=10_000)):

@@ -172,10 +172,10 @@ def test_unreadable_and_unwritable_files_are_refused_and_leave_nothing(tmp_path)
     assert (tmp_path / "file").read_text() == "not a folder"
 
 
-@pytest.mark.parametrize("kept", [1, 4, 200, -8, -1])
-def test_truncated_files_are_refused_in_a_single_line(tmp_path, kept):
+@pytest.mark.parametrize("n_bytes", [1, 4, 200, -8, -1])
+def test_truncated_files_are_refused_in_a_single_line(tmp_path, n_bytes):
     write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
-    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
+    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:n_bytes])
     assert "r.parquet' is truncated or damaged" in refusal(
         lambda: read_recording(tmp_path / "r.parquet")
     )

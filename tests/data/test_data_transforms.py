@@ -140,11 +140,11 @@ def test_outlier_removal_removes_planted_spikes_and_keeps_steps_and_ramps():
         np.mean(RemoveOutliers()(recorded(ay=noisy))["ay"] == noisy) > 0.99
     )  # six deviations of eleven normal samples: a few in 1000
     for wrong in ({"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}):
-        said = refusal(
+        message = refusal(
             lambda wrong=wrong: transform_from_config({"name": "remove_outliers", **wrong}),
             ConfigurationError,
         )
-        assert "greater than 0" in said
+        assert "greater than 0" in message
 
 
 @PROPERTY
@@ -255,7 +255,7 @@ def test_transforms_are_built_from_plain_values():
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
-    others = {
+    configurations = {
         "resample",
         "low_pass",
         "remove_outliers",
@@ -270,11 +270,11 @@ def test_transforms_are_built_from_plain_values():
         "sideslip_from_velocity",
         "scale_to_wheelbase",
     }
-    assert set(TRANSFORMS) == others | of_an_alignment | deriving
+    assert set(TRANSFORMS) == configurations | of_an_alignment | deriving
 
 
 @pytest.mark.parametrize(
-    ("config", "what"),
+    ("config", "message"),
     [
         ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
         ({"name": "low_pass"}, "transform 'low_pass': cutoff_hz"),
@@ -286,14 +286,14 @@ def test_transforms_are_built_from_plain_values():
         ({"name": "low_pass", "cutoff_hz": 5, "zero": 1}, "transform 'low_pass': "),
     ],
 )
-def test_misspelt_transforms_are_refused_in_a_single_line(config, what):
-    assert what in refusal(lambda: transform_from_config(config), ConfigurationError)
+def test_misspelt_transforms_are_refused_in_a_single_line(config, message):
+    assert message in refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
 
 
-def rolling(**shown):
+def rolling(**damages):
     """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
     time = np.arange(2000) / RATE
     u = 8.0 + 3.0 * np.sin(0.7 * time)
@@ -308,17 +308,17 @@ def rolling(**shown):
         "steer": steer,
         "ax": 2.1 * np.cos(0.7 * time),
         **wheels,
-    } | shown
+    } | damages
     gappy = frozenset(name for name, samples in channels.items() if np.isnan(samples).any())
     return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
 
 
 def damaged(value, *wheels, start=500, stop=650):
     """The same with some wheels that show another value for a while."""
-    whole, _ = rolling()
+    complete, _ = rolling()
     broken = {}
     for wheel in wheels:
-        broken[f"wheel_speed_{wheel}"] = np.array(whole[f"wheel_speed_{wheel}"])
+        broken[f"wheel_speed_{wheel}"] = np.array(complete[f"wheel_speed_{wheel}"])
         broken[f"wheel_speed_{wheel}"][start:stop] = value
     return rolling(**broken)
 
@@ -329,17 +329,19 @@ def test_speed_from_wheels_inverts_rolling_wheels():
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
     missing = np.full(2000, math.nan)
     assert "no wheel speed was measured" in refusal(lambda: WHEELS(rolling(yaw_rate=missing)[0]))
-    whole, u = rolling()
-    rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
+    complete, u = rolling()
+    rear = complete.select(["wheel_speed_rl", "wheel_speed_rr"])
     np.testing.assert_allclose(
         SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12
     )  # left and right make up for the track
-    one = whole.select(["wheel_speed_rl"])
+    single_wheel = complete.select(["wheel_speed_rl"])
     np.testing.assert_allclose(
-        SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12
+        SpeedFromWheels(wheel_radius=0.48)(single_wheel)["vx"],
+        0.48 * complete["wheel_speed_rl"],
+        atol=1e-12,
     )
     assert "has no wheel speed to make vx of" in refusal(
-        lambda: SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
+        lambda: SpeedFromWheels(wheel_radius=0.48)(complete.select(["yaw_rate"]))
     )
 
 
@@ -373,9 +375,11 @@ def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter(
     amplitude = 3.0 * 2 * np.pi * frequency
     late = math.sqrt(2.0) / (2.0 * np.pi * 5.0) + 0.5 / rate
     for direction, delay in (("zero_phase", 0.0), ("causal", late)):
-        made = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)
+        derived = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)
         expected = amplitude * np.cos(2 * np.pi * frequency * (time - delay))
-        np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
+        np.testing.assert_allclose(
+            derived["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude
+        )
     causal = AccelerationFromSpeed()
     np.testing.assert_array_equal(causal(drive.cut(0.0, 9.0))["ax"], causal(drive)["ax"][:900])
     assert "cutoff_hz must lie below half of 100 Hz" in refusal(
@@ -386,22 +390,24 @@ def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter(
 def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
     angle = np.deg2rad(np.array([-58.0, -3.0, 0.0, 12.0]))
     drive = recorded(vx=np.array([5.0, 20.0, 30.0, 10.0]), sideslip_ref=angle)
-    there = VelocityFromSideslip()(drive)
-    np.testing.assert_allclose(there["vy_ref"], drive["vx"] * np.tan(angle))
-    back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
+    with_velocity = VelocityFromSideslip()(drive)
+    np.testing.assert_allclose(with_velocity["vy_ref"], drive["vx"] * np.tan(angle))
+    back = SideslipFromVelocity()(with_velocity.select(["vx", "vy_ref"]))
     np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
     assert "less than 90 degrees" in refusal(
         lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
     )
-    standing = VelocityFromSideslip()(
+    at_standstill = VelocityFromSideslip()(
         recorded(vx=np.array([0.01, 0.05, 20.0]), sideslip_ref=np.array([3.1, 0.2, 0.1]))
     )
-    np.testing.assert_allclose(standing["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)])
+    np.testing.assert_allclose(
+        at_standstill["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)]
+    )
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
-    made = VelocityFromSideslip()(drive)
-    assert "vy_ref" in made.gappy
-    np.testing.assert_array_equal(np.isnan(made["vy_ref"]), [False, True, False])
+    derived = VelocityFromSideslip()(drive)
+    assert "vy_ref" in derived.gappy
+    np.testing.assert_array_equal(np.isnan(derived["vy_ref"]), [False, True, False])
 
 
 def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
@@ -464,9 +470,9 @@ def test_excessive_requests_are_refused_by_the_name_of_the_limit(config, limit):
 
 
 def test_chunked_and_spectral_computations_equal_the_direct_computation(monkeypatch):
-    whole = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
+    direct = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
     monkeypatch.setattr(transforms, "VALUES_AT_ONCE", 40)
-    np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)
+    np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], direct)
     low_pass = LowPass(2.0, design="fir", reach=50.0)
     through_spectra = low_pass(lap(n_samples=12_000))["ay"]
     monkeypatch.setattr(transforms, "MAX_DIRECT_TAPS", 20_000)

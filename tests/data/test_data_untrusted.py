@@ -45,13 +45,13 @@ class Kinds:
 
 
 def test_plain_values_become_dataclasses_that_may_take_further_keys():
-    given = {
+    values = {
         "names": ["a"],
         "inner": [{"gain": 1}, None],
         "pair": [0, "b"],
         "maps": {"c": {"d": {"gain": 0.5, "steps": 4}}},
     }
-    assert validated(Kinds, given, "'f'") == Kinds(
+    assert validated(Kinds, values, "'f'") == Kinds(
         ("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}}
     )
 
@@ -195,16 +195,16 @@ def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more()
 
 @given(st.text(max_size=300))
 def test_file_names_stay_a_single_path_component(name):
-    made = file_name(name, ".csv")
-    assert Path(made).name == made
-    assert not made.startswith(".")
-    assert len(made.encode()) < 140
-    assert made == file_name(name, ".csv")
+    escaped = file_name(name, ".csv")
+    assert Path(escaped).name == escaped
+    assert not escaped.startswith(".")
+    assert len(escaped.encode()) < 140
+    assert escaped == file_name(name, ".csv")
 
 
 @given(st.text(max_size=40), st.text(max_size=40))
-def test_different_names_stay_different(one, other):
-    assert (file_name(one) == file_name(other)) == (one == other)
+def test_different_names_stay_different(first, second):
+    assert (file_name(first) == file_name(second)) == (first == second)
 
 
 def test_plain_names_stay_and_terminal_escapes_are_printed():

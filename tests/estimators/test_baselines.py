@@ -81,8 +81,8 @@ def test_prior_map_is_the_static_map_with_prior_parameters():
         model = new("self_calibrating", wheelbase=wheelbase)
         assert model.prior[0][6] == pytest.approx(compliance)  # the mean of C
         assert model.rear == pytest.approx(0.48 * wheelbase)
-    given = new("prior_map", wheelbase=2.7, cg_to_rear_axle=1.1)
-    (estimate,) = given.estimate([drive.without_references()])
+    prior_map = new("prior_map", wheelbase=2.7, cg_to_rear_axle=1.1)
+    (estimate,) = prior_map.estimate([drive.without_references()])
     r = drive["yaw_rate"]
     np.testing.assert_allclose(estimate["vy"], r * (1.1 - 0.0045 * drive["vx"] ** 2), atol=1e-12)
     with pytest.raises(ConfigurationError, match="between 0 and the wheelbase"):

@@ -33,13 +33,13 @@ def test_learned_filters_compile_until_their_code_is_cached(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    "where",
+    "module_name",
     sorted(
         {SLOW_KERNEL, *(estimator_class(name).slow_kernel for name in estimator_names())} - {""}
     ),
 )
-def test_slow_kernels_are_entries_that_are_there(where):
-    module, _, name = where.partition(":")
+def test_slow_kernels_are_entries_that_are_there(module_name):
+    module, _, name = module_name.partition(":")
     assert hasattr(getattr(importlib.import_module(module), name), "stats")
 
 

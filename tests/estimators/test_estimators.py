@@ -25,7 +25,7 @@ fitted_once = cache(fitted)
 OF_A_DTYPE = [
     name
     for name in estimator_names()
-    if "dtype" in {own.name for own in fields(estimator_class(name).training_type)}
+    if "dtype" in {field.name for field in fields(estimator_class(name).training_type)}
 ]
 
 
@@ -181,8 +181,8 @@ def test_recordings_start_from_individual_or_shared_states(monkeypatch, drive):
     estimates = estimator.estimate([drive, drive], states)
     for state, estimate in zip(states, estimates, strict=True):
         assert np.array_equal(estimate["vy"], estimator.estimate([drive], state)[0]["vy"])
-    from_one_state = estimator.estimate([drive, drive], states[0])
-    assert np.array_equal(from_one_state[0]["vy"], from_one_state[1]["vy"])
+    from_shared_state = estimator.estimate([drive, drive], states[0])
+    assert np.array_equal(from_shared_state[0]["vy"], from_shared_state[1]["vy"])
     assert "2 initial states for 1 recordings" in refusal(
         lambda: estimator.estimate([drive], states)
     )

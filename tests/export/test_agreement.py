@@ -17,25 +17,27 @@ IN_FAULTS = 1e-7  # of bands beside faults: Python's own covariances lose digits
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("faults", [False, True], ids=["vectors", "faults"])
 def test_double_agrees_with_python_in_values_and_reasons(tmp_path, family, faults):
-    largest, others = Export(family, "double", tmp_path).agreement(faults=faults)
+    largest, n_different = Export(family, "double", tmp_path).agreement(faults=faults)
     assert largest[:2].max() <= TOLERANCES["double"]
     assert largest[2:].max() <= (IN_FAULTS if faults else TOLERANCES["double"])
-    assert others == 0
+    assert n_different == 0
 
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name not in NOT_IN_FLOAT])
 def test_float_agrees_to_a_millimetre_a_second_on_the_vectors(tmp_path, family):
-    largest, others = Export(family, "float", tmp_path).agreement()
+    largest, n_different = Export(family, "float", tmp_path).agreement()
     assert largest[:2].max() <= TOLERANCES["float"]
-    assert others <= 0.01 * len((tmp_path / "expected.csv").read_text().splitlines())
+    assert n_different <= 0.01 * len((tmp_path / "expected.csv").read_text().splitlines())
 
 
 @pytest.mark.parametrize("bus_rate_hz", [100.0, 250.0, 1000.0 / 3.0])
 @pytest.mark.parametrize("faults", [False, True], ids=["vectors", "faults"])
 def test_the_front_end_passes_on_the_same_rows_at_the_same_samples(tmp_path, bus_rate_hz, faults):
-    largest, others = Export("kinematic", "double", tmp_path, bus_rate_hz).agreement(faults=faults)
+    largest, n_different = Export("kinematic", "double", tmp_path, bus_rate_hz).agreement(
+        faults=faults
+    )
     assert largest.max() <= TOLERANCES["double"]
-    assert others == 0
+    assert n_different == 0
 
 
 @pytest.mark.parametrize("family", ["kinematic", "dugoff_ukf", "ksnn"])
@@ -44,9 +46,9 @@ def test_a_model_that_was_never_calibrated_has_the_limits_of_any_car_and_no_band
     assert not (tmp_path / "vehest_health.c").exists()
     export.build("gcc", "-O2")
     export.vectors(faults=True)
-    largest, others = export.differences(["./main"])
+    largest, n_different = export.differences(["./main"])
     assert largest[:2].max() <= TOLERANCES["double"]
-    assert others == 0
+    assert n_different == 0
     assert np.isnan(np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)[:, 2:4]).all()
 
 

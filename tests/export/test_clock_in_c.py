@@ -46,9 +46,9 @@ def test_every_clock_fault_has_the_same_health_and_reason_as_in_python(tmp_path,
     export.build("gcc", "-O1")
     for kind in FAULTS + RATE_FAULTS + HARMLESS:
         first = stamped(export, kind)
-        largest, others = export.differences(["./main"])
+        largest, n_different = export.differences(["./main"])
         assert largest[:2].max() <= TOLERANCES["double"], kind
-        assert others == 0, kind
+        assert n_different == 0, kind
         if kind == "constant":
             out = np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)
             calls = round(0.2 * export.stepper().input_rate_hz)
@@ -61,6 +61,6 @@ def test_behind_the_front_end_clock_faults_agree_too(tmp_path, kind):
     export = Export("kinematic", "double", tmp_path, 250.0).write()
     export.build("gcc", "-O1")
     stamped(export, kind)
-    largest, others = export.differences(["./main"])
+    largest, n_different = export.differences(["./main"])
     assert largest.max() <= TOLERANCES["double"]
-    assert others == 0
+    assert n_different == 0

@@ -41,13 +41,13 @@ def test_export_replaces_only_an_earlier_export(tmp_path):
     assert "holds 'mine.c', which is no part of an export" in refusal(
         lambda: export_model(model("zero"), None, out), ConfigurationError
     )
-    other = tmp_path / "project"
-    other.mkdir()
-    (other / "main.c").write_text("int main(void) { return 0; }")
+    foreign = tmp_path / "project"
+    foreign.mkdir()
+    (foreign / "main.c").write_text("int main(void) { return 0; }")
     assert "holds 'main.c'" in refusal(
-        lambda: export_model(model("zero"), None, other), ConfigurationError
+        lambda: export_model(model("zero"), None, foreign), ConfigurationError
     )
-    assert [path.name for path in other.iterdir()] == ["main.c"]
+    assert [path.name for path in foreign.iterdir()] == ["main.c"]
 
 
 @pytest.mark.parametrize(
@@ -65,12 +65,12 @@ def test_refused_exports_leave_nothing(tmp_path, options, words):
 
 
 def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(tmp_path):
-    own = trust("kalman")
-    health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
+    kalman_trust = trust("kalman")
+    health = replace(kalman_trust.health, deviation=(*kalman_trust.health.deviation[:-1], 1e-9))
     with pytest.raises(
         ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"
     ):
-        export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
+        export_model(model("kalman"), replace(kalman_trust, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
     assert "cannot be exported" in refusal(
         lambda: export_model(fitted("factor_graph"), None, tmp_path / "c"), ConfigurationError

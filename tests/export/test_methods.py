@@ -73,8 +73,8 @@ pytestmark = [
 each_variant = pytest.mark.parametrize(
     "variant",
     VARIANTS,
-    ids=lambda own: "-".join(
-        [own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)]
+    ids=lambda variant: "-".join(
+        [variant[0], *(f"{key}={value}" for key, value in variant[1].items() if key not in TRACK)]
     ),
 )
 Case = namedtuple(
@@ -89,10 +89,14 @@ def case_of(name, config):
 
 @cache
 def _case(name, config):
-    given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
-    estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
+    settings = next(
+        variant for family, variant in VARIANTS if family == name and repr(variant) == config
+    )
+    estimator = (
+        of_dugoff(name, settings) if name in ON_DUGOFF else fitted(name, "float32", **settings)
+    )
     on_dugoff = name in ON_DUGOFF and np.stack(
-        [dugoff_channels()[own] for own in estimator.channels], axis=1
+        [dugoff_channels()[variant] for variant in estimator.channels], axis=1
     )
     rows = on_dugoff if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
@@ -145,10 +149,10 @@ def dugoff_channels():
 
 def widened(estimator):
     """The same weights, computed in float64."""
-    own = copy.deepcopy(estimator)
-    if isinstance(own, Network):
-        own.network = own.network.double()
-    return own
+    double = copy.deepcopy(estimator)
+    if isinstance(double, Network):
+        double.network = double.network.double()
+    return double
 
 
 def disturbed(estimator, rows):
@@ -158,12 +162,12 @@ def disturbed(estimator, rows):
     for name in estimator.skippable:
         if name in estimator.channels:
             rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
-    needed = [
+    required = [
         column for column, name in enumerate(estimator.channels) if name not in estimator.skippable
     ]
     at = 2 * len(rows) // 3
-    if needed and estimator.refuses:
-        rows[at, needed[0]] = np.nan
+    if required and estimator.refuses:
+        rows[at, required[0]] = np.nan
     elif isinstance(estimator, WindowedEstimator):
         rows[at, 0] = np.nan  # it leaves the window again
     if "infinite" in estimator.refuses:
@@ -178,26 +182,26 @@ def stepped(estimator, rows):
     stepper = estimator.online()
     for k, row in enumerate(rows):
         try:
-            found = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
+            estimate = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
         except DataError:
             fine[k] = False
             stepper = estimator.online()
             continue
-        out[k] = [found.get(name, np.nan) for name in OUTPUTS]
+        out[k] = [estimate.get(name, np.nan) for name in OUTPUTS]
     return out, fine
 
 
 def check(library, estimator, rows, largest):
-    said, fine = library(rows)
-    wanted, stepped_fine = stepped(estimator, rows)
+    outputs, fine = library(rows)
+    expected, stepped_fine = stepped(estimator, rows)
     np.testing.assert_array_equal(fine, stepped_fine)
-    said[~fine] = np.nan
-    np.testing.assert_array_equal(np.isnan(said), np.isnan(wanted))
-    assert np.isfinite(wanted[:, 0]).sum() > 0.4 * len(rows)
-    np.testing.assert_allclose(said[:, :3], wanted[:, :3], rtol=0.0, atol=largest)
+    outputs[~fine] = np.nan
+    np.testing.assert_array_equal(np.isnan(outputs), np.isnan(expected))
+    assert np.isfinite(expected[:, 0]).sum() > 0.4 * len(rows)
+    np.testing.assert_allclose(outputs[:, :3], expected[:, :3], rtol=0.0, atol=largest)
     np.testing.assert_allclose(
-        said[:, 3],
-        wanted[:, 3],
+        outputs[:, 3],
+        expected[:, 3],
         rtol=3e-3 if library.precision == "float" else 1e-7,
         atol=largest * 1e-2,
     )
@@ -243,8 +247,8 @@ def rows_at_low_speed(estimator):
 
 @pytest.mark.parametrize(
     "config",
-    [own for family, own in VARIANTS if family == "self_calibrating"],
-    ids=lambda own: "-".join(own) or "default",
+    [variant for family, variant in VARIANTS if family == "self_calibrating"],
+    ids=lambda variant: "-".join(variant) or "default",
 )
 @each_precision
 def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
@@ -258,17 +262,17 @@ def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
 @pytest.mark.parametrize(
     "variant",
-    [own for own in VARIANTS if own[0] not in ("zero", "static_map")][::3],
-    ids=lambda own: own[0],
+    [variant for variant in VARIANTS if variant[0] not in ("zero", "static_map")][::3],
+    ids=lambda variant: variant[0],
 )
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_clang_takes_it_without_a_warning_and_computes_the_same(variant, precision, tmp_path):
     case = case_of(*variant)
-    said = [
+    outputs = [
         built(case.estimator, precision, tmp_path, compiler)(case.rows)[0]
         for compiler in ("clang", COMPILERS[0])
     ]
-    np.testing.assert_allclose(*said, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
+    np.testing.assert_allclose(*outputs, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
 
 
 def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(
@@ -342,11 +346,11 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
     rows = disturbed(hard, drive_for(hard).stack(hard.channels))[:200].copy()
     rows[:, 1:5] *= 3.0
     stepper = widened(hard).online()
-    wanted = []
+    expected = []
     repaired = 0
     lifted = 0
     for row in rows:
-        wanted.append(
+        expected.append(
             list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3]
         )
         tape = stepper._filter._tape
@@ -354,8 +358,8 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
         lifted = lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
     assert repaired > 20
     assert lifted > 0
-    said, _ = built(hard, "double", tmp_path)(rows)
-    np.testing.assert_allclose(said[:, [1, 0, 2]], wanted, rtol=0.0, atol=1e-6)
+    outputs, _ = built(hard, "double", tmp_path)(rows)
+    np.testing.assert_allclose(outputs[:, [1, 0, 2]], expected, rtol=0.0, atol=1e-6)
 
 
 def ferrari_rows(data_root, estimator, first=550.0, last=700.0):

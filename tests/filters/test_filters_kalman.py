@@ -49,7 +49,7 @@ def tensors(parts):
     return type(parts)(*map(torch.from_numpy, parts))
 
 
-def dense_posterior(model, measurements, initial, n_seen):
+def dense_posterior(model, measurements, initial, n_measured):
     """Mean and covariance of all states at once, given the measurements of the first samples; and their log-density.
 
     Written down as one normal distribution of x[0], w[0], w[1], … and v[0], v[1], …: no recursion.
@@ -71,7 +71,7 @@ def dense_posterior(model, measurements, initial, n_seen):
     y_mean = H @ f + d.ravel()
     y_cov = H @ prior @ H.T + np.diag(R.ravel())
     is_measured = ~np.isnan(measurements)
-    is_measured[n_seen:] = False
+    is_measured[n_measured:] = False
     rows = np.flatnonzero(is_measured.ravel())
     S = y_cov[np.ix_(rows, rows)]
     cross = (prior @ H.T)[:, rows]

@@ -26,9 +26,9 @@ def main():
     from fuzz.runner import Fuzzer, described, summary, write_rows
     from vehest.run.table_records import record_tables
 
-    with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as made:
+    with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as scratch:
         started = time.monotonic()
-        folder = Path(options.folder) if options.folder else Path(made)
+        folder = Path(options.folder) if options.folder else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         fuzzer = Fuzzer(
             folder, options.seed, options.family, keep=bool(options.folder), seconds=options.seconds

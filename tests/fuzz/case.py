@@ -105,20 +105,22 @@ def load_families():
     """Import every module of `fuzz.families`, which registers its generators."""
     from fuzz import families
 
-    for module in sorted(pkgutil.iter_modules(families.__path__), key=lambda one: one.name):
+    for module in sorted(
+        pkgutil.iter_modules(families.__path__), key=lambda module_info: module_info.name
+    ):
         importlib.import_module(f"{families.__name__}.{module.name}")
 
 
 def schedule(chosen):
     """The generators in the order in which they take turns; heavier ones come more than once a round."""
     return [
-        one
-        for turn in range(max(one.weight for one in chosen))
-        for one in chosen
-        if one.weight > turn
+        generator
+        for turn in range(max(generator.weight for generator in chosen))
+        for generator in chosen
+        if generator.weight > turn
     ]
 
 
-def is_honest(one, position, visit):
+def is_honest(generator, position, visit):
     """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
-    return one.family != PLANTED and (visit + position) % 8 == 0
+    return generator.family != PLANTED and (visit + position) % 8 == 0

@@ -56,26 +56,26 @@ JSON = (
 def spoil_bytes(content, rng):
     """Flip, cut, repeat, overwrite or insert, once or a few times: anywhere, near the head or near the end."""
     data = bytearray(content)
-    where = rng.choice(["anywhere", "anywhere", "head", "end"])
+    region = rng.choice(["anywhere", "anywhere", "head", "end"])
     for _ in range(rng.choice([1, 1, 1, 2, 3, 8])):
         size = len(data)
         if not size:
             break
-        near = size if where == "anywhere" else min(size, 500)
-        at = (size - near if where == "end" else 0) + rng.randrange(near)
+        near = size if region == "anywhere" else min(size, 500)
+        at = (size - near if region == "end" else 0) + rng.randrange(near)
         length = rng.choice([1, 2, 4, 8, 16, 100, 1000])
-        how = rng.randrange(7)
-        if how == 0:
+        kind = rng.randrange(7)
+        if kind == 0:
             data[at] ^= 1 << rng.randrange(8)
-        elif how == 1:
+        elif kind == 1:
             del data[at:]
-        elif how == 2:
+        elif kind == 2:
             del data[at : at + length]
-        elif how == 3:
+        elif kind == 3:
             data[at:at] = rng.randbytes(length)
-        elif how == 4:
+        elif kind == 4:
             data[at : at + length] = rng.choice([b"\0", b"\xff"]) * min(length, size - at)
-        elif how == 5:
+        elif kind == 5:
             data[at:at] = data[at : at + length] * rng.choice([1, 2, 50])
         else:
             number = rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1])
@@ -104,21 +104,21 @@ def spoil_tree(tree, rng, yaml_text=False):
             return hostile(rng, yaml_text)
         holder = rng.choice(holders)
         key = rng.choice(list(holder)) if isinstance(holder, dict) else rng.randrange(len(holder))
-        how = rng.randrange(9)
-        if how == 0:
+        kind = rng.randrange(9)
+        if kind == 0:
             del holder[key]
-        elif how == 1 and isinstance(holder, dict):
+        elif kind == 1 and isinstance(holder, dict):
             holder[rng.choice([*NAMES, 1, None, True, f"{key}x", "defaults", "_target_"])] = (
                 holder.pop(key)
             )
-        elif how == 1:
+        elif kind == 1:
             holder.extend(copy.deepcopy(holder[key]) for _ in range(rng.choice([1, 100, 5000])))
-        elif how == 2:
+        elif kind == 2:
             for _ in range(rng.choice([1, 1, 70, 150])):
                 holder[key] = rng.choice([[holder[key]], {"a": holder[key]}])
-        elif how == 3 and isinstance(holder[key], int | float):
+        elif kind == 3 and isinstance(holder[key], int | float):
             holder[key] = rng.choice([-1, 0, 1e-9, 1e9, 1e18, 10]) * holder[key]
-        elif how == 4:
+        elif kind == 4:
             holder[key] = str(holder[key])
         else:
             holder[key] = hostile(rng, yaml_text)
@@ -206,20 +206,20 @@ def _bomb(rng):
 
 def spoil_yaml(tree, rng, *, bombs=True):
     """A YAML file with a spoilt tree, spoilt text, or, if ``bombs``, something that explodes in it."""
-    how = rng.random()
-    if how < 0.6:
+    draw = rng.random()
+    if draw < 0.6:
         return yaml_of(spoil_tree(tree, rng, yaml_text=True)).encode("utf-8", "surrogatepass")
-    if bombs and how < 0.7 and isinstance(tree, dict):
+    if bombs and draw < 0.7 and isinstance(tree, dict):
         return "".join(rng.sample([_bomb(rng), yaml_of(tree)], 2)).encode()
-    if how < 0.77:
+    if draw < 0.77:
         return yaml_of(hostile(rng, True)).encode("utf-8", "surrogatepass")
     return spoil_text(yaml_of(tree), rng)
 
 
 def spoil_json(content, rng):
     """A JSON file with a spoilt tree, spoilt text, or something too deep in it."""
-    how = rng.random()
+    draw = rng.random()
     tree = json.loads(content)
-    if how < 0.6:
+    if draw < 0.6:
         return json_of(spoil_tree(tree, rng)).encode("utf-8", "surrogatepass")
-    return rng.choice(JSON).encode() if how < 0.7 else spoil_text(json_of(tree), rng)
+    return rng.choice(JSON).encode() if draw < 0.7 else spoil_text(json_of(tree), rng)

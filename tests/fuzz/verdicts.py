@@ -53,8 +53,8 @@ def judge(case, command, outcome):
 
 
 def _findings(case, command, outcome):
-    made = [path for path in outcome.changed if Path(path).name == CANARY]
-    yield from (("executed", f"made {path}") for path in made)
+    canaries = [path for path in outcome.changed if Path(path).name == CANARY]
+    yield from (("executed", f"made {path}") for path in canaries)
     for verdict in ("executed", "outside"):
         yield from (event for event in outcome.events if event[0] == verdict)
     yield from (
@@ -126,7 +126,7 @@ def _is_allowed(path, case, command):
 
 def snapshot(folder):
     """Everything below a folder, with what would change if it were written to; logs are left out, links not followed."""
-    found = {}
+    states = {}
     pending = [str(folder)]
     while pending:
         inside = pending.pop()
@@ -140,13 +140,13 @@ def snapshot(folder):
                 continue
             about = entry.stat(follow_symlinks=False)
             is_folder = stat.S_ISDIR(about.st_mode)
-            found[path] = (
+            states[path] = (
                 about.st_mode,
                 None if is_folder else (about.st_size, about.st_mtime_ns, about.st_ino),
             )
             if is_folder:
                 pending.append(entry.path)
-    return found
+    return states
 
 
 def differences(before, after):

@@ -118,8 +118,8 @@ class Watch:
             caller, ("multiprocessing.", "concurrent.futures.")
         ):
             return
-        what = arguments[1] if event == "compile" else arguments[0]
-        code = getattr(what, "co_filename", None) or what
+        subject = arguments[1] if event == "compile" else arguments[0]
+        code = getattr(subject, "co_filename", None) or subject
         if (
             self._reads
             and event == "exec"
@@ -172,10 +172,10 @@ class Watch:
             self._note("outside", f"{event} {real[:160]}")
             raise PermissionError(1, "this is outside of the sandbox", real)
 
-    def _note(self, verdict, what):
+    def _note(self, verdict, subject):
         if self._noted < 20:
             self._noted += 1
-            os.write(self._report, (json.dumps([verdict, what]) + "\n").encode())
+            os.write(self._report, (json.dumps([verdict, subject]) + "\n").encode())
 
 
 HARMLESS_IMPORTS = ("pyspark",)

@@ -50,8 +50,8 @@ def hour_of_driving():
         )
     columns["x"], columns["y"] = reckoned_course(vx, vy, yaw_rate, 1.0 / RATE)
     looks = [
-        {"label": title, "colour": own, "dark": on_dark(own), "dash": "solid"}
-        for title, own in zip(titles, COLOURS, strict=True)
+        {"label": title, "colour": colour, "dark": on_dark(colour), "dash": "solid"}
+        for title, colour in zip(titles, COLOURS, strict=True)
     ]
     content = {
         "start": 0.0,
@@ -67,7 +67,7 @@ def hour_of_driving():
     errors = [float(np.sqrt(np.mean((columns[f"vy{i}"] - vy) ** 2))) for i in range(len(COLOURS))]
     frame = pd.DataFrame({"title": titles, "error": errors})
     frame = frame.assign(low=0.8 * frame["error"], high=1.3 * frame["error"], interval="as drawn")
-    shown = {
+    panels = {
         "title": Column("estimator"),
         "error": Column("RMSE(v) [m/s]"),
         "interval": Column("interval", bar=("error", "low", "high")),
@@ -79,7 +79,7 @@ def hour_of_driving():
     return Document(
         "An hour",
         [
-            Table("board", "Board.", frame, shown, links),
+            Table("board", "Board.", frame, panels, links),
             Figure("traces", "Traces.", static, explorer),
         ],
     )

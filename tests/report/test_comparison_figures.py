@@ -68,7 +68,9 @@ def test_band_covers_its_half_width_about_the_estimate_and_is_in_the_legend():
         (figure.axes[0], estimate.sideslip, 0.5),
         (figure.axes[2], estimate.vy, 0.25),
     ):
-        (area,) = [own for own in axes.collections if isinstance(own, PolyCollection)]
+        (area,) = [
+            collection for collection in axes.collections if isinstance(collection, PolyCollection)
+        ]
         corners = area.get_paths()[0].vertices
         at_start = corners[corners[:, 0] == TIME[50], 1]
         assert (at_start.min(), at_start.max()) == pytest.approx(

@@ -72,9 +72,9 @@ def open_appendices(driver):
 
 def press(driver, text):
     (button,) = [
-        own
-        for own in driver.find_elements("css selector", ".views button, .filters button")
-        if own.text == text
+        toggle
+        for toggle in driver.find_elements("css selector", ".views button, .filters button")
+        if toggle.text == text
     ]
     button.click()
 
@@ -101,10 +101,10 @@ def test_errors_over_filtered_rows_follow_the_signals(chromium, toy):
     )
     assert f"{rows.sum()} of" in chromium.find_element("css selector", ".said").text
     press(chromium, "all rows")
-    shown = board(chromium)
-    assert len(shown) == len(FAMILIES)
+    figures = board(chromium)
+    assert len(figures) == len(FAMILIES)
     for row in ranked.to_dict("records"):
-        assert shown[row["title"]] == pytest.approx(
+        assert figures[row["title"]] == pytest.approx(
             (row["rmse_sideslip_chosen"], row["rmse_vy"]), abs=1e-3
         )
 
@@ -115,12 +115,12 @@ def test_browser_unpacks_the_packed_columns(chromium, toy):
     (explorer,) = [
         block.interactive for block in document.blocks if getattr(block, "interactive", "")
     ]
-    known = unpacked(json.loads(explorer))
+    columns = unpacked(json.loads(explorer))
     for name in ("vx", "vy", "vy2", "x"):
         read = chromium.execute_script(
             f"return [...document.querySelector('figure.live').explorer.columns['{name}']]"
         )
-        assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)
+        assert np.array(read, dtype=float) == pytest.approx(columns[name], abs=1e-12, nan_ok=True)
 
 
 def test_all_traces_zoom_together_and_back(chromium, hour):
@@ -133,7 +133,7 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
     }.items():
         if text:
             press(chromium, text)
-        assert all(shown == pytest.approx(view) for shown in views(chromium))
+        assert all(current == pytest.approx(view) for current in views(chromium))
 
 
 def test_dragging_over_a_trace_zooms_all(chromium, hour):
@@ -188,13 +188,13 @@ def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium, to
         return chromium.execute_script("return getComputedStyle(document.body).backgroundColor")
 
     grounds = {"light": "rgb(255, 255, 255)", "dark": "rgb(26, 26, 26)"}
-    other = SCHEMES[scheme == "light"]
+    opposite = SCHEMES[scheme == "light"]
     assert paper() == grounds[scheme]
     chromium.find_element("id", "theme").click()
-    assert paper() == grounds[other]
+    assert paper() == grounds[opposite]
     image = chromium.find_element("css selector", "#figure-forest_test img")
     assert (
-        image.value_of_css_property("color-scheme") == other
+        image.value_of_css_property("color-scheme") == opposite
     )  # by which an SVG image picks its colours
     chromium.execute_script("localStorage.clear()")
 
@@ -234,18 +234,18 @@ def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folde
     opened(chromium, tmp_path / "report.html", width=390)
     assert chromium.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     opened(chromium, tmp_path / "report.html", width=1280)
-    shown = chromium.execute_script("return document.querySelector('main').innerText")
+    text = chromium.execute_script("return document.querySelector('main').innerText")
     assert all(
-        words in shown
+        words in text
         for words in ("Verdict", "Recommended: KS-NN", "95 % interval", "vehest export")
     )
-    assert "FVU" not in shown
-    assert len(shown.split()) <= 1500
+    assert "FVU" not in text
+    assert len(text.split()) <= 1500
     assert chromium.execute_script(CUT) == []
     gaps = "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) => line.includes(null))"
     assert all(chromium.execute_script(gaps))
     first = "return document.querySelector('figure.live').explorer.detail.label"
-    assert f"Recommended: {chromium.execute_script(first)}, expected" in shown
+    assert f"Recommended: {chromium.execute_script(first)}, expected" in text
     open_appendices(chromium)
     assert "FVU" in chromium.execute_script("return document.querySelector('main').innerText")
     assert chromium.execute_script(CUT) == []
@@ -271,7 +271,7 @@ def test_legend_names_the_lines_and_the_reference_lies_below_the_estimates(chrom
 
 def test_strip_of_sensor_health_has_a_legend(chromium, hour):
     opened(chromium, hour)
-    heads = [own.text for own in chromium.find_elements("css selector", ".panel .head")]
+    heads = [head.text for head in chromium.find_elements("css selector", ".panel .head")]
     (strip,) = [text for text in heads if text.startswith("sensor health")]
     words = ("valid", "degraded", "invalid", *(f"Estimator {i}" for i in range(1, 5)))
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
@@ -280,10 +280,10 @@ def test_strip_of_sensor_health_has_a_legend(chromium, hour):
 def test_appendices_are_a_folded_list_at_the_end(chromium, toy):
     opened(chromium, toy[0])
     after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
-    found = chromium.execute_script(after)
-    assert len(found) >= 5
-    assert all(section == ["DETAILS", False] for section in found)
-    contents = [own.text for own in chromium.find_elements("css selector", "nav a")]
+    position = chromium.execute_script(after)
+    assert len(position) >= 5
+    assert all(section == ["DETAILS", False] for section in position)
+    contents = [link.text for link in chromium.find_elements("css selector", "nav a")]
     assert contents == ["Verdict", "Minutes of reference", "Appendices"]
     last = "return document.querySelector('#appendices ~ details:last-of-type h2').textContent"
     assert chromium.execute_script(last) == "Note"

@@ -159,10 +159,13 @@ def history(epochs):
     return pd.DataFrame({"epoch": epoch, "train_loss": 1.0 / epoch, "validation_loss": 1.5 / epoch})
 
 
-def with_value(artefacts, value, **where):
+def with_value(artefacts, value, **conditions):
     metrics = artefacts.metrics.copy()
     hit = np.logical_and.reduce(
-        [(metrics[name] == wanted).to_numpy() for name, wanted in where.items()]
+        [
+            (metrics[name] == value_to_match).to_numpy()
+            for name, value_to_match in conditions.items()
+        ]
     )
     assert hit.any()
     metrics.loc[hit, "value"] = value
@@ -199,8 +202,8 @@ def test_seed_is_chosen_on_validation_and_the_lower_seed_in_a_tie(
         > row["rmse_sideslip_min"]
     )
     tied = with_value(artefacts, 0.05, estimator="ksnn", test_set="validation", metric="rmse_vy")
-    for own in (tied, replace(tied, models=list(reversed(tied.models)))):
-        assert row_of(leaderboard(own), "ksnn")["seed"] == 0
+    for part in (tied, replace(tied, models=list(reversed(tied.models)))):
+        assert row_of(leaderboard(part), "ksnn")["seed"] == 0
     single = row_of(leaderboard(artefacts), "luenberger")
     assert (
         math.isnan(single["epochs"]),
@@ -268,14 +271,18 @@ def test_leaderboard_is_sorted_by_sideslip_error_within_each_test_set(tmp_path):
 
 
 def test_subsets_and_other_conditions_do_not_enter_the_leaderboard(artefacts, tmp_path):
-    other = artefacts.metrics.assign(value=99.0)
+    with_conditions = artefacts.metrics.assign(value=99.0)
     metrics = pd.concat(
-        [artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")]
+        [
+            artefacts.metrics,
+            with_conditions.assign(subset="nonlinear"),
+            with_conditions.assign(condition="noisy"),
+        ]
     )
     artefacts.metrics.to_csv(tmp_path / "metrics.csv", index=False)
-    for own in (metrics, pd.read_csv(tmp_path / "metrics.csv")):
+    for table in (metrics, pd.read_csv(tmp_path / "metrics.csv")):
         pd.testing.assert_frame_equal(
-            leaderboard(replace(artefacts, metrics=own)), leaderboard(artefacts)
+            leaderboard(replace(artefacts, metrics=table)), leaderboard(artefacts)
         )
 
 
@@ -363,15 +370,15 @@ def test_bound_stands_beside_the_errors_and_floors_are_tabled_from_the_spread_do
 
 def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts):
     assert table_of(artefacts, "regimes_test") is None
-    known = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
-    known = with_value(
-        known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip"
+    table_of_regimes = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
+    table_of_regimes = with_value(
+        table_of_regimes, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip"
     )
-    headers, rows, _ = formatted(table_of(known, "regimes_test"))
+    headers, rows, _ = formatted(table_of(table_of_regimes, "regimes_test"))
     assert headers == ["estimator", "turning (38 %)"]
     assert {row[0]: row[1] for row in rows}["KS-NN linear + bias, P = 2"] == "0.500"
     assert [row[1] for row in rows].count("0.250") == 4
-    pd.testing.assert_frame_equal(leaderboard(known), leaderboard(artefacts))
+    pd.testing.assert_frame_equal(leaderboard(table_of_regimes), leaderboard(artefacts))
 
 
 def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
@@ -394,9 +401,10 @@ def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
 def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(
     artefacts, tmp_path
 ):
-    whole = drive()
+    recording = drive()
     write_recording(
-        whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet"
+        recording.select([name for name in recording.channels if name != "ay"]),
+        tmp_path / "lap.parquet",
     )
     without = replace(artefacts, references={("toy", "lap"): tmp_path / "lap.parquet"})
     assert warnings_of(without) == [
@@ -452,7 +460,7 @@ def test_verdict_names_the_best_and_recommends_only_above_both_baselines(artefac
     without = replace(
         artefacts, models=[model for model in artefacts.models if model.estimator != "ksnn"]
     )
-    assert ["PCT/IT2023/050058" in words_of(own) for own in (artefacts, without)] == [True, False]
+    assert ["PCT/IT2023/050058" in words_of(part) for part in (artefacts, without)] == [True, False]
 
 
 def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts):
@@ -551,10 +559,10 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
 ):
     places = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # that of this process is drawn
-    made = tmp_path / artefacts.references["toy", "lap"].parent.name
+    folder = tmp_path / artefacts.references["toy", "lap"].parent.name
     report = tmp_path / written.name
     subprocess.run(
-        [sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places],
+        [sys.executable, "-c", DRAWN_ELSEWHERE, str(folder), str(report), *places],
         env=environment,
         check=True,
     )
@@ -604,10 +612,10 @@ def test_times_are_medians_over_seeds_by_part_and_estimator():
         rows, columns=["part", "estimator", "variant", "seed", "test_set", "metric", "value"]
     )
     titles = {("gru", "states_5"): "GRU", ("zero", "zero"): "Zero"}
-    heading, shown = timings_of_study(
-        [(part, own, titles) for part, own in table.groupby("part", sort=False)]
+    heading, printed_rows = timings_of_study(
+        [(part, part_table, titles) for part, part_table in table.groupby("part", sort=False)]
     )
-    headers, cells, _ = formatted(shown)
+    headers, cells, _ = formatted(printed_rows)
     assert (heading, headers[:2], headers[-1]) == (
         "## Times",
         ["part", "estimator"],
@@ -756,8 +764,8 @@ def test_each_family_has_a_hue_with_contrast_on_dark_and_light_pages():
         ]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
-    def contrast(one, other):
-        high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    def contrast(first, second):
+        high, low = sorted((luminance(first), luminance(second)), reverse=True)
         return (high + 0.05) / (low + 0.05)
 
     ksnn = [
@@ -776,10 +784,10 @@ def test_decimation_keeps_peaks_ends_and_gaps():
     values = np.sin(time)
     values[4321] = 7.0
     values[8000:8200] = np.nan
-    at, kept = decimated(time, values, 400)
+    at, values_drawn = decimated(time, values, 400)
     assert len(at) < 650
-    assert (np.nanmax(kept), (at[0], at[-1])) == (7.0, (time[0], time[-1]))
-    assert np.isnan(kept[(at > 80.0) & (at < 82.0)]).all()
+    assert (np.nanmax(values_drawn), (at[0], at[-1])) == (7.0, (time[0], time[-1]))
+    assert np.isnan(values_drawn[(at > 80.0) & (at < 82.0)]).all()
     assert (np.diff(at) > 0).all()
 
 

@@ -13,7 +13,7 @@ from vehest.run.study import read_study
 
 PLAIN = ["estimator=zero,static_map,kinematic"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
-LACKING = ["estimator=kalman"]  # there is no steering angle
+UNUSABLE = ["estimator=kalman"]  # there is no steering angle
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def across(place):
         "pipelines/vehicles.yaml",
         study="vehicles",
         report="transfer",
-        parts=parts_of(PLAIN, LUENBERGER, LACKING),
+        parts=parts_of(PLAIN, LUENBERGER, UNUSABLE),
     )
     return place
 
@@ -114,11 +114,11 @@ def test_vehicles_are_listed_side_by_side_including_failed_ones(across):
     code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
     assert code == 5, err
     assert "steer" in err
-    found = json.loads(out)
-    titles = [row["estimator"] for row in found["overview"]]
+    result = json.loads(out)
+    titles = [row["estimator"] for row in result["overview"]]
     assert titles[:2] == ["Zero (v = 0)", "Static map"]
     assert "Luenberger" in titles
-    assert any("kalman" in name for name in found["failed"])
+    assert any("kalman" in name for name in result["failed"])
     report = next((across.folder / "out" / "report").glob("vehicles-*")) / "report.md"
     text = report.read_text(encoding="utf-8")
     assert all(words in text for words in ("kalman", "is left out"))

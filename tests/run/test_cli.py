@@ -41,13 +41,13 @@ def test_pipeline_reuses_artefacts_and_reruns_only_changed_stages(place):
     out, err = place.once("run", "small", "tracking=none")
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
-    made = place.files()
+    files = place.files()
 
     again, err = place.done("run", "small", "tracking=none")
     assert ({status for status, _ in _statuses(err)}, again, place.files()) == (
         {"reused"},
         out,
-        made,
+        files,
     )
 
     (place.folder / "README.md").write_text("changed")
@@ -69,9 +69,9 @@ def test_two_processes_give_the_same_numbers_and_a_dry_run_writes_nothing(place)
     place("run", "small", "tracking=none", "output=one")
     place.done("run", "small", "--jobs", "2", "tracking=none", "output=two")
     for model in (place.folder / "one" / "train").iterdir():
-        other = place.folder / "two" / "train" / model.name
+        parallel = place.folder / "two" / "train" / model.name
         assert (model / "model.safetensors").read_bytes() == (
-            other / "model.safetensors"
+            parallel / "model.safetensors"
         ).read_bytes()
 
 
@@ -93,10 +93,10 @@ def test_failed_jobs_are_reported_and_other_results_remain(place):
         in err
     )
     assert "Traceback" not in err
-    kept = {
+    remaining = {
         folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()
     }
-    assert kept == {"luenberger-luenberger"}
+    assert remaining == {"luenberger-luenberger"}
     assert all(
         words in out
         for words in (
@@ -231,9 +231,9 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
     assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
-    shown = place.told("data", "show", "mine")
-    assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
-    assert shown["recordings"][0]["rate_hz"] == 100.0
+    description = place.told("data", "show", "mine")
+    assert [recording["id"] for recording in description["recordings"]] == ["one", "three", "two"]
+    assert description["recordings"][0]["rate_hz"] == 100.0
     out, _ = place.done("data", "check", "mine")
     assert "d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation" in out
     assert "yaw_rate" in place("data", "channels")[1]
@@ -253,11 +253,11 @@ def test_doctor_names_the_purpose_of_an_absent_extra(place, monkeypatch):
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
-        lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"),
+        lambda name, *options: None if name == "optuna" else find(name, *options) or find("vehest"),
     )
-    found = {item["name"]: item for item in place.told("doctor")}
-    assert (found["compiled recursions"]["level"], found["extras"]["level"]) == ("ok", "warning")
-    assert "Optuna need 'vehest[tuning]': pip install" in found["extras"]["message"]
+    checks = {item["name"]: item for item in place.told("doctor")}
+    assert (checks["compiled recursions"]["level"], checks["extras"]["level"]) == ("ok", "warning")
+    assert "Optuna need 'vehest[tuning]': pip install" in checks["extras"]["message"]
 
 
 def test_help_shows_choices_and_answers_quickly(place):
@@ -307,8 +307,8 @@ def test_empty_and_truncated_files_and_wrong_units_are_a_single_clear_line(place
     pd.read_csv(path).to_parquet(place.folder / "raw" / "one.parquet")
     path.write_text("")
     place.refused("ingest", "mine", says="one.csv' is empty")
-    whole = (place.folder / "raw" / "one.parquet").read_bytes()
-    (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
+    content = (place.folder / "raw" / "one.parquet").read_bytes()
+    (place.folder / "raw" / "one.parquet").write_bytes(content[: len(content) // 2])
     place.refused(
         "ingest",
         "mine",
@@ -415,8 +415,8 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
         place.refused("estimate", "luenberger", name, "-o", out, says=says)
         assert not Path("out.parquet").exists()
     slow.to_csv("twenty.csv", index=False)
-    _, said = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
-    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in said
+    _, output = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
+    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in output
     swapped = (
         "split.train=[{recording: three}]",
         "split.tests.test=[{recording: one, start: 5, stop: 20}]",
@@ -438,28 +438,28 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
 def test_truncated_artefacts_are_recomputed(place):
     arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none")
     weights = Path(place.told(*arguments)["model"]) / "model.safetensors"
-    whole = weights.read_bytes()
-    weights.write_bytes(whole[:50])
-    assert (place.told(*arguments)["skipped"], weights.read_bytes() == whole) == (False, True)
+    content = weights.read_bytes()
+    weights.write_bytes(content[:50])
+    assert (place.told(*arguments)["skipped"], weights.read_bytes() == content) == (False, True)
 
 
 def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypatch):
     outputs = place.folder / "outputs"
 
-    class OneEvaluation(TimeLimit):
+    class SingleEvaluation(TimeLimit):
         """A time that is up once one evaluation is there."""
 
         def requested(self):
             return any((outputs / "evaluate").glob("*/manifest.json"))
 
     with monkeypatch.context() as patched:
-        patched.setattr(runner, "TimeLimit", OneEvaluation)
+        patched.setattr(runner, "TimeLimit", SingleEvaluation)
         code, out, err = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out
     assert f"left out: gru-states_2-seed0: {NO_TIME}" in out
-    told, err = place.done("report", "small", "tracking=none")
-    assert told == out, "the same report"
+    output, err = place.done("report", "small", "tracking=none")
+    assert output == out, "the same report"
     assert "gru-states_2-seed0; 'vehest run small tracking=none' goes on with them" in err
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
@@ -494,8 +494,8 @@ def test_the_next_command_that_is_printed_finds_data_and_results_elsewhere(place
 def test_the_training_that_an_evaluation_asks_for_can_be_pasted(place):
     words = ["estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=20"]
     words += ["output=my results", "tracking=none"]
-    others = ["evaluation.rate_hz=10", "fault=frozen", "fault.channel=yaw_rate"]
-    _, line = place.refused("eval", *words, *others, code=4)
+    overrides = ["evaluation.rate_hz=10", "fault=frozen", "fault.channel=yaw_rate"]
+    _, line = place.refused("eval", *words, *overrides, code=4)
     command = shlex.split(line[line.index("vehest ") : line.index("' first")])
     assert command == ["vehest", "train", *words]
     place.done(*command[1:])
@@ -594,11 +594,11 @@ def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, m
     assert not list((place.folder / "outputs").glob("train/[!.]*"))
     epochs, resumed = _epochs(place, monkeypatch)
     assert epochs[0] == 4
-    _, whole = _epochs(place, monkeypatch, "output=undisturbed")
-    assert resumed["epochs"] == whole["epochs"] == 8
+    _, uninterrupted = _epochs(place, monkeypatch, "output=undisturbed")
+    assert resumed["epochs"] == uninterrupted["epochs"] == 8
     weights = [
         (Path(model) / "model.safetensors").read_bytes()
-        for model in (resumed["model"], whole["model"])
+        for model in (resumed["model"], uninterrupted["model"])
     ]
     assert weights[0] == weights[1]
     assert not any("checkpoint" in name for name in place.files())

@@ -74,10 +74,10 @@ def test_local_configuration_precedes_and_extends_the_packaged_configuration(els
     ],
 )
 def test_wrong_overrides_are_a_single_helpful_line(elsewhere, overrides, message):
-    said = refusal(
+    refused = refusal(
         lambda: compose_config("train" if overrides else "ingest", overrides), ConfigurationError
     )
-    assert re.search(message, said)
+    assert re.search(message, refused)
     assert "did you mean pipelines/quickstart.yaml?" in refusal(
         lambda: read_study("quikstart"), MissingError
     )
@@ -98,11 +98,11 @@ def test_wrong_overrides_are_a_single_helpful_line(elsewhere, overrides, message
     ],
 )
 def test_misspelt_options_of_any_group_get_a_suggestion(elsewhere, override, meant):
-    said = refusal(
+    message = refusal(
         lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", override]),
         ConfigurationError,
     )
-    assert f"did you mean '{meant}'?" in said
+    assert f"did you mean '{meant}'?" in message
 
 
 def test_a_misspelt_option_of_a_data_set_a_nested_group_or_a_study_is_answered_too(elsewhere):
@@ -114,14 +114,14 @@ def test_a_misspelt_option_of_a_data_set_a_nested_group_or_a_study_is_answered_t
             "estimator.car.mass",
         ),
     ):
-        said = refusal(
+        message = refusal(
             lambda words=words, command=command: compose_config(command, words), ConfigurationError
         )
-        assert f"did you mean '{meant}'?" in said
-    said = refusal(
+        assert f"did you mean '{meant}'?" in message
+    message = refusal(
         lambda: jobs_of(read_study("quickstart"), ["estimator.nlocal=3"]), ConfigurationError
     )
-    assert "did you mean 'estimator.n_local'?" in said
+    assert "did you mean 'estimator.n_local'?" in message
     assert "did you mean" not in refusal(
         lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", "zzz=1"]),
         ConfigurationError,
@@ -323,10 +323,10 @@ def test_config_prints_settings_with_the_comments_of_their_files(elsewhere, caps
 
 
 def test_an_unknown_option_of_the_shipped_filter_names_the_families_that_have_it():
-    said = refusal(
+    message = refusal(
         lambda: with_settings(SelfCalibrating(SelfCalibrating.settings_type()), {"nlocal": 3}),
         ConfigurationError,
     )
-    assert said.startswith(
+    assert message.startswith(
         "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
     )

@@ -126,11 +126,11 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     assert after[: len(before)] == before, (
         "what is said without the fault is the same, and stands first"
     )
-    shown = {name for name in figures if not is_fault(name)}
-    assert shown == set(nominal)
+    columns = {name for name in figures if not is_fault(name)}
+    assert columns == set(nominal)
     assert all(
         figures[name] == nominal[name]
-        for name in shown - {"folder", "step_seconds.test", "train_seconds.test"}
+        for name in columns - {"folder", "step_seconds.test", "train_seconds.test"}
     )
     added = pd.DataFrame(csv.DictReader([before[0], *after[len(before) :]]))
     assert (set(added["condition"]), set(added["subset"])) == ({CONDITION}, {"faulted", "after"})
@@ -178,15 +178,15 @@ def test_values_that_are_not_finite_leave_finite_errors(trained):
         f"{{kind:{kind},channel:vx,severity:severe}}" for kind in ("nan", "inf", "huge", "dropout")
     )
     figures = evaluated(trained, f"faults=[{listed}]")[1]
-    found = [
+    values = [
         value
         for name, value in figures.items()
         if is_fault(name) and name.startswith(("rmse_", "max_")) and "undetected" not in name
     ]
-    assert len(found) == 4 * 2 * 6, (
+    assert len(values) == 4 * 2 * 6, (
         "four faults, two subsets, six metrics; the validation range is not shown"
     )
-    assert None not in found, "JSON has null for what is not finite"
+    assert None not in values, "JSON has null for what is not finite"
 
 
 def test_key_of_an_evaluation_contains_its_faults_alone(
@@ -238,12 +238,12 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
             / "metrics.csv"
         )
         condition = f"{job['fault']}:{job['fault.channel']}:medium"
-        own = metrics[
+        fault_rows = metrics[
             (metrics["condition"] == condition)
             & (metrics["subset"] == "faulted")
             & (metrics["test_set"] == "test")
         ]
-        assert job["rmse_sideslip.test"] == own.set_index("metric")["value"]["rmse_sideslip"]
+        assert job["rmse_sideslip.test"] == fault_rows.set_index("metric")["value"]["rmse_sideslip"]
     report = (folder / "report.md").read_text()
     assert "faults, which are conditions of the evaluation" in report
     assert (
@@ -301,8 +301,8 @@ def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
             CONDITION,
             "nan:ay:mild",
         }
-    shown = outcome["leaderboard"]
-    assert len(shown) == 2, "the leaderboard is that without faults"
+    leaderboard = outcome["leaderboard"]
+    assert len(leaderboard) == 2, "the leaderboard is that without faults"
 
 
 def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):

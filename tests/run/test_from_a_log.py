@@ -42,8 +42,8 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
         (place.folder / name).write_text(content, encoding="utf-8")
     code, out, err = logged("data", "check", "my_log")
     assert (code, err) == (0, "")
-    (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
-    assert said in out.splitlines()
+    (warning,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
+    assert warning in out.splitlines()
     out, _ = logged.done("data", "usable", "my_log")
     for line in (
         "ax: transforms: [{name: acceleration_from_speed}] of vx",

@@ -95,11 +95,11 @@ def test_killed_workers_are_named_by_their_recordings(place, slow, monkeypatch):
         broken.setattr(ingest, "_make_part", killed)
         code, _, err = place("ingest", "mine", "--jobs", "2")
     assert code == 4
-    first, other = ("one", "three") if "recording 'one'" in err else ("three", "one")
+    first, second = ("one", "three") if "recording 'one'" in err else ("three", "one")
     assert (
         f"error: data set 'mine', recording '{first}': a worker process was ended by SIGKILL" in err
     )
-    assert err.strip().endswith(f"the same command goes on (and 1 more: '{other}')")
+    assert err.strip().endswith(f"the same command goes on (and 1 more: '{second}')")
     assert ingest._make_part is make_part
     folder = Path(place.told("ingest", "mine", "--jobs", "1")["folder"])
     assert len(list(folder.glob("*.parquet"))) == 3

@@ -16,7 +16,7 @@ def test_errors_at_an_unknown_point_are_listed_with_the_best_lever_arm(place):
         split="mine",
         sweeps=[["estimator=zero"]],
     )
-    shown = place.told("run", "levers", "tracking=none", "output=out")
+    result = place.told("run", "levers", "tracking=none", "output=out")
     table = pd.read_csv(next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv")
     tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
     levers, nominal = (
@@ -31,8 +31,8 @@ def test_errors_at_an_unknown_point_are_listed_with_the_best_lever_arm(place):
         next((place.folder / "out" / "downsample").glob("mine-20hz-*")) / "three.parquet"
     )
     late = recording.time >= recording.start_time + 1.5 - 1e-9
-    rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
-    assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
-    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [
+    residual = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
+    assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-9)
+    assert [row["rmse_sideslip"] for row in result["leaderboard"]] == [
         pytest.approx(nominal["rmse_sideslip"])
     ]

@@ -86,7 +86,7 @@ def _shows_only_text(text):
             )
         ),
     ],
-    ids=lambda own: str(own)[:50],
+    ids=lambda case: str(case)[:50],
 )
 def test_wrong_usage_is_a_single_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
@@ -143,9 +143,9 @@ def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_befo
 @pytest.mark.parametrize("terminal", [False, True])
 def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     messages = Messages()
-    seen = io.StringIO()
+    stream = io.StringIO()
     messages.console = type(messages.console)(
-        file=seen,
+        file=stream,
         force_terminal=terminal,
         color_system=None,
         soft_wrap=True,
@@ -156,13 +156,13 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     messages.warn(f"first\n{HOSTILE}")
     with messages.bars() as bars:
         bars.step(HOSTILE, 1, 2, HOSTILE)
-    text = seen.getvalue()
-    shown = printable(HOSTILE)
-    assert text.startswith(f"done    train      {shown}\\ {shown}")
-    assert f"warning first\n{shown}" in text
+    text = stream.getvalue()
+    hostile = printable(HOSTILE)
+    assert text.startswith(f"done    train      {hostile}\\ {hostile}")
+    assert f"warning first\n{hostile}" in text
     assert not {"\x07", "\x9b", "\u202e"} & set(text)
     assert "\x1b]" not in text
-    assert terminal == (f"{shown} " in text.split("warning", 1)[1].split(shown, 1)[1])
+    assert terminal == (f"{hostile} " in text.split("warning", 1)[1].split(hostile, 1)[1])
 
 
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
@@ -307,10 +307,10 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     )
     for _, _, command in stages:  # what is compiled is cached in files, too
         assert place(*command)[0] == 0
-    for made in ("outputs", "aligned"):
-        shutil.rmtree(made)
-    for made in ("out.parquet", "out.csv"):
-        Path(made).unlink()
+    for folder in ("outputs", "aligned"):
+        shutil.rmtree(folder)
+    for folder in ("out.parquet", "out.csv"):
+        Path(folder).unlink()
     for size, target, command in stages:
         before = place.files() | set(os.listdir())
         with _small_disk(size):
@@ -336,14 +336,14 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
 )
 def test_full_disks_are_identified_under_every_library_error(tmp_path, error):
     full = not isinstance(error, ValueError)
-    said = f"no room left to write '{tmp_path / 'target'}'" if full else "no space"
+    message = f"no room left to write '{tmp_path / 'target'}'" if full else "no space"
 
     def break_off():
         with written_aside(tmp_path / "target") as aside:
             aside.write_text("half")
             raise error
 
-    with pytest.raises(MissingError if full else ValueError, match=said):
+    with pytest.raises(MissingError if full else ValueError, match=message):
         break_off()
     assert (
         list(tmp_path.iterdir()),
@@ -384,12 +384,16 @@ def test_internal_errors_are_a_single_line(place, monkeypatch, error, code, word
 
 def _shell(place, script, **environment):
     command = f"vehest() {{ '{sys.executable}' -m vehest \"$@\"; }}\n{script}"
-    kept = {
+    inherited = {
         name: value
         for name, value in os.environ.items()
         if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")
     }
-    options = {"cwd": place.folder, "env": {**kept, **environment}, "stdin": subprocess.DEVNULL}
+    options = {
+        "cwd": place.folder,
+        "env": {**inherited, **environment},
+        "stdin": subprocess.DEVNULL,
+    }
     return subprocess.run(
         ["bash", "-c", command], capture_output=True, text=True, timeout=300, **options
     )
@@ -426,7 +430,7 @@ def test_no_home_no_terminal_and_no_utf_8_still_show_everything(place):
     plain, table = (
         _shell(place, f"vehest data channels {words}", **bare) for words in ("--json", "")
     )
-    assert [(own.returncode, own.stderr) for own in (plain, table)] == [(0, "")] * 2
+    assert [(process.returncode, process.stderr) for process in (plain, table)] == [(0, "")] * 2
     assert plain.stdout.isascii()
     assert json.loads(plain.stdout) == place.told("data", "channels")
     assert "m/s²" in table.stdout

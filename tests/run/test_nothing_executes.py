@@ -278,7 +278,7 @@ def watch(name, folder):
     with contextlib.suppress(VehestError):  # what the way to an error imports
         read(folder / "nowhere" / min(hostile.iterdir()).name)
     outcome = {}
-    seen = []
+    events = []
     armed = [False]
     temporary = tempfile.gettempdir()
 
@@ -288,13 +288,13 @@ def watch(name, folder):
         if event == "os.fork":
             return  # the reading process, in which the fuzz watches
         if event == "open" and _writes(*arguments) and not str(arguments[0]).startswith(temporary):
-            seen.append(f"open {str(arguments[0])[:80]} {arguments[1]}")
+            events.append(f"open {str(arguments[0])[:80]} {arguments[1]}")
         elif event in WATCHED:
-            seen.append(f"{event} {str(arguments)[:160]}")
+            events.append(f"{event} {str(arguments)[:160]}")
 
     sys.addaudithook(hook)
     for file in sorted(hostile.iterdir()):
-        seen.clear()
+        events.clear()
         armed[0] = True
         try:
             read(file)
@@ -304,7 +304,7 @@ def watch(name, folder):
         except BaseException as error:
             ended = f"{type(error).__name__}: {error}"[:200]
         armed[0] = False
-        outcome[file.name] = ended, list(seen)
+        outcome[file.name] = ended, list(events)
     return outcome
 
 

@@ -27,16 +27,16 @@ ROOT = Path(__file__).parents[2]
 def test_estimate_without_a_model_uses_and_names_the_pretrained_model(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
-    said = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
-    assert said["model"] == said["estimator"] == "self_calibrating"
+    result = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
+    assert result["model"] == result["estimator"] == "self_calibrating"
     for content in (
         "simulated cars, not on yours",
         "docs/estimators/self_calibrating.md",
         "PCT/IT2023/050058",
     ):
-        assert content in said["note"]
-    assert "\n" not in said["note"]
-    assert len(said["note"]) < 200
+        assert content in result["note"]
+    assert "\n" not in result["note"]
+    assert len(result["note"]) < 200
     assert (
         place("estimate", "self_calibrating", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
     )
@@ -140,12 +140,12 @@ def bands_on(name, data_root):
 
 def test_documentation_has_the_coverage_of_pretrained_bands_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
-    told = re.search(
+    figures = re.search(
         r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % of the drive is valid",
         text,
     )
     inside, median, valid = bands_on("ferrari_250lm", data_root)
-    assert [told[1], told[2], told[3]] == [
+    assert [figures[1], figures[2], figures[3]] == [
         f"{100 * inside:.0f}",
         f"{median:.1f}",
         f"{100 * valid:.0f}",

@@ -73,9 +73,9 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
     assert len(digests(pair.folder / "outputs")) == 4
     shutil.rmtree("outputs")
     _, err = pair.done(*RUN)
-    said = " ".join(err.split())
-    assert "3 of 3 taken from results/pair/weights.safetensors" in said
-    assert "1 of 3 taken from results/pair/weights.safetensors" in said
+    message = " ".join(err.split())
+    assert "3 of 3 taken from results/pair/weights.safetensors" in message
+    assert "1 of 3 taken from results/pair/weights.safetensors" in message
     assert err.count("epochs,") == 2
     resumed = pair.folder / "outputs"
     published = {
@@ -125,7 +125,7 @@ def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monke
 
 
 def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatch):
-    first, second, *others = trained(pair)
+    first, second, *remaining = trained(pair)
     file = pair.folder / "some" / "weights.safetensors"
     published = PublishedWeights(file)
     assert published.add([first]) == 1
@@ -133,13 +133,13 @@ def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatc
     monkeypatch.setattr(weights, "MAX_MEGABYTES", len(before) / 1e6)
     assert published.add([first]) == 0
     with pytest.raises(WeightsTooLargeError, match=r"MB of weights are more than the 0\.0"):
-        published.add([second, *others])
+        published.add([second, *remaining])
     assert (os.listdir(file.parent), file.read_bytes()) == ([file.name], before)
     assert (first.key in published, second.key in published) == (True, False)
     _, err = pair.done(*RUN)
-    said = " ".join(err.split())
-    assert said.count("no more weights are published") == 1
-    assert "the report is published without weights" in said
+    message = " ".join(err.split())
+    assert message.count("no more weights are published") == 1
+    assert "the report is published without weights" in message
     assert not (pair.folder / FILE).exists()
     assert (pair.folder / "results/pair/report.md").is_file()
 
@@ -191,9 +191,9 @@ def test_publishing_changed_results_or_to_another_place_is_refused(pair):
     pair.change("pipelines/pair.yaml", publish=False)
     pair.refused(*RUN, code=2, says="it needs publish: true")
     pair.change("pipelines/pair.yaml", publish=True)
-    other = pair.folder / "results" / "pair" / "notes.txt"
-    other.parent.mkdir(parents=True)
-    other.write_text("mine", encoding="utf-8")
+    foreign = pair.folder / "results" / "pair" / "notes.txt"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("mine", encoding="utf-8")
     pair.refused(*RUN, code=2, says="holds files that vehest did not publish")
 
 
@@ -209,7 +209,7 @@ def published_files(pair):
     }
 
 
-def said_by_report(pair):
+def report_message(pair):
     return (pair.folder / "results/pair/report.md").read_text()
 
 
@@ -222,10 +222,10 @@ def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others
     pair.change("results/stale.yaml", pair="its second part is not trained")
     _, err = pair.done(*PUBLISH)
     assert "epochs," not in err, "nothing is trained"
-    said = " ".join(err.split())
-    assert "3 of 6 not done" in said
-    assert "vehest run pair tracking=none --train-missing" in said
-    assert "nothing could be trained or scored: back" in said_by_report(pair)
+    message = " ".join(err.split())
+    assert "3 of 6 not done" in message
+    assert "vehest run pair tracking=none --train-missing" in message
+    assert "nothing could be trained or scored: back" in report_message(pair)
     assert read_json(pair.folder / "results/pair/provenance.json")["n_not_trained"] == 3
     incomplete = published_files(pair)
 
@@ -250,7 +250,7 @@ def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others
     _, err = pair.done(*PUBLISH)
     refusal = "not published: 'results/pair' shows 3 trainings that this run lacks"
     assert refusal in " ".join(err.split())
-    assert said_by_report(pair).encode() == complete["report.md"]
+    assert report_message(pair).encode() == complete["report.md"]
 
 
 def test_an_incomplete_study_is_stale_once_its_configuration_changes(pair, monkeypatch):

@@ -92,9 +92,9 @@ def test_a_published_search_is_not_repeated_elsewhere_and_gives_the_same_results
     for again in ((), ("--force",)):
         shutil.rmtree("outputs")
         _, err = tuned.done(*RUN, *again)
-        said = " ".join(err.split())
-        taken = "2 of 2 trials taken from results/tuned/searches.csv" in said
-        assert (taken, n_trained(err)) == ((False, 3) if again else (True, 0))
+        message = " ".join(err.split())
+        is_reused = "2 of 2 trials taken from results/tuned/searches.csv" in message
+        assert (is_reused, n_trained(err)) == ((False, 3) if again else (True, 0))
         assert contents(tuned.folder / "results") == before
     shutil.rmtree("outputs")
     _, err = tuned.done(*RUN, "--retrain")

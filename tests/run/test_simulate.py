@@ -55,8 +55,8 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, m
     assert list(alone) == ["lap_001", "lap_002", "lap_003"]
     for name, values in alone.items():
         np.testing.assert_array_equal(values, together[name])
-    other = samples(place.told("simulate", "sim", "seed=2")["folder"])
-    assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
+    second_samples = samples(place.told("simulate", "sim", "seed=2")["folder"])
+    assert not any(np.array_equal(values, second_samples[name]) for name, values in alone.items())
 
 
 def test_ingest_makes_the_same_drives_as_simulate(place, monkeypatch):

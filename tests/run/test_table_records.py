@@ -74,11 +74,11 @@ def test_tables_without_a_record_and_removed_tables_are_named(table, outcome):
 
 
 def test_rows_without_keys_leave_the_state_undetermined(table, outcome):
-    other = table.with_name("b.csv")
-    other.write_text("rmse\n")
-    record_tables([other], "make b", [], "rows of gru")
+    second_table = table.with_name("b.csv")
+    second_table.write_text("rmse\n")
+    record_tables([second_table], "make b", [], "rows of gru")
     assert outcome() == (3, "tables: not known: b.csv: rows of gru without keys (make b)\n")
-    record_tables([other], "make b", [])
+    record_tables([second_table], "make b", [])
     assert outcome() == (0, "tables: up to date\n")
 
 
@@ -161,8 +161,8 @@ def test_commands_of_the_car_benchmark_run_without_recordings_of_its_record(tmp_
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(subprocess, "run", run)
-    own_car = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "own_car.py"))
-    own_car["timed"](tmp_path, "--version")
+    program = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "own_car.py"))
+    program["timed"](tmp_path, "--version")
     assert "VEHEST_DATA" not in environments[0]
     assert environments[0]["VEHEST_OUTPUT"] == str(tmp_path / "outputs")
     assert os.environ["VEHEST_DATA"] == "recordings"
@@ -201,19 +201,19 @@ def test_every_folder_of_results_has_a_provenance():
     results = Path(__file__).parents[2] / RESULTS
     folders = {folder.name for folder in results.iterdir() if folder.is_dir()}
     # Times of one machine, each with its processor, commit and libraries; verdicts on committed files.
-    others = {"benchmarks", "scorecard"}
+    exempt = {"benchmarks", "scorecard"}
     recorded = {file.parent.name for file in results.glob(f"*/{PROVENANCE}")}
-    assert folders - others == recorded
+    assert folders - exempt == recorded
 
 
 def test_every_recorded_data_set_has_the_digest_of_its_raw_files():
     """Without one a table is stale at once wherever the raw files are."""
     records = (Path(__file__).parents[2] / RESULTS).glob(f"*/{PROVENANCE}")
     keys = {
-        f"{file.parent.name}/{what}": key
+        f"{file.parent.name}/{stage}": key
         for file in records
-        for what, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
-        if re.match(r"\S+\.\w+: (data|files) ", what)
+        for stage, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
+        if re.match(r"\S+\.\w+: (data|files) ", stage)
     }
     assert keys
-    assert [what for what, key in keys.items() if "data" not in key] == []
+    assert [stage for stage, key in keys.items() if "data" not in key] == []

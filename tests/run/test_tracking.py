@@ -38,7 +38,7 @@ def test_runs_are_tracked_with_parameters_metrics_and_model(
         trained.data.params["estimator.n_local"],
         trained.data.params["training.learning_rate"],
     ) == ("2", "0.001")
-    assert _is_whole(client, trained)
+    assert _is_complete(client, trained)
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     done = _in_process(
@@ -65,18 +65,22 @@ def _runs(client, name="vehest"):
 
 def _local(place, stage=""):
     """Runs in the local store, of one stage or of all."""
-    kept = [(run, run.data.tags["vehest.stage"]) for run in _runs(_client(place))]
-    return [run for run, own in kept if own == stage or (not stage and own != "study")]
+    runs = [(run, run.data.tags["vehest.stage"]) for run in _runs(_client(place))]
+    return [
+        run
+        for run, stage_of_run in runs
+        if stage_of_run == stage or (not stage and stage_of_run != "study")
+    ]
 
 
-def _is_whole(client, run):
+def _is_complete(client, run):
     """Whether a training's run has its losses and its files."""
-    kept = {entry.path for entry in client.list_artifacts(run.info.run_id)}
+    paths = {entry.path for entry in client.list_artifacts(run.info.run_id)}
     losses = [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")]
     return (
         run.info.status == "FINISHED"
         and losses == [1, 2]
-        and {"model.safetensors", "model.yaml", "manifest.json"} <= kept
+        and {"model.safetensors", "model.yaml", "manifest.json"} <= paths
     )
 
 
@@ -105,7 +109,7 @@ def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
         0,
     )
     [run] = _local(place, "train")
-    assert _is_whole(_client(place), run)
+    assert _is_complete(_client(place), run)
 
 
 def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypatch):
@@ -175,14 +179,14 @@ def _raising(error):
 
 
 def _in_process(code, *arguments):
-    """A command in a process of its own, run by ``code``."""
-    own = [
+    """A command in a process of its command, run by ``code``."""
+    command = [
         sys.executable,
         "-c",
         f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}",
         *arguments,
     ]
-    return subprocess.run(own, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def mlflow_server(folder):
@@ -230,7 +234,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
     assert "logging to MLflow" not in err
     runs = {run.info.run_name: run for run in _runs(client)}
     assert len(runs) == 13
-    assert _is_whole(client, runs["ksnn-linear_no_bias_p2-seed1"])
+    assert _is_complete(client, runs["ksnn-linear_no_bias_p2-seed1"])
     assert not (place.folder / "outputs" / "mlflow.db").exists()
 
     def fell_over():
@@ -279,9 +283,9 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     for file in ("fit.csv", "timings.csv"):
         (tmp_path / file).write_text("metric,value\n")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
-    said = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact)
-    assert not said
+    messages = []
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", messages.append).log(artefact)
+    assert not messages
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}"))
     assert {key: int(value) for key, value in run.data.params.items()} == {
         f"group.{key}": v for key, v in config["group"].items()

@@ -116,7 +116,7 @@ def test_a_stop_ends_running_tasks_with_their_outcome_and_begins_no_other():
 
     done = list(launch([until_stopped] * 5, 2, stop, report))
     assert sorted(begun) == [0, 1]
-    assert {own.position: own.outcome for own in done} == dict.fromkeys((0, 1), "best so far")
+    assert {entry.position: entry.outcome for entry in done} == dict.fromkeys((0, 1), "best so far")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")

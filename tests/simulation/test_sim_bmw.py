@@ -186,8 +186,11 @@ def test_sim_bmw_cars_has_125_manoeuvres_of_each_group_on_three_cars():
 
 def test_skids_are_trained_on_and_tests_are_of_sim_bmw_cars_alone():
     for name in ("sim_bmw_cars", "sim_bmw_cars_limited"):
-        own = configuration("split", name)
-        learnt = [entry["keep"]["magnitude"] for entry in (*own["train"], *own["validation"])]
+        split_settings = configuration("split", name)
+        learnt = [
+            entry["keep"]["magnitude"]
+            for entry in (*split_settings["train"], *split_settings["validation"])
+        ]
         assert not any("sideslip_ref" in bounds for bounds in learnt)
-        assert {entry["dataset"] for entry in own["train"]} == {"sim_bmw"}
-        assert {entry["dataset"] for entry in own["tests"]["test"]} == {"sim_bmw_cars"}
+        assert {entry["dataset"] for entry in split_settings["train"]} == {"sim_bmw"}
+        assert {entry["dataset"] for entry in split_settings["tests"]["test"]} == {"sim_bmw_cars"}

@@ -50,10 +50,10 @@ def vehicle(name):
 
 
 @cache
-def moderate(car, which):
+def moderate(car, case):
     return drive(
         MultiBodyPlant(vehicle(car)),
-        manoeuvre_from_config((MODERATE | MODERATE_LAPS)[which]),
+        manoeuvre_from_config((MODERATE | MODERATE_LAPS)[case]),
         seed=1,
     )
 
@@ -95,17 +95,17 @@ def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     "car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)]
 )
 @pytest.mark.parametrize(
-    "which", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)]
+    "case", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)]
 )
-def test_moderate_severity_is_completed_by_every_car(car, which):
-    trip = moderate(car, which)
+def test_moderate_severity_is_completed_by_every_car(car, case):
+    trip = moderate(car, case)
     flags = trip.flags
     motion = trip.motion
     assert flags.completed
     assert not flags.spun
     assert not flags.left_road
     assert flags.gave_up_at is None
-    assert flags.stood == (which in ("braking in turn", "speed lap"))
+    assert flags.stood == (case in ("braking in turn", "speed lap"))
     assert flags.largest_lateral_error is None or flags.largest_lateral_error < 0.6
     assert math.degrees(flags.largest_sideslip) < 6.0
     assert motion.vx[0] > 5.0  # rolls from the first sample on
@@ -121,10 +121,10 @@ def test_moderate_severity_is_completed_by_every_car(car, which):
 
 
 @pytest.mark.parametrize("car", CARS)
-@pytest.mark.parametrize("which", ["lane change", "obstacle"])
-def test_lane_change_keeps_the_car_between_the_cones(car, which):
-    trip = moderate(car, which)
-    manoeuvre = manoeuvre_from_config(MODERATE[which])
+@pytest.mark.parametrize("case", ["lane change", "obstacle"])
+def test_lane_change_keeps_the_car_between_the_cones(car, case):
+    trip = moderate(car, case)
+    manoeuvre = manoeuvre_from_config(MODERATE[case])
     width = car_of(MultiBodyPlant(vehicle(car))).width
     x = trip.motion.x
     y = side_of(trip) * trip.motion.y
@@ -153,10 +153,10 @@ def test_gates_are_those_of_the_standards():
 
 
 @pytest.mark.parametrize("car", CARS)
-@pytest.mark.parametrize("which", ["slalom 18 m", "slalom 30 m"])
-def test_slalom_passes_the_cones_on_alternating_sides(car, which):
-    trip = moderate(car, which)
-    manoeuvre = manoeuvre_from_config(MODERATE[which])
+@pytest.mark.parametrize("case", ["slalom 18 m", "slalom 30 m"])
+def test_slalom_passes_the_cones_on_alternating_sides(car, case):
+    trip = moderate(car, case)
+    manoeuvre = manoeuvre_from_config(MODERATE[case])
     width = car_of(MultiBodyPlant(vehicle(car))).width
     cones = np.arange(manoeuvre.cones) * manoeuvre.spacing
     at_cones = side_of(trip) * np.interp(cones, trip.motion.x, trip.motion.y)

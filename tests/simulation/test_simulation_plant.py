@@ -128,13 +128,13 @@ class TwoTyres:
 
     def __init__(self, vehicle):
         self.values = library_parameters(vehicle)
-        self.asked = 0
+        self.evaluations = 0
         self.tyres = (self.values.tire, rear_tyre(vehicle))
 
     def __getattr__(self, name):
         if name == "tire":
-            self.asked += 1
-            return self.tyres[(self.asked - 1) % 4 // 2]
+            self.evaluations += 1
+            return self.tyres[(self.evaluations - 1) % 4 // 2]
         return getattr(self.values, name)
 
 

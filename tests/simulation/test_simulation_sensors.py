@@ -531,7 +531,7 @@ def test_sensor_configurations_are_parsed(spelt, meant):
 
 
 @pytest.mark.parametrize(
-    ("spelt", "said"),
+    ("spelt", "message"),
     [
         ("perfect", "sensors 'perfect' is not one of: default, race, ideal"),
         ("{az: {noise: 0}}", "sensors: 'az' is not one of: vx, yaw_rate"),
@@ -553,8 +553,8 @@ def test_sensor_configurations_are_parsed(spelt, meant):
         ),
     ],
 )
-def test_invalid_sensor_configurations_are_refused_in_a_single_line(spelt, said):
-    assert said in refusal(
+def test_invalid_sensor_configurations_are_refused_in_a_single_line(spelt, message):
+    assert message in refusal(
         lambda: sensor_levels_from_config(yaml.safe_load(spelt)), ConfigurationError
     )
 

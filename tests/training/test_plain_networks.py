@@ -117,12 +117,12 @@ def test_members_equal_training_each_alone(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "one_by_one"),
+    ("name", "is_sequential"),
     [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)],
 )
-def test_members_are_batched_where_torch_can_batch_every_layer(name, one_by_one):
+def test_members_are_batched_where_torch_can_batch_every_layer(name, is_sequential):
     members, _ = fit(NETWORKS[name], [0, 1])
-    assert (members[0].network in _UNBATCHABLE) is one_by_one
+    assert (members[0].network in _UNBATCHABLE) is is_sequential
 
 
 @cache

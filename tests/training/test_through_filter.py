@@ -23,13 +23,13 @@ from vehest.training.through_filter import (
 )
 
 DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
-ONE_STEP_PHASE = PhaseSettings(learning_rate=5e-3, max_epochs=3)
+SINGLE_STEP_PHASE = PhaseSettings(learning_rate=5e-3, max_epochs=3)
 THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
 def settings(**changes):
     defaults = {
-        "one_step": ONE_STEP_PHASE,
+        "one_step": SINGLE_STEP_PHASE,
         "one_step_batch": 100,
         "through": THROUGH,
         "noise": THROUGH,

@@ -299,8 +299,8 @@ def test_epochs_of_n_steps_validate_after_n_steps_within_the_pass(monkeypatch):
         _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=2, epoch_steps=steps_of_epoch))
         for steps_of_epoch in (0, 10_000)
     ]
-    (whole,), (many,) = (members for members, _ in passes)
-    assert np.array_equal(flat_weights(whole), flat_weights(many))
+    (full_pass,), (short_epochs,) = (members for members, _ in passes)
+    assert np.array_equal(flat_weights(full_pass), flat_weights(short_epochs))
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -275,8 +275,8 @@ def test_phase_of_no_epochs_is_left_out_with_any_schedule(schedule):
     assert records[1].best_loss < records[1].start_loss
 
 
-@pytest.mark.parametrize("where", ["loss", "gradient"])
-def test_step_that_is_not_finite_is_skipped_and_counted(where):
+@pytest.mark.parametrize("fault_in", ["loss", "gradient"])
+def test_step_that_is_not_finite_is_skipped_and_counted(fault_in):
     network = _network()
     calls = 0
     parameters = []
@@ -289,7 +289,9 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
         if calls != 2:
             return good
         return (
-            good * math.nan if where == "loss" else good + torch.sqrt(network[2].bias.sum() * 0.0)
+            good * math.nan
+            if fault_in == "loss"
+            else good + torch.sqrt(network[2].bias.sum() * 0.0)
         )
 
     (record,) = train_phases([_phase(network, loss=loss, max_epochs=1)], 0, FitContext())

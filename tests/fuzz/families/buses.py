@@ -8,7 +8,7 @@ from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes
 
-TOLD = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
+BUS_CHANNELS = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
 SUFFIXES = (".asc", ".blf", ".log")
 BUS = {
     "name": "logs",
@@ -89,7 +89,7 @@ def log_of_a_bus(case):
         "--dbc",
         "raw/car.dbc",
         "--signals",
-        TOLD,
+        BUS_CHANNELS,
         "--speed",
         "max",
         "--quiet",

@@ -50,21 +50,22 @@ PACKAGED = {  # file of the packaged configuration -> commands that read it, of 
 }
 DRY = ("split=steered", "tracking=none", "--dry-run")
 PACKAGED |= {
-    f"estimator/{own}": [
-        ("config", "train", f"estimator={own}"),
-        ("train", f"estimator={own}", *DRY),
+    f"estimator/{entry_name}": [
+        ("config", "train", f"estimator={entry_name}"),
+        ("train", f"estimator={entry_name}", *DRY),
     ]
-    for own in ESTIMATORS
+    for entry_name in ESTIMATORS
 }
 PACKAGED |= {
-    f"dataset/{own}": [
-        ("config", "ingest", f"dataset={own}"),
-        ("ingest", own, "--dry-run", "--download"),
+    f"dataset/{entry_name}": [
+        ("config", "ingest", f"dataset={entry_name}"),
+        ("ingest", entry_name, "--dry-run", "--download"),
     ]
-    for own in DATASETS
+    for entry_name in DATASETS
 }
 PACKAGED |= {
-    f"vehicle/{own}": [("simulate", dataset, "--dry-run")] for own, dataset in CARS.items()
+    f"vehicle/{entry_name}": [("simulate", dataset, "--dry-run")]
+    for entry_name, dataset in CARS.items()
 }
 DERIVED = DATASET | {
     "transforms": [
@@ -239,9 +240,9 @@ def packaged_file(case):
 @generator("drives", "study", weight=8)
 def pipeline(case):
     """Studies of one's own and packaged ones; titles and texts that end up in tables, figures and pages."""
-    how = case.idea(8)
-    case.copy("study" if how == 0 else "drives")
-    if how == 0:
+    kind = case.idea(8)
+    case.copy("study" if kind == 0 else "drives")
+    if kind == 0:
         word = case.rng.choice(
             [*WRITABLE_NAMES, "$x^{", "\\frac", "$", "_" * 50, "|a|b|", "&lt;", "</script>"]
         )
@@ -251,7 +252,7 @@ def pipeline(case):
         )
         return Command(("report", "small", "tracking=none"))
     name = "small"
-    if how in (1, 2):
+    if kind in (1, 2):
         file = case.rng.choice(sorted(packaged("pipelines").glob("*.yaml")))
         name = file.stem
         tree = yaml.safe_load(file.read_text(encoding="utf-8"))

@@ -75,13 +75,13 @@ def _overwrite_formula(content, rng):
 @generator("mdf", weight=12)
 def measurement(case):
     case.copy("mdf/conf", "conf")
-    how = case.idea(2)
-    name = f"{case.rng.choice(list(VERSIONS))}_{4 if how == 0 else case.rng.randrange(4)}"
+    kind = case.idea(2)
+    name = f"{case.rng.choice(list(VERSIONS))}_{4 if kind == 0 else case.rng.randrange(4)}"
     file = case.write(
         f"raw/drive.{'mdf' if name.startswith('v3') else 'mf4'}",
         (case.templates / "mdf" / "files" / name).read_bytes(),
     )
-    case.spoil(file, (_overwrite_formula, spoil_bytes)[how])
+    case.spoil(file, (_overwrite_formula, spoil_bytes)[kind])
     return Command(
         case.rng.choice(
             [("data", "check", "measured"), ("data", "show", "measured"), ("ingest", "measured")]

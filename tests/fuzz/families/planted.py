@@ -33,8 +33,8 @@ def _finish():
     print("done")
 
 
-def _leave(code, said=""):
-    sys.stderr.write(said)
+def _leave(code, error_text=""):
+    sys.stderr.write(error_text)
     sys.exit(code)
 
 

@@ -30,13 +30,13 @@ def _reads(case, file):
 @generator(weight=8)
 def csv(case):
     file = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False))
-    how = case.idea(3)
-    if how == 2:
+    kind = case.idea(3)
+    if kind == 2:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         row = case.rng.choice([*rows[1:], rows[-1]])
         row[0] = repr(float(row[0]) + case.rng.choice([1e7, 1e9, 1e10, 1e18]))
         case.write("lap.csv", "\n".join(map(",".join, rows)) + "\n")
-    elif how == 0:
+    elif kind == 0:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         for row in case.rng.sample(rows, case.rng.choice([1, 1, 3, 50])):
             row[case.rng.randrange(len(row))] = case.rng.choice(CELLS)
