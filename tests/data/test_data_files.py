@@ -89,7 +89,10 @@ def test_files_of_dead_writers_are_swept_and_those_of_living_writers_stay(tmp_pa
 
 def test_killed_writers_leave_only_temporary_files(tmp_path):
     script = "import os, sys, pathlib\nfrom vehest.data.files import written_aside\n"
-    script += "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n    os.kill(os.getpid(), 9)\n"
+    script += (
+        "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n   "
+        " os.kill(os.getpid(), 9)\n"
+    )
     (tmp_path / "file").write_text("old")
     assert (
         subprocess.run(

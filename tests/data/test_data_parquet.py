@@ -1,4 +1,7 @@
-"""Parquet files of others: numbers come out as they went in; files that are damaged or beyond the limits are refused in one line."""
+"""Parquet files of others: numbers come out as they went in.
+
+Files that are damaged or beyond the limits are refused in one line.
+"""
 
 import numpy as np
 import pyarrow as pa
@@ -79,8 +82,8 @@ def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_
     file = written(tmp_path, columns())
     with use_limits(Limits(samples=999)):
         assert (
-            "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER"
-            in refused(file)
+            "holds 1000 rows, more than the limit of 999; if that is meant, raise it: "
+            "limits.samples=NUMBER" in refused(file)
         )
     zeros = written(
         tmp_path, {name: np.zeros(100_000) for name in ("time", "vx", "ay")}, compression="zstd"

@@ -1,4 +1,6 @@
-"""Sizes of pages in Parquet files: as pyarrow writes them, and of pages that unpack to more than a file says and may take."""
+"""Sizes of pages in Parquet files: as pyarrow writes them, and of pages that unpack to more than a
+file says and may take.
+"""
 
 import subprocess
 import sys

@@ -1,4 +1,6 @@
-"""Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles nothing."""
+"""Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles
+nothing.
+"""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,6 @@
-"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings, and splits of papers are theirs."""
+"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings,
+and splits of papers are theirs.
+"""
 
 import math
 import re
@@ -103,7 +105,8 @@ def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     )
     with pytest.raises(
         ConfigurationError,
-        match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, 6\) s\)",
+        match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, "
+        r"6\) s\)",
     ):
         Split("s", (Span("d", "r", 0, 10),), (Span("d", "v"),), {"wet": (Span("d", "r", 5, 6),)})
 
@@ -141,7 +144,8 @@ def test_plain_values_make_a_split_with_tests_alone():
         ),
         (
             {"train": "a"},
-            'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"',
+            'train must be a list of ranges, a percentage such as "60 %" or laps such as "last '
+            'lap"',
         ),
         ({"dataset": None}, "each range needs a dataset"),
     ],
@@ -152,7 +156,9 @@ def test_misspelt_splits_are_refused_in_a_single_line(changes, message):
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_shipped_splits_are_valid(file):
-    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any
+    other has what the split names.
+    """
 
     def cruising(dataset):
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
@@ -238,7 +244,8 @@ def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
 
 
 def test_conditions_select_segments_of_the_minimum_duration():
-    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
+    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the
+    # end. Limits belong to what is kept.
     ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
     keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
     split = selected_ranges(keep, drives({"train_1": ay}, start_time=50.0))
@@ -387,7 +394,10 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
 
 
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
-    """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
+    """A course of two straights and two unlike bends, driven at a speed of its own every lap.
+
+    And the distance of a lap [m].
+    """
     straight = 200.0
     radii = (60.0, 30.0)
     bends = [np.pi * radius for radius in radii]
@@ -578,7 +588,10 @@ def test_invalid_portions_are_refused_in_a_single_line(changes, message):
 
 
 def test_folds_are_never_scraps_and_gaps_stay_complete():
-    """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
+    """What is before the first lap and after the last belongs to them.
+
+    A gap reaches over blocks that are shorter than it.
+    """
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
         config = {

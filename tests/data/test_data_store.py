@@ -1,4 +1,6 @@
-"""The store: what is read back is what was written, bit for bit, and a failure leaves what was there before."""
+"""The store: what is read back is what was written, bit for bit, and a failure leaves what was
+there before.
+"""
 
 import math
 import tempfile

@@ -52,7 +52,9 @@ def fitted_sine(samples, time, frequency):
 
 
 def bilinear(frequency, cutoff_hz):
-    """Response of a second-order Butterworth filter made digital by the bilinear transform with pre-warping."""
+    """Response of a second-order Butterworth filter made digital by the bilinear transform with
+    pre-warping.
+    """
     warped = 1j * np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff_hz / RATE)
     return complex(1.0 / (warped**2 + math.sqrt(2.0) * warped + 1.0))
 
@@ -101,7 +103,9 @@ def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length):
 
 
 def test_reference_lever_brings_velocities_to_the_centre_of_gravity():
-    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
+    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a
+    fixed point.
+    """
     yaw_rate = np.array([0.0, 0.4, -0.3])
     vx = np.full(3, 15.0)
     vy = np.array([0.0, -0.2, 0.4])
@@ -172,9 +176,11 @@ def test_a_few_impossible_samples_are_bridged_by_lines_and_many_stay(beside):
 
 
 def rigid_body(lever_x, lever_y, yaw):
-    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
+    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does
+    at its centre of gravity.
 
-    The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
+    The sensor's acceleration comes from differentiating its position in the plane twice, not from
+    rigid-body formulae.
     """
     time = np.arange(800) / RATE
     step = 2e-4
@@ -294,7 +300,10 @@ WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
 
 
 def rolling(**damages):
-    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
+    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed.
+
+    ``shown`` replaces channels.
+    """
     time = np.arange(2000) / RATE
     u = 8.0 + 3.0 * np.sin(0.7 * time)
     yaw_rate = 0.3 * np.sin(0.9 * time)
@@ -411,7 +420,9 @@ def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
 
 
 def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
-    """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of smooth signals."""
+    """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of
+    smooth signals.
+    """
     time = np.arange(4000) / 100.0
     vx = 3.0 + 0.5 * np.sin(time)
     vy = 0.4 * np.sin(1.3 * time)
@@ -482,6 +493,7 @@ def test_chunked_and_spectral_computations_equal_the_direct_computation(monkeypa
 def test_a_window_longer_than_the_limit_is_refused():
     with pytest.raises(
         DataError,
-        match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples",
+        match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; "
+        r".*limits\.filter_samples",
     ):
         windows_of([lap()], ["vx"], "ay", 2_000_000)

@@ -69,7 +69,8 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ({"names": "a"}, "it.names must be a list of names, not 'a'"),
         (
             {"inner": [{"gain": 1, "gian": 1}]},
-            "it.inner.0.gian is not an option of it.inner.0; did you mean 'it.inner.0.gain'? options: gain, steps",
+            "it.inner.0.gian is not an option of it.inner.0; did you mean 'it.inner.0.gain'? "
+            "options: gain, steps",
         ),
         ({"lists": [3]}, "it.lists.0 must be a list, not 3"),
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
@@ -85,7 +86,8 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ({"inner": [{"gain": float("nan")}]}, "'f': inner.0.gain must be a number, not nan"),
         (
             {"other": 1},
-            "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, maps",
+            "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, "
+            "maps",
         ),
         (
             {"names": {1, 2}},
@@ -175,7 +177,8 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
     for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
         with pytest.raises(
             ConfigurationError,
-            match=r"limits\.(samples must be a whole number|samples: input should be greater than 0|values is not an option .*samples)",
+            match=r"limits\.(samples must be a whole number|samples: input should be greater than "
+            r"0|values is not an option .*samples)",
         ):
             limits_from_config(wrong)
 
@@ -188,7 +191,8 @@ def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more()
         check_unpacked("f", 200, 3000)
         with pytest.raises(
             DataError,
-            match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER",
+            match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, "
+            r".*limits\.memory=NUMBER",
         ):
             check_unpacked("f", 200, 3001)
 

@@ -29,7 +29,9 @@ def fitted(name, drive, **settings):
 
 
 def steady_drive(car, seconds=30.0):
-    """Steady cornering of the linear single track at several speeds and steering angles: v and r solve 0 = A x + B δ at each sample."""
+    """Steady cornering of the linear single track at several speeds and steering angles: v and r
+    solve 0 = A x + B δ at each sample.
+    """
     generator = np.random.default_rng(3)
     vx = generator.uniform(8.0, 35.0, round(20 * seconds))
     steer = generator.uniform(-0.05, 0.05, len(vx))
@@ -71,7 +73,9 @@ def test_static_map_identifies_and_data_sheet_computes_a_linear_single_track():
 
 
 def test_prior_map_is_the_static_map_with_prior_parameters():
-    """At the filter's centre of gravity, for a car of full size and for a small one whose tyres slip more."""
+    """At the filter's centre of gravity, for a car of full size and for a small one whose tyres
+    slip more.
+    """
     drive = steady_drive(CAR)
     for wheelbase, compliance in ((2.7, 0.0045), (0.3, 0.0135)):
         (estimate,) = new("prior_map", wheelbase=wheelbase).estimate([drive.without_references()])

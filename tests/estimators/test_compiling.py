@@ -1,4 +1,6 @@
-"""Compilation that keeps a first training waiting is said beforehand, once, and what it compiles has the digits of every later run."""
+"""Compilation that keeps a first training waiting is said beforehand, once, and what it compiles
+has the digits of every later run.
+"""
 
 import ast
 import importlib
@@ -62,7 +64,7 @@ def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(t
 
 
 def test_code_with_reordered_sums_is_compiled_in_a_single_way():
-    """`fastmath` outside `kernels.compiling` would bring back a first run with digits of its own."""
+    """`fastmath` outside `kernels.compiling` would give the first run different digits."""
     source = Path(vehest.__file__).parent
     decorated = [
         f"{path.relative_to(source)}:{call.lineno}"

@@ -1,4 +1,6 @@
-"""The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre forces and without."""
+"""The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre
+forces and without.
+"""
 
 import sys
 from dataclasses import replace
@@ -197,7 +199,9 @@ def test_levels_come_from_moving_samples_and_are_tuned_on_the_scored_reference()
 
 
 def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
-    """Going on identifies again; a network trained behind half a search would then meet another filter."""
+    """Going on identifies again; a network trained behind half a search would then meet another
+    filter.
+    """
     drives = [dugoff_drive(3.0)]
     estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
     before = {

@@ -1,4 +1,6 @@
-"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing, trainings that start from others."""
+"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing,
+trainings that start from others.
+"""
 
 import math
 from dataclasses import fields

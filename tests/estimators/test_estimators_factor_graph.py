@@ -1,4 +1,6 @@
-"""The factor graph against sparse least squares over its factors, and against a filter with the same noise."""
+"""The factor graph against sparse least squares over its factors, and against a filter with the
+same noise.
+"""
 
 from dataclasses import replace
 
@@ -31,7 +33,9 @@ def drive_with_gaps(seconds=2.0):
 
 
 def least_squares(estimator, drive, first, last, start, deviation):
-    """States first … last by sparse least squares over the equations that factors stand for, (last - first + 1, 2)."""
+    """States first … last by sparse least squares over the equations that factors stand for, (last
+    - first + 1, 2).
+    """
     noise = estimator.settings.noise
     A, B, C, D = estimator.sampled_model(drive["vx"])
     entries = []

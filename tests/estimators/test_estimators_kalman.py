@@ -1,4 +1,6 @@
-"""The Kalman filter over the single track: consistent on its own model, honest about where its noise levels come from."""
+"""The Kalman filter over the single track: consistent on its own model, honest about where its
+noise levels come from.
+"""
 
 from dataclasses import replace
 
@@ -63,7 +65,9 @@ def test_configured_levels_are_not_read_and_need_no_training():
 
 
 def test_samples_that_are_missing_are_skipped():
-    """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it knows less."""
+    """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it
+    knows less.
+    """
     drive, states = linear_drive(30.0, seed=5)
     gappy = with_gaps(drive, {"ay": slice(1000, 1200), "yaw_rate": slice(1100, 1200)})
     estimator = kalman(**CONFIGURED_NOISE)
@@ -116,12 +120,14 @@ def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed()
         (
             "steer",
             np.zeros(3000),
-            "'linear': channel 'steer' has no noise that could be read off it; give estimator.noise.steer",
+            "'linear': channel 'steer' has no noise that could be read off it; give "
+            "estimator.noise.steer",
         ),
         (
             "ay",
             np.full(3000, np.nan),
-            "channel 'ay': 75 samples without a gap are needed to read a noise level; give estimator.noise.ay",
+            "channel 'ay': 75 samples without a gap are needed to read a noise level; give "
+            "estimator.noise.ay",
         ),
     ],
 )
@@ -154,7 +160,9 @@ def with_planted_offsets(seed, ay, steer):
 
 
 def augmented(drive, ay, steer, seconds):
-    """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
+    """β, r and two offsets filtered by the textbook's equations, all matrices written out: means
+    (T, 4), covariances (T, 4, 4).
+    """
     A, B, C, D = kalman(**CONFIGURED_NOISE).sampled_model(drive["vx"])
     decay = np.exp(-0.01 / seconds)
     mean = np.zeros(4)

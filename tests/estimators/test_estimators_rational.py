@@ -1,4 +1,6 @@
-"""Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again, bad input survived."""
+"""Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again,
+bad input survived.
+"""
 
 import importlib.util
 
@@ -42,7 +44,9 @@ def drive():
 
 
 def readable(estimator, samples):
-    """The extended filter of the same model, with Jacobians from automatic differentiation, step by step."""
+    """The extended filter of the same model, with Jacobians from automatic differentiation, step by
+    step.
+    """
     first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
     return extended_filter(
         rational_model(estimator),
@@ -105,7 +109,9 @@ def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
 
 @pytest.mark.parametrize("unstable", [False, True])
 def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
-    """A bend of 15 s without measurements: with too soft a rear axle the model spins, of which no filter may be sure."""
+    """A bend of 15 s without measurements: with too soft a rear axle the model spins, of which no
+    filter may be sure.
+    """
     curves = {**CURVES, "c2_rear": (0.5 if unstable else 1.0) * CURVES["c2_rear"]}
     estimator = rational("rational", curves=curves)
     count = round(15.0 * estimator.settings.rate_hz)
@@ -125,7 +131,9 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
 
 @pytest.mark.parametrize("tyres", KINDS)
 def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres, drive):
-    """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
+    """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what
+    they were.
+    """
     estimator = rational(tyres, largest_sideslip=np.radians(1.5))
     short = drive.cut(0.0, 8.0)
     samples = short.stack(estimator.channels)
@@ -170,7 +178,9 @@ def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncerta
 
 
 def test_changed_tyres_and_friction_are_identified_and_reduce_the_error():
-    """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and half the error of fixed tyres."""
+    """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and
+    half the error of fixed tyres.
+    """
     worn = rational_drive(120.0, seed=2, stiffness=0.85)
     adaptive = rational().estimate([worn])[0]
     fixed = rational("rational").estimate([worn])[0]
@@ -193,7 +203,9 @@ def test_changed_tyres_and_friction_are_identified_and_reduce_the_error():
 
 
 def test_tyre_states_are_constant_straight_ahead_and_adapt_in_bends(drive):
-    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
+    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no
+    longer moves them.
+    """
     estimator = rational(adapt_above=2.0)
     filtered = estimator.filter_samples(drive.stack(estimator.channels))
     before = filtered.mean[:-1, 4:]
@@ -225,7 +237,8 @@ def test_tyre_parameters_stay_inside_bounds_wider_than_the_initial_uncertainty(d
         states = estimator.filter_samples(absurd.stack(estimator.channels)).mean[:, 4:]
         assert np.abs(states).max() == pytest.approx(np.log(1.5)), "the bound is reached"
         assert (np.abs(states) <= np.log(1.5)).all()
-    # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations.
+    # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard
+    # deviations.
     wide = rational(curves={**CURVES, "deviation": 0.5})
     narrow = rational()
     assert wide.model().bounds[4:] == pytest.approx([1.5] * 4)
@@ -281,7 +294,9 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
 
 @pytest.mark.parametrize("fault", ["slip", "force"])
 def test_stiffness_intervals_cover_the_truth_with_offset_sensors(fault):
-    """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals show neither."""
+    """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals
+    show neither.
+    """
     drive = rational_drive(60.0, seed=4)
     wrong = {
         "slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)},

@@ -1,4 +1,6 @@
-"""Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting states, long drives."""
+"""Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting
+states, long drives.
+"""
 
 import numpy as np
 import pytest
@@ -55,7 +57,9 @@ def _phase(estimator, training, train, validation):
 def test_validation_loss_is_the_weighted_squared_error_without_dropped_samples(
     name,
 ):
-    """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
+    """Sequences of 100 samples from the start of the drive on, each estimated by itself through the
+    public interface.
+    """
     estimator = _estimator(name)
     record = estimator.fit(DATA, QUICK)
     errors = []
@@ -71,7 +75,9 @@ def test_validation_loss_is_the_weighted_squared_error_without_dropped_samples(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_error_in_dropped_samples_teaches_nothing(name):
-    """References that differ only where every possible sequence drops its samples lead to the same weights."""
+    """References that differ only where every possible sequence drops its samples lead to the same
+    weights.
+    """
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
     complete = _drive(seed=1)
     spoilt = {
@@ -145,7 +151,9 @@ def test_sequences_start_at_random_within_recordings_and_dropout_keeps_the_mean(
 
 
 def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
-    """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
+    """Pieces of both drives, padded, their stretches in order: rows that count are the drives'
+    rows, each once, in whatever order.
+    """
     training = SequenceSettings(
         PhaseSettings(max_epochs=1),
         60,
@@ -172,7 +180,10 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
-    """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
+    """Losses of stretches are those of the sequence as a whole.
+
+    The second stretch's gradient is that of a start that is a constant.
+    """
     training = SequenceSettings(
         PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1
     )
@@ -248,7 +259,10 @@ def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name, monk
 
 
 def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
-    """h, c by the gates written out; then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64."""
+    """h, c by the gates written out.
+
+    Then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64.
+    """
     estimator = _estimator("velocity_lstm", n_dense=5)
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     w = estimator.weights()
@@ -294,12 +308,14 @@ def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
 def test_recordings_too_short_or_with_gaps_are_a_clear_error():
     with pytest.raises(
         DataError,
-        match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it",
+        match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, "
+        r"'drive 2' 50; lower it",
     ):
         _estimator("velocity_gru").fit(DATA, SequenceSettings())
     with pytest.raises(
         DataError,
-        match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60",
+        match=r"'drive 2' is 50 samples long: too short to validate on with "
+        r"training\.dropped_steps 60",
     ):
         _estimator("velocity_gru").fit(
             FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60)

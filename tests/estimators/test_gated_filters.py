@@ -1,4 +1,7 @@
-"""Filters with a gate: a spike does no harm, a jump is followed, online is batch; a step that raises leaves any stepper as it was."""
+"""Filters with a gate: a spike does no harm, a jump is followed, online is batch.
+
+A step that raises leaves any stepper as it was.
+"""
 
 import math
 from dataclasses import replace
@@ -49,7 +52,10 @@ EVERY_FILTER = pytest.mark.parametrize("name", CONFIGS)
 
 
 def estimator(name, gate=None):
-    """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
+    """As it starts to learn, which is enough for filtering.
+
+    Weights are the same with a gate and without.
+    """
     gated = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
     gated.seed(0)
     if name in ("ensemble_ukf", "cnn_ukf"):
@@ -64,7 +70,7 @@ def estimator(name, gate=None):
 
 @cache
 def drive(name):
-    """Two drives one after the other, as if the car had jumped from the one motion into the other."""
+    """Two drives one after the other, as if the car had jumped from one motion to another."""
     first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
     return replace(
         first,
@@ -107,7 +113,10 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
     gated = estimator("cnn_ukf", 6.0)
     pseudo_of = gated.pseudo_of
     at = round(SPIKE * 100.0)
-    sure = lambda inputs: pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
+
+    def sure(inputs):
+        return pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))
+
     monkeypatch.setattr(gated, "pseudo_of", sure)
     clean = vy(gated, drive("cnn_ukf"))
 

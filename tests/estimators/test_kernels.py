@@ -30,7 +30,10 @@ STRUCTURES = [
 
 
 def _problem(estimator, dtype, members=3, batch=70):
-    """Parameters of several members, windows of each, and the series; batch is no multiple of the lanes."""
+    """Parameters of several members, windows of each, and the series.
+
+    Batch is no multiple of the lanes.
+    """
     drive = planar_drive()
     network = estimator.network_for([drive]).to(dtype)
     windows = windows_of([drive], estimator.channels, "vy_ref", 30)
@@ -110,7 +113,10 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
 
 
 def test_compiled_ksnn_matches_at_and_beyond_its_centres():
-    """Yaw rates at centres, between them and beyond the last one; the lanes of a block are in different local models."""
+    """Yaw rates at centres, between them and beyond the last one.
+
+    The lanes of a block are in different local models.
+    """
     estimator = Ksnn(Ksnn.settings_type(n_local=4, n_hidden=2, bias=True))
     drive = planar_drive()
     network = estimator.network_for([drive]).double()

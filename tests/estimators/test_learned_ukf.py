@@ -1,4 +1,4 @@
-"""The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
+"""The learned filter as an estimator: candidates, starts, dropouts, members, and refusals."""
 
 from functools import cache
 
@@ -95,7 +95,8 @@ def test_variants_are_called_and_parameters_counted_as_in_the_paper():
     assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {
         name: name for name in cases
     }
-    # A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state.
+    # A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of
+    # its dependence on the state.
     ukf = estimator_class("learned_ukf").from_config({})
     assert ukf.settings == LearnedUkf.settings_type()
     network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
@@ -131,7 +132,9 @@ def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
 
 
 def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training():
-    """A sliding car's lateral velocity to less than half of its deviation, which a filter that calls it zero does not reach."""
+    """A sliding car's lateral velocity to less than half of its deviation, which a filter that
+    calls it zero does not reach.
+    """
     recording = small_car_drive(6.0, 3)
     start = {name: float(recording[reference][0]) for name, reference in REFERENCES.items()}
     estimate = trained().estimate([recording.without_references()], start)[0]

@@ -1,4 +1,6 @@
-"""Filters that take a network's word: how much it counts, online and in batch, gradients end to end, what is lost on the way."""
+"""Filters that take a network's word: how much it counts, online and in batch, gradients end to
+end, what is lost on the way.
+"""
 
 from dataclasses import fields, replace
 
@@ -69,7 +71,7 @@ def filter_alone(estimator):
 
 
 def end_to_end(batch_size=4, dropout=0.0):
-    """A network that is not trained yet, in double precision, and its training through the filter."""
+    """An untrained network in double precision, and its training through the filter."""
     estimator = estimator_of("cnn_ukf", dropout=dropout)
     raw = learnt_samples(DATA.train, estimator.network_inputs, estimator.name)
     estimator.network.double().scale(*raw)
@@ -179,7 +181,7 @@ def test_pre_training_has_the_loss_of_the_formulas_and_the_filters_process_noise
 
 
 def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch):
-    """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
+    """Eq. 7 on a full recording, with outputs of the network and estimates of the filter."""
     monkeypatch.setattr(
         cnn_ukf, "START", (EXACT_STATE_DEVIATION, EXACT_STATE_DEVIATION)
     )  # as precise as a state that is handed over
@@ -254,7 +256,8 @@ def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_traini
     batch.driven[:, 7, 1] = torch.nan
     with pytest.raises(
         DataError,
-        match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of the batch's 4",
+        match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of "
+        r"the batch's 4",
     ):
         training.loss(batch)
     assert training.place(830) == "0.30 s of recording 'second'"

@@ -1,4 +1,6 @@
-"""Networks over single samples: compiled layers, masks of dropout, members that do not touch each other, and the feed-forward network."""
+"""Networks over single samples: compiled layers, masks of dropout, members that do not touch each
+other, and the feed-forward network.
+"""
 
 from dataclasses import replace
 

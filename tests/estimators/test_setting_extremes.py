@@ -1,4 +1,6 @@
-"""Every numeric setting at its extremes: refused in one line, or the estimator runs to finite numbers within the guard's bound."""
+"""Every numeric setting at its extremes: refused in one line, or the estimator runs to finite
+numbers within the guard's bound.
+"""
 
 import math
 from contextlib import suppress

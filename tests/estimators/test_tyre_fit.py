@@ -112,7 +112,9 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
 
 
 def test_priors_of_road_tyres_remain_where_drives_do_not_reach_the_bend():
-    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
+    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the
+    drive says.
+    """
     fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
     assert (
         np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - ROAD_TYRE_LOG_C1[0])

@@ -1,4 +1,6 @@
-"""Scores of bands, covariances, innovations, delays and misses of detections against closed forms and simulations."""
+"""Scores of bands, covariances, innovations, delays and misses of detections against closed forms
+and simulations.
+"""
 
 import math
 from dataclasses import replace
@@ -59,7 +61,10 @@ def part_of(rng, seconds=100.0, deviation=0.1):
 
 
 def test_interval_score_of_a_gaussian_matches_its_closed_form():
-    """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ; each side misses with the same."""
+    """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ.
+
+    Each side misses with the same.
+    """
     errors = np.random.default_rng(0).standard_normal(400_000)
     for level in (0.5, 0.9):
         z = stats.norm.ppf(0.5 + 0.5 * level)
@@ -104,7 +109,10 @@ def test_intraclass_correlation_of_planted_variances():
 
 
 def test_coverage_intervals_contain_the_truth_with_correlated_blocks():
-    """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
+    """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9.
+
+    Three standard errors are 0.015.
+    """
     rng = np.random.default_rng(3)
     n_covered = 0
     for _ in range(2000):
@@ -215,7 +223,9 @@ DRIVES = [linear_drive(60.0, seed=seed)[0] for seed in range(3)]
 
 
 def figures_of_kalman(factor):
-    """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor`` times what it is."""
+    """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor``
+    times what it is.
+    """
     noise = {name: factor * level for name, level in NOISE.items()} | {"steer_factor": 1.0}
     estimator = estimator_class("kalman").from_config({"noise": noise})
     estimates = estimator.estimate([drive.without_references() for drive in DRIVES])

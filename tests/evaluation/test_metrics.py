@@ -1,4 +1,6 @@
-"""Metrics, best lever arms and indicators over manoeuvres against their definitions on series whose errors are known."""
+"""Metrics, best lever arms and indicators over manoeuvres against their definitions on series whose
+errors are known.
+"""
 
 import math
 from dataclasses import replace

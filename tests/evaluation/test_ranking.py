@@ -1,4 +1,6 @@
-"""Blocks, intervals of single figures, and who may be called best, on errors whose outcome is known."""
+"""Blocks, intervals of single figures, and who may be called best, on errors whose outcome is
+known.
+"""
 
 import numpy as np
 import pytest
@@ -71,7 +73,9 @@ def test_segments_reproduce_the_metrics(tmp_path):
 
 
 def with_stop(part, seconds=12.0):
-    """The same range with a stop at its end, in which sideslip is not scored and its error is 90 degrees."""
+    """The same range with a stop at its end, in which sideslip is not scored and its error is 90
+    degrees.
+    """
     n = round(seconds * RATE)
     columns = {"vy": 0.0, "vy_ref": 0.0, "sideslip": np.pi / 2, "sideslip_ref": 0.0, "ay": 0.0}
     stopped = {
@@ -116,7 +120,9 @@ def test_a_stop_changes_no_ranking_and_no_interval_of_sideslip():
 
 @pytest.mark.parametrize("memory", [0.3, 0.5, 0.9, 0.95])
 def test_block_length_is_that_of_another_library(memory):
-    """Which begins to look for insignificant autocorrelations one lag earlier than the paper says, and so has a window wider by two."""
+    """Which begins to look for insignificant autocorrelations one lag earlier than the paper says,
+    and so has a window wider by two.
+    """
     values = np.square(coloured(np.random.default_rng(7), 900, memory))
     expected = float(optimal_block_length(values)["circular"].iloc[0])
     covariances = _pooled_covariances([values])

@@ -1,4 +1,6 @@
-"""Regimes of a drive against one whose every sample is known, and their errors against those of all samples."""
+"""Regimes of a drive against one whose every sample is known, and their errors against those of all
+samples.
+"""
 
 import csv
 import json
@@ -18,7 +20,9 @@ ALL = Protocol(RATE, 0.0, 0.0)
 
 
 def stepped_drive():
-    """Ten seconds straight ahead, ten in a circle at 3 m/s², ten at 7 m/s², with steep ramps of 1.2 s and 1.5 s between."""
+    """Ten seconds straight ahead, ten in a circle at 3 m/s², ten at 7 m/s², with steep ramps of 1.2
+    s and 1.5 s between.
+    """
     time = np.arange(600) / RATE
     ay = np.interp(time, [0, 10, 11.2, 20, 21.5, 30], [0, 0, 3, 3, 7, 7])
     vy = 0.1 * np.sin(time)

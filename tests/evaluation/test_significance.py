@@ -23,7 +23,9 @@ LENGTH = 100
 
 
 def losses(generator, n_seeds, seed_level=0.0, has_seed_noise=False):
-    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own, and a level of each seed."""
+    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own,
+    and a level of each seed.
+    """
     white = generator.standard_normal((n_seeds if has_seed_noise else 1, N_SEQUENCES, LENGTH))
     noise = signal.lfilter([1.0], [1.0, -0.95], white, axis=2)
     return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
@@ -102,7 +104,10 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
 
 
 def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds():
-    """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
+    """Welch-Satterthwaite of one part of the variance: its own degrees of freedom.
+
+    Of two equal ones: their sum.
+    """
     sizes = np.ones(40)
     even = np.full((3, 40), 0.0)
     seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]
@@ -124,7 +129,9 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds():
 
 
 def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
-    """Expected squared error of the mean, worked out from the variances that the values are drawn with."""
+    """Expected squared error of the mean, worked out from the variances that the values are drawn
+    with.
+    """
     rng = np.random.default_rng(2)
     deviations = {"blocks": 0.5, "seeds": 0.3, "single": 0.8}
     n_seeds = 4

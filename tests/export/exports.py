@@ -1,4 +1,6 @@
-"""Exports of every family: fitted for a moment, with limits, health and bands, written, built and run."""
+"""Exports of every family: fitted for a moment, with limits, health and bands, written, built and
+run.
+"""
 
 import shutil
 import subprocess
@@ -46,7 +48,9 @@ def tool(name):
 
 
 WELL_CONDITIONED = {"learned_ukf": {"dynamics": "pacejka", "noise": "constant"}}
-"""Variants that do not amplify rounding: two seconds of training leave the learnt noise ill-conditioned, so that a last digit grows."""
+"""Variants that do not amplify rounding: two seconds of training leave the learnt noise
+ill-conditioned, so that a last digit grows.
+"""
 
 
 @cache
@@ -181,7 +185,9 @@ class Export:
         return self.compared()
 
     def compared(self):
-        """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
+        """The largest difference of vy, sideslip and both bands, and how many rows have another
+        health or, in double, reason.
+        """
         computed, expected = (
             np.genfromtxt(self.folder / name, delimiter=",", skip_header=1)
             for name in ("out.csv", "expected.csv")

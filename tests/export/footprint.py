@@ -1,4 +1,6 @@
-"""What an export takes: bytes of state, code and tables, and the worst case of its stack, as compilers that are there say it."""
+"""What an export takes: bytes of state, code and tables, and the worst case of its stack, as
+compilers that are there say it.
+"""
 
 import re
 import shutil
@@ -55,7 +57,10 @@ class Footprint:
 
 
 def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
-    """What files, name -> text, take on a target, main.c aside; None where there is no compiler for it, or it cannot say."""
+    """What files, name -> text, take on a target, main.c aside.
+
+    None where there is no compiler for it, or it cannot say.
+    """
     if target.compiler is None:
         return None
     with tempfile.TemporaryDirectory() as temporary:
@@ -109,7 +114,10 @@ def _sections(text: str) -> tuple[int, int, int]:
 
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``; functions that are called and absent."""
+    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``.
+
+    Functions that are called and absent.
+    """
     stack_of = {}
     calls = {}
     functions = set()

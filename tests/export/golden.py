@@ -1,4 +1,7 @@
-"""Golden files: the C of models with weights set by hand. `python tests/export/golden.py` writes them anew after a wanted change."""
+"""Golden files: the C of models with weights set by hand.
+
+`python tests/export/golden.py` writes them anew after a wanted change.
+"""
 
 import re
 import sys
@@ -106,7 +109,10 @@ def sources():
 
 
 def differences(text, golden):
-    """Where a text is another than the golden one; numbers may differ in their last digits, as they do between machines."""
+    """Where a text is another than the golden one.
+
+    Numbers may differ in their last digits, as they do between machines.
+    """
     ours = text.splitlines()
     theirs = golden.splitlines()
     if len(ours) != len(theirs):

@@ -1,4 +1,5 @@
-"""Rules of MISRA C:2012 that cppcheck finds broken in the C of all families with weights set by hand, counted.
+"""Rules of MISRA C:2012 that cppcheck finds broken in the C of all families with weights set by
+hand, counted.
 
 `python tests/export/misra.py` prints the counts of docs/export.md.
 """
@@ -31,7 +32,10 @@ def version():
 
 
 def cppcheck_findings(home):
-    """How often each rule is broken, and what cppcheck finds beside, a line each; the C is written into ``home``."""
+    """How often each rule is broken, and what cppcheck finds beside, a line each.
+
+    The C is written into ``home``.
+    """
     write(methods(FAMILIES) | contract(), home)
     rules = Counter()
     further_findings = []

@@ -8,10 +8,10 @@ from vehest.export.program import TOLERANCES
 
 pytestmark = pytest.mark.export
 
-NOT_IN_FLOAT = (
-    "learned_ukf",
-)  # its drive has a motor speed that follows vx to more digits than a float has: health sees rounding
-IN_FAULTS = 1e-7  # of bands beside faults: Python's own covariances lose digits there, which square roots in C keep
+# its drive has a motor speed that follows vx to more digits than a float has: health sees rounding
+NOT_IN_FLOAT = ("learned_ukf",)
+# of bands beside faults: Python's own covariances lose digits there, which square roots in C keep
+IN_FAULTS = 1e-7
 
 
 @pytest.mark.parametrize("family", FAMILIES)

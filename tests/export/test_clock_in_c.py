@@ -1,4 +1,6 @@
-"""A clock fault in C has the same consequences as in Python, at the same call, with the same reason."""
+"""A clock fault in C has the same consequences as in Python, at the same call, with the same
+reason.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +21,10 @@ FAULT_SECONDS = 2.0  # after which the clock resumes
 
 
 def stamped(export, kind):
-    """Write in.csv, a drive whose clock fails for a while, and expected.csv; the number of the faulted sample."""
+    """Write in.csv, a drive whose clock fails for a while, and expected.csv.
+
+    The number of the faulted sample.
+    """
     stepper = export.stepper()
     rate = stepper.input_rate_hz
     plain = drive(stepper.estimator, 5, 6.0)

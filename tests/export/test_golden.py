@@ -1,4 +1,6 @@
-"""A changed generator shows as a changed golden file, and counts of the rules of MISRA as other counts."""
+"""A changed generator shows as a changed golden file, and counts of the rules of MISRA as other
+counts.
+"""
 
 from pathlib import Path
 
@@ -16,7 +18,8 @@ def test_the_c_of_models_set_by_hand_is_that_of_the_golden_files():
     for name, text in files.items():
         changed = differences(text, (FOLDER / name).read_text(encoding="utf-8"))
         assert not changed, (
-            f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look at what git shows"
+            f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look "
+            f"at what git shows"
         )
     stored = {str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*") if path.is_file()}
     assert stored == set(files)

@@ -1,4 +1,6 @@
-"""A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
+"""A method in C says what Python's stepper says, sample by sample: gaps, restarts and float
+included.
+"""
 
 import copy
 from collections import namedtuple
@@ -103,7 +105,7 @@ def _case(name, config):
 
 
 def of_dugoff(name, config):
-    """A filter with known tyres; a network with random weights, as sure of itself as a trained one."""
+    """A filter with known tyres, and a network with random weights and trained variances."""
     estimator = estimator_class(name).from_config(config)
     if isinstance(estimator, NetworkUkf):
         inputs = np.stack([dugoff_channels()[name] for name in estimator.network_inputs], 1)
@@ -122,7 +124,9 @@ def of_dugoff(name, config):
 
 @cache
 def dugoff_channels():
-    """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
+    """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with
+    all tyre forces.
+    """
     generator = np.random.default_rng(1)
     time = np.arange(1200) / 100.0
     n = len(time)
@@ -156,7 +160,9 @@ def widened(estimator):
 
 
 def disturbed(estimator, rows):
-    """One in twenty samples missing of what may be, and values on which a method without memory of them has to start anew."""
+    """One in twenty samples missing of what may be, and values on which a method without memory of
+    them has to start anew.
+    """
     rows = rows.copy()
     generator = np.random.default_rng(0)
     for name in estimator.skippable:
@@ -176,7 +182,10 @@ def disturbed(estimator, rows):
 
 
 def stepped(estimator, rows):
-    """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
+    """What Python's stepper says, (T, 4), and whether it did, (T,).
+
+    After an error it starts anew.
+    """
     out = np.full((len(rows), len(OUTPUTS)), np.nan)
     fine = np.ones(len(rows), bool)
     stepper = estimator.online()
@@ -215,7 +224,9 @@ each_precision = pytest.mark.parametrize(
 @each_variant
 @each_precision
 def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest, tmp_path):
-    """Filters have no float32 in Python but in networks, so that float in C is held against float64."""
+    """Filters have no float32 in Python but in networks, so that float in C is held against
+    float64.
+    """
     case = case_of(*variant)
     check(
         built(case.estimator, precision, tmp_path),
@@ -226,7 +237,7 @@ def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest
 
 
 def rows_at_low_speed(estimator):
-    """A car that stands, moves off, rolls below the minimum speed, reverses and starts anew there."""
+    """A car that stands, moves off, rolls below the minimum speed, reverses and restarts."""
     generator = np.random.default_rng(2)
     time = np.arange(0.0, 40.0, 1.0 / estimator.rate_hz)
     speed = np.interp(time, [0.0, 3.0, 10.0, 16.0, 24.0, 32.0, 40.0], [0, 0, 9, 2, 2, -4, 12])
@@ -333,9 +344,11 @@ def test_sources_are_plain_c_and_their_literals_have_the_type(precision):
 
 
 def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp_path):
-    """Sensors far too trusted, and κ = -2: without the mean point's negative weight, or lifted by their eigenvalues.
+    """Sensors far too trusted, and κ = -2: without the mean point's negative weight, or lifted by
+    their eigenvalues.
 
-    A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more than elsewhere.
+    A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more
+    than elsewhere.
     """
     hard = copy.deepcopy(
         case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator
@@ -447,10 +460,11 @@ def test_learned_filters_agree_over_a_real_drive_of_the_small_car(dynamics, data
 def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(
     dynamics, data_root, tmp_path
 ):
-    """A network that learnt for seconds makes a filter that forgets slowly, and its largest error from rounding is a matter of chance.
+    """A network that learnt for seconds makes a filter that forgets slowly, and its largest error
+    from rounding is a matter of chance.
 
-    Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in Python and in C alike; the median
-    hardly moves. So both are compared over nine such drives.
+    Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in
+    Python and in C alike; the median hardly moves. So both are compared over nine such drives.
     """
     case = small_car(data_root, dynamics)
     generator = np.random.default_rng(0)

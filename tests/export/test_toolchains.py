@@ -1,4 +1,6 @@
-"""Exports under the compilers, analysers and emulators that a control unit's engineer would try them with."""
+"""Exports under the compilers, analysers and emulators that a control unit's engineer would try
+them with.
+"""
 
 import re
 
@@ -141,7 +143,9 @@ def test_a_cortex_m4f_without_an_operating_system_finds_the_same(tmp_path, place
 
 
 def run_on_board(export, board):
-    """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was said."""
+    """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was
+    said.
+    """
     compiler = tool("arm-none-eabi-gcc")
     emulator = tool(BOARD[0])
     options = [*STRICT, *ARM, "-I."]

@@ -50,7 +50,9 @@ def tensors(parts):
 
 
 def dense_posterior(model, measurements, initial, n_measured):
-    """Mean and covariance of all states at once, given the measurements of the first samples; and their log-density.
+    """Mean and covariance of all states at once, given the measurements of the first samples.
+
+    And their log-density.
 
     Written down as one normal distribution of x[0], w[0], w[1], … and v[0], v[1], …: no recursion.
     """
@@ -118,7 +120,10 @@ def test_unmeasured_samples_keep_the_prediction():
 
 
 def test_covariances_stay_symmetric_and_positive():
-    """From a first variance of 1e10 down to 1e-6; the short form of the update, (I - KC)P, turns negative on the way."""
+    """From a first variance of 1e10 down to 1e-6.
+
+    The short form of the update, (I - KC)P, turns negative on the way.
+    """
     model, measurements, _ = example(300, seed=8)
     model = model._replace(
         process_noise=1e-6 * model.process_noise, observation_noise=1e-6 * model.observation_noise

@@ -1,4 +1,7 @@
-"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for; noise levels read off signals."""
+"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for.
+
+Noise levels read off signals.
+"""
 
 import numpy as np
 import pytest
@@ -110,7 +113,10 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
 
 
 def test_high_passed_level_measures_white_noise_and_ignores_slow_signals():
-    """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency; 2 % leaves room for the filter's slopes."""
+    """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency.
+
+    2 % leaves room for the filter's slopes.
+    """
     noise = 0.3 * np.random.default_rng(0).standard_normal(100_000)
     for cutoff in (0.1, 0.2):
         assert high_passed_level([noise], cutoff) == pytest.approx(

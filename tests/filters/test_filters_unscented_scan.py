@@ -1,4 +1,7 @@
-"""The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
+"""The compiled scan is the readable unscented filter, in values and gradients.
+
+That one is filterpy's to 1e-8 (test_filters_nonlinear).
+"""
 
 import dataclasses
 from collections import namedtuple
@@ -38,7 +41,8 @@ def learnt(first):
 
 
 def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
-    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances.
+    """The pendulum by the readable filter and by the scan: what they return, and gradients of a
+    random sum of means and covariances.
 
     Those of the measurements come last.
     """
@@ -159,13 +163,17 @@ VARIANCES = torch.tensor(
     [[20.0, 20, 20], [1, 20, 20], [2.9, 20, 20], [-2, 20, 20], [20, 0.5, 20], [20, 20, 20]],
     dtype=torch.float64,
 )
-"""Of squares at three samples, by which the negative weight of the mean point costs nothing, the definiteness of the innovation, that of
-the state after it, the innovation's even without that weight, and that of the innovation at the second sample. The last sequence begins
-with a covariance that is not positive definite."""
+"""Of squares at three samples, by which the negative weight of the mean point costs nothing, the
+definiteness of the innovation, that of the state after it, the innovation's even without that
+weight, and that of the innovation at the second sample. The last sequence begins with a
+covariance that is not positive definite.
+"""
 
 
 def squares(way, repair=True):
-    """Sequences with these variances by the readable filter or the scan, and gradients of means in the first mean and covariance."""
+    """Sequences with these variances by the readable filter or the scan, and gradients of means in
+    the first mean and covariance.
+    """
     eye = torch.eye(3, dtype=torch.float64)
     lone = torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag()
     mean = torch.tensor(

@@ -1,4 +1,7 @@
-"""Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
+"""Gates: outliers are refused as if they had not been measured, readable as compiled.
+
+What contradicts for long is believed again.
+"""
 
 import math
 from functools import partial

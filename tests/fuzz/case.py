@@ -22,7 +22,9 @@ _DEPTH = ("up", "up", "up", "place")
 
 @dataclass(frozen=True)
 class Command:
-    """A command line to try: words after ``vehest``, and files and folders, beside the output root, that it may write."""
+    """A command line to try: words after ``vehest``, and files and folders, beside the output root,
+    that it may write.
+    """
 
     argv: tuple[str | bytes, ...]
     targets: tuple[str, ...] = ("out.csv",)
@@ -67,7 +69,10 @@ class Case:
         return path
 
     def spoil(self, file, spoil):
-        """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest; returns whether that was done."""
+        """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest.
+
+        Returns whether that was done.
+        """
         if not self.honest:
             file.write_bytes(spoil(file.read_bytes(), self.rng))
         return not self.honest
@@ -78,7 +83,9 @@ class Case:
 
 
 Generator = namedtuple("Generator", "family name build needs weight")
-"""A way to make inputs: a function that writes the files of a case and returns the command, templates, and its turns in a round."""
+"""A way to make inputs: a function that writes the files of a case and returns the command,
+templates, and its turns in a round.
+"""
 GENERATORS = []
 TEMPLATES = {}
 
@@ -112,7 +119,10 @@ def load_families():
 
 
 def schedule(chosen):
-    """The generators in the order in which they take turns; heavier ones come more than once a round."""
+    """The generators in the order in which they take turns.
+
+    Heavier ones come more than once a round.
+    """
     return [
         generator
         for turn in range(max(generator.weight for generator in chosen))
@@ -122,5 +132,7 @@ def schedule(chosen):
 
 
 def is_honest(generator, position, visit):
-    """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
+    """Whether a visit makes the honest variant: the first visits of an eighth of the generators,
+    then each in its turn.
+    """
     return generator.family != PLANTED and (visit + position) % 8 == 0

@@ -11,17 +11,22 @@ from fuzz.case import CANARY
 
 CALL = f"__import__('os').system('touch {CANARY}')"
 NAMES = (
-    "../../../evil", "../../../../../../evil", "a/b/c", "..", ".", "", " ", "-rf", "--help", ".hidden", "a\x1b[2Jb", "a\nerror: b",
-    "\u202eevil", "ä ö ü 😀", "x" * 300, "x" * 5000, "con", "a*b?[c]", "~root", f"$(touch {CANARY})", f"; touch {CANARY}",
-    "<script>alert(1)</script>", "[red]x[/red]", "[/]", "%s%n%x", "{0}", "${root}", "a=b", "a,b", "a\tb", ".writing-1-aaaaaaaa-x",
-    "a\x00b", "\ud8ff",
+    "../../../evil", "../../../../../../evil", "a/b/c", "..", ".", "", " ", "-rf", "--help",
+    ".hidden", "a\x1b[2Jb", "a\nerror: b", "\u202eevil", "ä ö ü 😀", "x" * 300, "x" * 5000, "con",
+    "a*b?[c]", "~root", f"$(touch {CANARY})", f"; touch {CANARY}", "<script>alert(1)</script>",
+    "[red]x[/red]", "[/]", "%s%n%x", "{0}", "${root}", "a=b", "a,b", "a\tb",
+    ".writing-1-aaaaaaaa-x", "a\x00b", "\ud8ff",
 )  # fmt: skip
-"""Names that no file system, terminal, shell or page should take as they are; the last two not even Python's own functions."""
+"""Names that no file system, terminal, shell or page should take as they are.
+
+The last two not even Python's own functions.
+"""
 WRITABLE_NAMES = NAMES[:-2]
 SCALARS = (
-    None, True, False, 0, 1, -1, 2**31, 2**63, 10**400, -(10**18), 0.5, -0.0, 1e-320, 1e300, math.inf, -math.inf, math.nan,
-    "", "null", "1e400", "7", "x" * 100_000, "${nothing.there}", "${oc.env:HOME}", "${.}", "???", CALL, "os.system",
-    [], {}, [[]], [None], {"": None}, {"a": {"b": {"c": [1, {"d": 2}]}}}, [1, "a", None, 2.5], {1: 2, None: 3, False: 4},
+    None, True, False, 0, 1, -1, 2**31, 2**63, 10**400, -(10**18), 0.5, -0.0, 1e-320, 1e300,
+    math.inf, -math.inf, math.nan, "", "null", "1e400", "7", "x" * 100_000, "${nothing.there}",
+    "${oc.env:HOME}", "${.}", "???", CALL, "os.system", [], {}, [[]], [None], {"": None},
+    {"a": {"b": {"c": [1, {"d": 2}]}}}, [1, "a", None, 2.5], {1: 2, None: 3, False: 4},
     date(2020, 1, 1), b"\xff\xfe", *NAMES,
 )  # fmt: skip
 """Values that belong nowhere in particular."""
@@ -32,11 +37,14 @@ class Raw(str):
 
 
 RAW = (
-    f"!!python/object/apply:os.system ['touch {CANARY}']", f"!!python/object/new:os.system ['touch {CANARY}']", "!!python/name:os.system",
-    "!!python/module:antigravity", "!!python/tuple [1, 2]", "!unknown {a: 1}", "!!binary '%%%'", "!!set {a, b}", "!!omap [a: 1]",
-    "!!timestamp not-a-time", "!!int x", "!!float x", "&self [*self]", "&map {a: *map}", "*nowhere", "1e400", "0o777", "1_000", "12:30:45",
-    "2020-13-45", "{<<: 3}", "{<<: [*x, 4]}", "{a: 1, a: 2}", "{? [a, b] : c}", "'unfinished", "[1, 2", "|\n  a\n b", "\t- a", "@at",
-    "%percent", "[" * 100 + "]" * 100, "[" * 5000 + "]" * 5000, "{a: " * 70 + "1" + "}" * 70, "9" * 5000, "0." + "1" * 100_000,
+    f"!!python/object/apply:os.system ['touch {CANARY}']",
+    f"!!python/object/new:os.system ['touch {CANARY}']", "!!python/name:os.system",
+    "!!python/module:antigravity", "!!python/tuple [1, 2]", "!unknown {a: 1}", "!!binary '%%%'",
+    "!!set {a, b}", "!!omap [a: 1]", "!!timestamp not-a-time", "!!int x", "!!float x",
+    "&self [*self]", "&map {a: *map}", "*nowhere", "1e400", "0o777", "1_000", "12:30:45",
+    "2020-13-45", "{<<: 3}", "{<<: [*x, 4]}", "{a: 1, a: 2}", "{? [a, b] : c}", "'unfinished",
+    "[1, 2", "|\n  a\n b", "\t- a", "@at", "%percent", "[" * 100 + "]" * 100,
+    "[" * 5000 + "]" * 5000, "{a: " * 70 + "1" + "}" * 70, "9" * 5000, "0." + "1" * 100_000,
 )  # fmt: skip
 """Pieces of YAML that a reader may stumble over."""
 JSON = (
@@ -54,7 +62,9 @@ JSON = (
 
 
 def spoil_bytes(content, rng):
-    """Flip, cut, repeat, overwrite or insert, once or a few times: anywhere, near the head or near the end."""
+    """Flip, cut, repeat, overwrite or insert, once or a few times: anywhere, near the head or near
+    the end.
+    """
     data = bytearray(content)
     region = rng.choice(["anywhere", "anywhere", "head", "end"])
     for _ in range(rng.choice([1, 1, 1, 2, 3, 8])):
@@ -96,7 +106,9 @@ def hostile(rng, yaml_text=False):
 
 
 def spoil_tree(tree, rng, yaml_text=False):
-    """Replace, remove, rename, wrap or repeat values anywhere in a tree of plain values, once or a few times."""
+    """Replace, remove, rename, wrap or repeat values anywhere in a tree of plain values, once or a
+    few times.
+    """
     tree = copy.deepcopy(tree)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
         holders = [holder for holder in _holders(tree) if holder]
@@ -190,7 +202,9 @@ def spoil_text(text, rng):
 
 
 def _bomb(rng):
-    """A few hundred bytes of YAML whose aliases or merged mappings would unfold to 10¹² values, or some such number."""
+    """A few hundred bytes of YAML whose aliases or merged mappings would unfold to 10¹² values, or
+    some such number.
+    """
     if rng.random() < 0.5:
         lines = ["m0: &m0 {a: 1, b: 2}"]
         lines += [
@@ -205,7 +219,7 @@ def _bomb(rng):
 
 
 def spoil_yaml(tree, rng, *, bombs=True):
-    """A YAML file with a spoilt tree, spoilt text, or, if ``bombs``, something that explodes in it."""
+    """A YAML file with a spoilt tree, spoilt text, or, if ``bombs``, a value that explodes."""
     draw = rng.random()
     if draw < 0.6:
         return yaml_of(spoil_tree(tree, rng, yaml_text=True)).encode("utf-8", "surrogatepass")

@@ -30,13 +30,17 @@ MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
 Row = namedtuple(
     "Row",
-    "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict detail",
+    "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict "
+    "detail",
 )
 """One input and what became of it: a line of the CSV file."""
 
 
 class Fuzzer:
-    """Everything that is imported and made once; all families but the planted ones, if none is named."""
+    """Everything that is imported and made once.
+
+    All families but the planted ones, if none is named.
+    """
 
     def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
         self.folder = folder.resolve()
@@ -71,7 +75,9 @@ class Fuzzer:
                 make(folder)
 
     def generator_of(self, index):
-        """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
+        """Generator of an input, how often it has had its turn before, and whether the input is to
+        be honest.
+        """
         position = index % len(self.turns)
         visit = index // len(self.turns)
         generator = self.turns[position]
@@ -203,7 +209,9 @@ def _watch(case, command):
 
 
 class _Readers:
-    """What a command and the reading processes that it starts take, as far as repeated looks at them tell."""
+    """What a command and the reading processes that it starts take, as far as repeated looks at
+    them tell.
+    """
 
     def __init__(self, command):
         self._command = command
@@ -283,8 +291,10 @@ def described(row):
     kind = " (honest)" if row.honest else ""
     took = f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
     return (
-        f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest {row.command}\n"
-        f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} {row.detail}"
+        f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest "
+        f"{row.command}\n"
+        f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} "
+        f"{row.detail}"
     )
 
 
@@ -300,6 +310,7 @@ def summary(rows):
         honest = sum(row.honest for row in family_rows)
         done = sum(row.exit_code == 0 for row in family_rows)
         lines.append(
-            f"{family:<14} {len(family_rows):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}"
+            f"{family:<14} {len(family_rows):>5} inputs, {honest:>4} honest, {done:>4} done: "
+            f"{ended}"
         )
     return "\n".join(lines)

@@ -48,7 +48,8 @@ def test_two_hundred_malformed_inputs_end_with_a_result_or_a_single_line(tmp_pat
         if generator.family != PLANTED
     }
     bad = [
-        f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest {row['command']}: {row['detail']}"
+        f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest "
+        f"{row['command']}: {row['detail']}"
         for row in rows
     ]
     assert [line for line, row in zip(bad, rows, strict=True) if row["verdict"] != "ok"] == []

@@ -65,7 +65,8 @@ def _findings(case, command, outcome):
     if outcome.seconds > case.seconds:
         yield (
             "slow",
-            f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; {outcome.stack}",
+            f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; "
+            f"{outcome.stack}",
         )
     if outcome.exit_code < 0:
         yield "crash", f"signal {-outcome.exit_code}"
@@ -125,7 +126,10 @@ def _is_allowed(path, case, command):
 
 
 def snapshot(folder):
-    """Everything below a folder, with what would change if it were written to; logs are left out, links not followed."""
+    """Everything below a folder, with what would change if it were written to.
+
+    Logs are left out, links not followed.
+    """
     states = {}
     pending = [str(folder)]
     while pending:

@@ -1,4 +1,4 @@
-"""An hour of made-up driving at 20 Hz with eight estimators, for what a page of it weighs and does."""
+"""An hour of synthetic driving at 20 Hz with eight estimators, for tests of its page."""
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,10 @@ COLOURS = ("#4aa5e0", "#0b4f9c", "#f59a23", "#b8480b", "#8e24aa", "#00876c", "#d
 
 
 def hour_of_driving():
-    """Laps of 90 s, every signal with sensor noise; band and health with each estimator; sixteen channels."""
+    """Laps of 90 s, every signal with sensor noise.
+
+    Band and health with each estimator; sixteen channels.
+    """
     rng = np.random.default_rng(0)
     time = np.arange(int(RATE * SECONDS)) / RATE
 

@@ -22,7 +22,7 @@ def drive():
 
 
 def estimate_of(drive, error=0.1, rate_hz=RATE):
-    """The reference with a constant error of v [m/s], a band of 0.2 m/s, invalid in the last 3 s."""
+    """The reference with a constant error of v [m/s] and a band of 0.2 m/s, invalid for 3 s."""
     step = round(drive.rate_hz / rate_hz)
     vx = drive["vx"][::step]
     vy = drive["vy_ref"][::step] + error

@@ -1,4 +1,6 @@
-"""The verdict on a user's car: what is recommended, with which error, and what more recordings would bring."""
+"""The verdict on a user's car: what is recommended, with which error, and what more recordings
+would bring.
+"""
 
 from dataclasses import replace
 
@@ -63,7 +65,9 @@ def test_of_two_equal_estimators_neither_is_significantly_worse(part):
 
 
 def test_commands_use_the_recommended_model(part):
-    """Luenberger comes first in the list, and GRU, alike on the test, has the lowest error on validation."""
+    """Luenberger comes first in the list, and GRU, alike on the test, has the lowest error on
+    validation.
+    """
     metrics = part.metrics.copy()
     metrics.loc[
         (metrics["estimator"] == "gru")
@@ -87,7 +91,10 @@ def test_commands_use_the_recommended_model(part):
 
 
 def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, tmp_path):
-    """25 s of which 1.5 s are left out: 94 %; a slide at the start of the range, a stop at its end."""
+    """25 s of which 1.5 s are left out: 94 %.
+
+    A slide at the start of the range, a stop at its end.
+    """
     recording = drive()
     vx = recording["vx"].copy()
     vy = recording["vy_ref"].copy()
@@ -105,8 +112,8 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
         )
     )
     assert (
-        "94 % of the test is scored, without the first 1.5 s of its 1 range, **which contain the largest sideslip** ("
-        in words
+        "94 % of the test is scored, without the first 1.5 s of its 1 range, **which contain the "
+        "largest sideslip** (" in words
     )
     assert "; in 2.1 % of that the car is slower than 1 m/s, and only v is scored." in words
     assert "largest sideslip" not in verdict_text(part)
@@ -122,7 +129,9 @@ def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
 
 
 def test_an_estimator_that_only_equals_a_baseline_is_not_recommended(part):
-    """A static map that is as good as KS-NN: the best and its equals all lack a significant difference to it."""
+    """A static map that is as good as KS-NN: the best and its equals all lack a significant
+    difference to it.
+    """
     ksnn = next(model for model in part.models if model.estimator == "ksnn" and model.seed == 1)
     tied = [
         replace(model, evaluation_folder=ksnn.evaluation_folder)
@@ -149,7 +158,7 @@ def test_an_estimator_that_only_equals_a_baseline_is_not_recommended(part):
 
 
 def test_the_comparison_of_a_drive_recommends_by_the_same_rule(part):
-    """The page of any comparison and its printed verdict, with the static map as good as the best."""
+    """The page of any comparison and its printed verdict; the static map is as good as the best."""
     artefacts = StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part})
     (printed,) = drive_study.verdict(artefacts)
     opening = str(drive_study.comparison(part).blocks[0])
@@ -201,8 +210,8 @@ def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
     for start, stop in ((2.0, 40.0), (42.0, 58.0), (60.0, 85.0)):
         minutes += float((np.abs(recording.cut(start, stop)["ay"]) > 4.0).sum()) / 20.0 / 60.0
     assert (
-        f"Your recordings contain {minutes:.1f} min with |ay| above 4 m/s²: {3 * minutes:.0f} min more would halve the interval."
-        in verdict_text(part)
+        f"Your recordings contain {minutes:.1f} min with |ay| above 4 m/s²: {3 * minutes:.0f} min "
+        f"more would halve the interval." in verdict_text(part)
     )
 
 

@@ -1,4 +1,6 @@
-"""The page of a report in headless Chromium: what it draws, what its filter says, how it reads with dark and light, wide and narrow."""
+"""The page of a report in headless Chromium: what it draws, what its filter says, how it reads with
+dark and light, wide and narrow.
+"""
 
 import json
 import math
@@ -46,7 +48,10 @@ def hour(tmp_path_factory):
 
 def board(driver):
     """What the filter's table says: estimator -> RMSE(β) [deg], RMSE(v) [m/s]."""
-    script = "return [...document.querySelectorAll('.explorer tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
+    script = (
+        "return [...document.querySelectorAll('.explorer tbody tr')].map(row => "
+        "[...row.cells].map(cell => cell.textContent))"
+    )
     return {cells[1]: (float(cells[2]), float(cells[4])) for cells in driver.execute_script(script)}
 
 
@@ -213,14 +218,17 @@ def test_page_is_accessible_fits_its_width_and_complains_of_nothing(
 
 
 CUT = """return [...document.querySelectorAll("main *")].filter(
-  (own) => own.clientWidth > 0 && own.scrollWidth > own.clientWidth + 1 && getComputedStyle(own).overflowX !== "visible"
+  (own) => own.clientWidth > 0 && own.scrollWidth > own.clientWidth + 1 &&
+    getComputedStyle(own).overflowX !== "visible"
 ).map((own) => own.ariaLabel ?? own.tagName)"""
 
 
 def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folded(
     chromium, tmp_path
 ):
-    """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
+    """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways
+    at 390, traces break between ranges.
+    """
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
     part = study(tmp_path / "study", tests)
     write_document(
@@ -242,7 +250,10 @@ def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folde
     assert "FVU" not in text
     assert len(text.split()) <= 1500
     assert chromium.execute_script(CUT) == []
-    gaps = "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) => line.includes(null))"
+    gaps = (
+        "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) "
+        "=> line.includes(null))"
+    )
     assert all(chromium.execute_script(gaps))
     first = "return document.querySelector('figure.live').explorer.detail.label"
     assert f"Recommended: {chromium.execute_script(first)}, expected" in text
@@ -279,7 +290,10 @@ def test_strip_of_sensor_health_has_a_legend(chromium, hour):
 
 def test_appendices_are_a_folded_list_at_the_end(chromium, toy):
     opened(chromium, toy[0])
-    after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
+    after = (
+        "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, "
+        "own.open])"
+    )
     position = chromium.execute_script(after)
     assert len(position) >= 5
     assert all(section == ["DETAILS", False] for section in position)

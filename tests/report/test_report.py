@@ -39,7 +39,8 @@ from vehest.studies.kit.warnings import warnings_of
 RATE = 20.0
 PROTOCOL = Protocol(rate_hz=RATE, warm_up_seconds=2.0, skip_seconds=1.5)
 
-# (estimator, variant, title) -> for each seed, the size of its error on the validation and on the test range
+# (estimator, variant, title) -> for each seed, the size of its error on the validation and on the
+# test range
 FAMILIES = {
     ("luenberger", "luenberger", "Luenberger"): [(0.30, 0.30)],
     ("ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"): [
@@ -427,12 +428,14 @@ def test_verdict_names_the_best_and_recommends_only_above_both_baselines(artefac
     assert best["estimator"] == "ksnn"
     low, high = best["rmse_sideslip_low"], best["rmse_sideslip_high"]
     assert text.startswith(
-        f"## Verdict\n\n**Best: {best['title']}, {best['rmse_sideslip']:.2f}° [{low:.2f}, {high:.2f}].** "
-        "Every other estimator is significantly worse. **Recommended: KS-NN linear + bias, P = 2**, "
+        f"## Verdict\n\n**Best: {best['title']}, {best['rmse_sideslip']:.2f}° [{low:.2f}, "
+        f"{high:.2f}].** "
+        "Every other estimator is significantly worse. **Recommended: KS-NN linear + bias, P = "
+        "2**, "
     )
     assert (
-        "5 estimators were compared with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 epochs a network"
-        in text
+        "5 estimators were compared with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 "
+        "epochs a network" in text
     )
     twin = [
         replace(model, variant="twin", title="Twin")
@@ -452,8 +455,8 @@ def test_verdict_names_the_best_and_recommends_only_above_both_baselines(artefac
     text = words_of(twins)
     assert "Twin and GRU | 5 &lt;states> are not significantly worse. **Recommended: KS-NN" in text
     assert (
-        "of the 3 estimators among these that are significantly better than the zero-sideslip baseline"
-        in text
+        "of the 3 estimators among these that are significantly better than the zero-sideslip "
+        "baseline" in text
     )
     missing = "none was compared with the zero-sideslip baseline and the static map."
     assert f"**No estimator is recommended**: {missing}" in words_of(alone)
@@ -497,8 +500,8 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
     short = [replace(model, training={"max_epochs": 11}) for model in artefacts.models]
     assert (
-        "Training ended at its limit, and longer training may lower the error: KS-NN linear + bias, P = 2 (11 epochs, 2 of 3 seeds)"
-        in words_of(replace(artefacts, models=short))
+        "Training ended at its limit, and longer training may lower the error: KS-NN linear + "
+        "bias, P = 2 (11 epochs, 2 of 3 seeds)" in words_of(replace(artefacts, models=short))
     )
 
 
@@ -629,7 +632,9 @@ def test_times_are_medians_over_seeds_by_part_and_estimator():
 
 
 class Page(HTMLParser):
-    """Tags, attributes and text of a page, everything in it that a browser would load, and the cells of its tables."""
+    """Tags, attributes and text of a page, everything in it that a browser would load, and the
+    cells of its tables.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -792,6 +797,9 @@ def test_decimation_keeps_peaks_ends_and_gaps():
 
 
 def test_importing_the_report_package_loads_no_drawing_library():
-    code = "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', 'jinja2'} & set(sys.modules))"
+    code = (
+        "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', "
+        "'jinja2'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -80,7 +80,10 @@ def test_hostile_name_is_plain_text_in_both_forms_of_a_report(tmp_path, name):
 
 
 def test_honest_markdown_stays_as_it_is(tmp_path):
-    text = "**Bold** with `code <b>`, a [link](tables/names.csv), <https://example.org>, |ω| < 3 rad/s and [deg]."
+    text = (
+        "**Bold** with `code <b>`, a [link](tables/names.csv), <https://example.org>, |ω| < 3 "
+        "rad/s and [deg]."
+    )
     write_document(Document("Honest", [text]), tmp_path)
     assert text in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert as_text("KS-NN (Revs) sim_quickstart, 20 Hz") == "KS-NN (Revs) sim_quickstart, 20 Hz"

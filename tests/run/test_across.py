@@ -57,7 +57,9 @@ def parts_of(*sweeps):
 
 
 def rmse_by_hand(output, models, protocol_skip=1.5):
-    """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings [deg], with NumPy alone."""
+    """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings
+    [deg], with NumPy alone.
+    """
     errors = []
     folders = sorted((output / "evaluate").glob(f"{models}-on-folded_fold_*"))
     assert len(folders) == 3

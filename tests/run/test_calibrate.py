@@ -1,4 +1,6 @@
-"""Calibration as a stage: between training and evaluation, found by its model, and left out where there is nothing to calibrate by."""
+"""Calibration as a stage: between training and evaluation, found by its model, and left out where
+there is nothing to calibrate by.
+"""
 
 import csv
 import json

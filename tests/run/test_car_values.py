@@ -1,4 +1,6 @@
-"""Values of a car in its data set: every command uses them, and a band does not depend on the data set's name."""
+"""Values of a car in its data set: every command uses them, and a band does not depend on the data
+set's name.
+"""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,6 @@
-"""The command line from end to end, on a small data set of its own: what runs, what is skipped, what is refused."""
+"""The command line from end to end, on a small data set of its own: what runs, what is skipped,
+what is refused.
+"""
 
 import importlib.util
 import json
@@ -89,8 +91,8 @@ def test_failed_jobs_are_reported_and_other_results_remain(place):
     code, out, err = place("run", "small", "tracking=none")
     assert code == 5
     assert (
-        "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss"
-        in err
+        "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the "
+        "validation loss" in err
     )
     assert "Traceback" not in err
     remaining = {
@@ -263,8 +265,14 @@ def test_doctor_names_the_purpose_of_an_absent_extra(place, monkeypatch):
 def test_help_shows_choices_and_answers_quickly(place):
     _, out, _ = place("train", "--help")
     assert all(words in out for words in ("luenberger", "ferrari_drive"))
-    code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
-    code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
+    code = (
+        "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\n"
+        "except SystemExit: pass\n"
+    )
+    code += (
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', "
+        "'pandas', 'numba', 'matplotlib'}))"
+    )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
@@ -548,9 +556,17 @@ SAVES = (supervised, "save_checkpoint")  # once an epoch
 
 
 def _killed(place, module, name, call, *arguments):
-    """Run a command in a process that is killed once a function of a module is through for the n-th time."""
-    program = f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = {['vehest', *arguments]!r}\n"
-    program += f"import {module.__name__} as module; from processes import Striking; from vehest.cli import main\n"
+    """Run a command in a process that is killed once a function of a module is through for the n-th
+    time.
+    """
+    program = (
+        f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = "
+        f"{['vehest', *arguments]!r}\n"
+    )
+    program += (
+        f"import {module.__name__} as module; from processes import Striking; from vehest.cli "
+        f"import main\n"
+    )
     program += f"module.{name} = Striking(module.{name}, {call}, {int(signal.SIGKILL)}); main()"
     assert start([sys.executable, "-c", program], cwd=place.folder).wait(HANGS) == -signal.SIGKILL
 

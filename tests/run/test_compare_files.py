@@ -107,7 +107,10 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
 def test_references_and_estimates_in_another_unit_or_sign_are_warned_of(
     drive, tmp_path, monkeypatch, capsys, spoil, warning
 ):
-    """As `vehest data check` warns of the recording; once of the estimate alone, once of the reference alone."""
+    """As `vehest data check` warns of the recording.
+
+    Once of the estimate alone, once of the reference alone.
+    """
     monkeypatch.chdir(tmp_path)
     names = ("vx", "yaw_rate", "ax", "ay")
     table = pd.DataFrame({"time": drive.time} | {name: drive[name] for name in names})
@@ -270,7 +273,9 @@ def test_a_model_that_was_trained_here_is_listed_last_and_changes_no_verdict(dri
 
 
 def carmaker(folder, drive, shift=0.0):
-    """A table of another tool: semicolons, its own names, the angle in degrees and counted the other way."""
+    """A table of another tool: semicolons, its own names, the angle in degrees and counted the
+    other way.
+    """
     beta = -np.degrees(np.arctan2(drive["vy_ref"] + 0.05, drive["vx"]))
     file = folder / "carmaker.csv"
     pd.DataFrame({"Clock": drive.time - shift, "Beta_CarMaker": beta}).to_csv(

@@ -58,13 +58,15 @@ def test_local_configuration_precedes_and_extends_the_packaged_configuration(els
     [
         (
             ["estimator=ksn"],
-            r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, ",
+            r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, "
+            r"kinematic, ksnn, ",
         ),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
         (
             ["estimator=self_calibrating", "estimator.nlocal=3"],
-            "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
+            "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of "
+            "ksnn; "
             "'vehest config train estimator=self_calibrating' prints",
         ),
         (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),

@@ -1,4 +1,6 @@
-"""`vehest estimate` and the Python interface on drives with something wrong, and what goes with a model: bands, health, trust.yaml."""
+"""`vehest estimate` and the Python interface on drives with something wrong, and what goes with a
+model: bands, health, trust.yaml.
+"""
 
 import json
 from pathlib import Path

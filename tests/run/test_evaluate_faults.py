@@ -1,4 +1,6 @@
-"""Faults as conditions of an evaluation: their rows, their keys, one training for all of them, and errors in one line."""
+"""Faults as conditions of an evaluation: their rows, their keys, one training for all of them, and
+errors in one line.
+"""
 
 import csv
 import json
@@ -101,7 +103,8 @@ def test_invalid_faults_are_refused_in_a_single_line(trained):
         (("faults=[{channel:ay}]",), "faults must be a list of faults, each with its kind"),
         (
             ("fault=bias", "fault.channel=steer"),
-            "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)",
+            "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, "
+            "yaw_rate)",
         ),
     ):
         trained.refused("eval", *TRAINED, *overrides, code=2, says=says)

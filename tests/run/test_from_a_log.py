@@ -1,4 +1,6 @@
-"""The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like another car's log."""
+"""The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like
+another car's log.
+"""
 
 import re
 from pathlib import Path
@@ -11,7 +13,9 @@ DRIVE = "revs/20140222_01_01_03_250lm"
 
 
 def log_of(data_root):
-    """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed, angles in degrees."""
+    """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed,
+    angles in degrees.
+    """
 
     def column(name):
         return np.loadtxt(data_root / DRIVE / f"{name}.txt")

@@ -1,4 +1,6 @@
-"""A car's record: found on drives of a car whose numbers are known, written, read back and started from."""
+"""A car's record: found on drives of a car whose numbers are known, written, read back and started
+from.
+"""
 
 import json
 import math
@@ -235,7 +237,9 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     ],
 )
 def test_wheelbases_excluded_by_the_drive_are_reported(scale, wheelbase, words):
-    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
+    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with
+    its root, yaw rates against it.
+    """
     time = np.arange(0.0, 60.0, 1.0 / RATE)
     speed = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0])
     curvature = np.where(time < 20.0, 0.09, 0.01)

@@ -1,4 +1,7 @@
-"""Recordings that take long to make are kept as soon as they are done; an ingest that was interrupted goes on with the rest."""
+"""Recordings that take long to make are kept as soon as they are done.
+
+An ingest that was interrupted goes on with the rest.
+"""
 
 import os
 import signal

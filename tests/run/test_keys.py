@@ -32,7 +32,9 @@ class Extended(Gru.settings_type):
 
 @pytest.fixture
 def published(tmp_path, monkeypatch, capsys):
-    """A small study that was trained and published, with a configuration of its estimator and no output root."""
+    """A small study that was trained and published, with a configuration of its estimator and no
+    output root.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)

@@ -12,7 +12,9 @@ NOISE_OF_RECORDING = ("estimator=kalman", "estimator.noise.read_from=recording",
 
 @pytest.fixture
 def steered(place):
-    """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
+    """Two drives with a steering angle, a split with a test only, and one that trains on the other
+    drive.
+    """
     place.add_steered()
     tests = {"test": [{"recording": "second"}]}
     place.change(

@@ -1,4 +1,6 @@
-"""Rows of errors with the best lever arm in a study's metrics, where the reference's point is unknown."""
+"""Rows of errors with the best lever arm in a study's metrics, where the reference's point is
+unknown.
+"""
 
 import numpy as np
 import pandas as pd

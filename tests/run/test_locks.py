@@ -1,4 +1,6 @@
-"""Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone, nobody waits for ever."""
+"""Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone,
+nobody waits for ever.
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""Messages to users: usage errors, hostile names, full disks, broken streams; one line each, without control of the terminal."""
+"""Messages to users: usage errors, hostile names, full disks, broken streams.
+
+One line each, without control of the terminal.
+"""
 
 import errno
 import io
@@ -38,7 +41,8 @@ def _shows_only_text(text):
     [
         (
             ("trian",),
-            "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options",
+            "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and "
+            "options",
         ),
         (("train", "--nope"), "'vehest train --help' lists commands and options"),
         (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
@@ -275,7 +279,9 @@ def test_unreadable_overrides_are_a_single_line_and_long_valid_ones_are_read():
 
 @contextmanager
 def _small_disk(size):
-    """Files of this process may not grow beyond a size [bytes]: every larger write fails as on a full disk."""
+    """Files of this process may not grow beyond a size [bytes]: every larger write fails as on a
+    full disk.
+    """
     former = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, former[1]))
     try:
@@ -327,7 +333,8 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     [
         *(OSError(code, os.strerror(code)) for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)),
         SafetensorError(
-            'Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No space left on device" })'
+            'Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No '
+            'space left on device" })'
         ),
         sqlite3.OperationalError("database or disk is full"),
         RuntimeError("wrapped: No space left on device (os error 28)"),

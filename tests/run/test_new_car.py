@@ -1,4 +1,6 @@
-"""`vehest new` on the command line: what is asked, answered, written and refused, and that `vehest run` takes it."""
+"""`vehest new` on the command line: what is asked, answered, written and refused, and that `vehest
+run` takes it.
+"""
 
 import io
 import json
@@ -330,8 +332,8 @@ def test_estimators_of_the_user_are_compared_too(log, monkeypatch):
     arguments = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
     _, err = log.new(*arguments, code=2)
     assert (
-        '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip'
-        in err
+        '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then '
+        "install it with pip" in err
     )
     install_examples(log.folder / "installed", monkeypatch)
     try:

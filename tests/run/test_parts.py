@@ -1,4 +1,6 @@
-"""A study of several comparisons, each on a split of its own, run from the command line on a small data set."""
+"""A study of several comparisons, each on a split of its own, run from the command line on a small
+data set.
+"""
 
 import dataclasses
 import json

@@ -1,4 +1,6 @@
-"""`vehest plot` and `vehest estimate --plot`: pictures and a page of a drive, complete or not at all."""
+"""`vehest plot` and `vehest estimate --plot`: pictures and a page of a drive, complete or not at
+all.
+"""
 
 import re
 from pathlib import Path

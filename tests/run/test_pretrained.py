@@ -48,7 +48,10 @@ def test_estimate_without_a_model_uses_and_names_the_pretrained_model(place):
 
 def test_estimate_of_the_shipped_model_loads_no_torch_pandas_or_scipy_signal(place):
     write_csv(place.folder / "lap.csv", 9)
-    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+    program = (
+        "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, "
+        "file=sys.stderr)\n"
+    )
     for out in ("lap.parquet", "estimate.csv"):
         command = [sys.executable, "-c", program, "estimate", "lap.csv", "dataset=mine", "-o", out]
         result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
@@ -82,9 +85,9 @@ def test_pretrained_model_is_small_and_the_choice_of_the_published_study():
     about = yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
     assert about["note"] == make_pretrained.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
-    trust = read_trust(
-        folder
-    )  # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real ones
+    # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real
+    # ones
+    trust = read_trust(folder)
     assert (trust.about.note, trust.guard, trust.bands is None, trust.health is None) == (
         "",
         None,
@@ -123,7 +126,9 @@ def test_a_copy_of_a_loaded_model_keeps_its_calibration():
 
 
 def bands_on(name, data_root):
-    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
+    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its
+    median [°], share that is valid.
+    """
     source = open_source(
         compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]
     )
@@ -141,7 +146,8 @@ def bands_on(name, data_root):
 def test_documentation_has_the_coverage_of_pretrained_bands_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
     figures = re.search(
-        r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % of the drive is valid",
+        r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % "
+        r"of the drive is valid",
         text,
     )
     inside, median, valid = bands_on("ferrari_250lm", data_root)

@@ -1,4 +1,6 @@
-"""Published results: a rerun leaves them as they are, and a check says whether they are those of today."""
+"""Published results: a rerun leaves them as they are, and a check says whether they are those of
+today.
+"""
 
 import json
 import shutil
@@ -49,7 +51,9 @@ def published(tmp_path_factory):
 
 @pytest.fixture
 def checked(published, place):
-    """The same study in a folder of its own, without the output root: what is checked needs no models."""
+    """The same study in a folder of its own, without the output root: what is checked needs no
+    models.
+    """
     for name in ("conf", "pipelines", "raw", "results"):
         shutil.rmtree(place.folder / name, ignore_errors=True)
         shutil.copytree(published / name, place.folder / name)
@@ -278,7 +282,10 @@ def test_pipeline_that_cannot_be_run_is_stale(
         checked.refused(*words, code=code, says=says)
     checked.change("pipelines/small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
     code, line = verdict(checked)
-    message = "small: stale: configuration (pipeline); today it cannot be run (unknown option 'training.nothing'"
+    message = (
+        "small: stale: configuration (pipeline); today it cannot be run (unknown option "
+        "'training.nothing'"
+    )
     assert (code, line.startswith(message)) == (3, True)
     shutil.rmtree(checked.folder / "results")
     checked.refused(*CHECK, code=4, says="no study is published in 'results'")
@@ -466,7 +473,8 @@ def test_the_list_of_stale_studies_only_shrinks():
     entries = yaml.safe_load((results / "stale.yaml").read_text(encoding="utf-8"))
     # Tables of other commands were not compared at all before they had records (`table_records`).
     may_be_listed |= {"examples", "export", "own_car", "reliability", "unseen_car"}
-    # learned_ukf_sim ended with its pipeline: untrained, and learned_ukf is the same on real tyre sets.
+    # learned_ukf_sim ended with its pipeline: untrained, and learned_ukf is the same on real tyre
+    # sets.
     assert not (results / "learned_ukf_sim").exists()
     assert set(entries) <= may_be_listed
     assert [name for name in may_be_listed if not (results / name / PROVENANCE).is_file()] == [], (

@@ -1,4 +1,6 @@
-"""Weights are published training by training: a study that was stopped goes on elsewhere, and trains only what is missing."""
+"""Weights are published training by training: a study that was stopped goes on elsewhere, and
+trains only what is missing.
+"""
 
 import os
 import shutil

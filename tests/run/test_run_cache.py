@@ -1,4 +1,6 @@
-"""A finished study is recognised by what it was made from, and prints what a run in full would print."""
+"""A finished study is recognised by what it was made from, and prints what a run in full would
+print.
+"""
 
 import json
 import os
@@ -57,7 +59,10 @@ def test_finished_studies_print_the_output_of_a_full_run(study):
 
 
 def test_finished_studies_import_no_training_code(study):
-    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+    program = (
+        "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, "
+        "file=sys.stderr)\n"
+    )
     command = [sys.executable, "-c", program, "run", *WORDS, "--quiet"]
     result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     assert "test set 'test'" in result.stdout

@@ -1,4 +1,7 @@
-"""What describes something, and is damaged, hostile or of another version, is one line; and no name in it leads out of the output root."""
+"""What describes something, and is damaged, hostile or of another version, is one line.
+
+And no name in it leads out of the output root.
+"""
 
 import json
 import sys
@@ -102,7 +105,10 @@ def test_model_is_read_with_its_types_and_finite_numbers(model, tmp_path):
     name = max(weights, key=lambda tensor: weights[tensor].size)
     weights[name].flat[:2] = [np.nan, np.inf]
     save_file(weights, model / "model.safetensors")
-    message = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
+    message = (
+        f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not "
+        f"finite"
+    )
     assert message in refusal(lambda: load_model(model))
     estimator = estimator_class("kalman").from_config({})
     save_model(estimator, tmp_path)

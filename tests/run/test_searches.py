@@ -1,4 +1,6 @@
-"""A part of a study that searches: candidates are tried, validation chooses, and the published outcome is not searched for again."""
+"""A part of a study that searches: candidates are tried, validation chooses, and the published
+outcome is not searched for again.
+"""
 
 import shutil
 
@@ -17,7 +19,9 @@ SEARCHES = "results/tuned/searches.csv"
 
 @pytest.fixture
 def tuned(place):
-    """A place with a study of a search over two step sizes, and a part that states the first of them."""
+    """A place with a study of a search over two step sizes, and a part that states the first of
+    them.
+    """
     write_drives(place.folder, 60.0)
     place.change(
         "conf/split/forth.yaml",
@@ -59,7 +63,10 @@ def n_trained(err):
 
 def test_part_that_ignores_the_chosen_value_is_named(tuned):
     _, err = tuned.done(*RUN)
-    remark = "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: training.learning_rate=0.01"
+    remark = (
+        "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: "
+        "training.learning_rate=0.01"
+    )
     assert remark in " ".join(err.split())
     trials = pd.read_csv(SEARCHES)
     assert list(trials["name"]) == ["pace_1", "pace_2"]

@@ -1,4 +1,7 @@
-"""A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps; and what is skipped or fails."""
+"""A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps.
+
+And what is skipped or fails.
+"""
 
 import json
 import math

@@ -200,7 +200,8 @@ def test_the_commit_of_a_record_has_no_changes_but_those_in_results(place, monke
 def test_every_folder_of_results_has_a_provenance():
     results = Path(__file__).parents[2] / RESULTS
     folders = {folder.name for folder in results.iterdir() if folder.is_dir()}
-    # Times of one machine, each with its processor, commit and libraries; verdicts on committed files.
+    # Times of one machine, each with its processor, commit and libraries; verdicts on committed
+    # files.
     exempt = {"benchmarks", "scorecard"}
     recorded = {file.parent.name for file in results.glob(f"*/{PROVENANCE}")}
     assert folders - exempt == recorded

@@ -1,4 +1,6 @@
-"""Runs in MLflow: in the local store, on a server of its own, and what happens when that server is away."""
+"""Runs in MLflow: in the local store, on a server of its own, and what happens when that server is
+away.
+"""
 
 import json
 import os
@@ -42,7 +44,8 @@ def test_runs_are_tracked_with_parameters_metrics_and_model(
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     done = _in_process(
-        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()",
+        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); "
+        "vehest.cli.main()",
         "run",
         "small",
     )
@@ -142,7 +145,10 @@ def test_a_store_that_is_gone_is_filled_again(place):
     assert (place(*TRAIN)[0], len(_local(place, "train"))) == (0, 1)
 
 
-FULL = "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); vehest.cli.main()"
+FULL = (
+    "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); "
+    "vehest.cli.main()"
+)
 
 
 def test_runs_untracked_because_of_a_full_disk_are_logged_by_the_next_run(place):

@@ -1,4 +1,6 @@
-"""Errors on the training ranges are left out where a reference has gaps, and not where a recording cannot be read."""
+"""Errors on the training ranges are left out where a reference has gaps, and not where a recording
+cannot be read.
+"""
 
 from types import SimpleNamespace
 

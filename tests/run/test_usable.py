@@ -1,4 +1,6 @@
-"""What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
+"""What estimators lack is said before anything is trained, what is promised to supply it does, and
+rates fit the recordings.
+"""
 
 import json
 from dataclasses import replace
@@ -136,9 +138,9 @@ def test_fit_fails_without_each_required_channel(name):
     assert bool(required) == estimator.learns
     generator = np.random.default_rng(0)
     channels = {channel: 10.0 + generator.normal(size=400) for channel in required}
-    stops = (
-        name not in QUICK
-    )  # at once where a fit would go on; of these the filter is identified whole before the network is trained
+    # at once where a fit would go on; of these the filter is identified whole before the network is
+    # trained
+    stops = name not in QUICK
     for channel in set(required) - unread:
         remaining = {second: samples for second, samples in channels.items() if second != channel}
         lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, remaining, "simulated")
@@ -344,8 +346,8 @@ def test_table_names_all_estimators_and_json_says_the_same(place):
     words = " ".join(out.split())
     assert "luenberger no 50 Hz, not 100" in words
     assert (
-        "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]"
-        in words
+        "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: "
+        "acceleration_from_speed}]" in words
     )
 
 
@@ -400,8 +402,8 @@ def test_unusable_candidates_are_listed_at_once_and_others_are_evaluated(place):
     reasons = {name.split("-")[0]: reason for name, reason in result["failed"].items()}
     assert set(reasons) == {"ksnn", "kalman"}
     assert (
-        "lack channels that estimator 'ksnn' requires: ax (transforms: [{name: acceleration_from_speed}] of vx)"
-        in reasons["ksnn"]
+        "lack channels that estimator 'ksnn' requires: ax (transforms: [{name: "
+        "acceleration_from_speed}] of vx)" in reasons["ksnn"]
     )
     assert "steer (not in the log)" in reasons["kalman"]
     assert models(place) == {"zero", "static_map"}
@@ -488,7 +490,10 @@ def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     assert (same_model["model"], same_model["skipped"]) == (str(folder), True), (
         "the same training as if the rate had been given"
     )
-    message = "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less"
+    message = (
+        "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give "
+        "estimator.rate_hz=50 or less"
+    )
     place.refused(
         "train",
         "estimator=luenberger",
@@ -569,7 +574,8 @@ def test_available_rates_remain_and_lowered_rates_are_explained():
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
     with pytest.raises(
         DataError,
-        match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window",
+        match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: "
+        r"estimator.window",
     ):
         lower_rate(config, "estimator", at(20.0))
     _, ((_, text),) = lower_rate(
@@ -613,7 +619,9 @@ PLUGINS = {
 
 @pytest.fixture
 def plugins(tmp_path, monkeypatch):
-    """An installed package whose estimators and whose study fail in one way each, but for the estimator `sound`."""
+    """An installed package whose estimators and whose study fail in one way each, but for the
+    estimator `sound`.
+    """
     info = tmp_path / "plugins" / "broken-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")

@@ -1,4 +1,6 @@
-"""Tasks in processes of this machine: one that is killed fails its own task, and Ctrl-C ends all while they start."""
+"""Tasks in processes of this machine: one that is killed fails its own task, and Ctrl-C ends all
+while they start.
+"""
 
 import os
 import signal
@@ -121,7 +123,9 @@ def test_a_stop_ends_running_tasks_with_their_outcome_and_begins_no_other():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_ctrl_c_while_workers_start_ends_them_all(tmp_path):
-    """The terminal sends it to every process: here six times, as soon as one or two workers can be seen."""
+    """The terminal sends it to every process: here six times, as soon as one or two workers can be
+    seen.
+    """
     script = tmp_path / "driver.py"
     script.write_text(DRIVER, encoding="utf-8")
     try:
@@ -145,7 +149,9 @@ def test_ctrl_c_while_workers_start_ends_them_all(tmp_path):
 
 
 def test_ctrl_c_while_workers_import_ends_them_all(tmp_path):
-    """Workers that Ctrl-C reached and that took a moment to end left tasks behind that nobody ended."""
+    """Workers that Ctrl-C reached and that took a moment to end left tasks behind that nobody
+    ended.
+    """
     script = tmp_path / "driver.py"
     script.write_text(SLOW_IMPORTS + DRIVER, encoding="utf-8")
     log = tmp_path / "log"

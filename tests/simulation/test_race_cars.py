@@ -1,4 +1,6 @@
-"""What makes simulated cars differ as real ones do: tyres that lag and wear, payloads, installations, drivers who correct, traffic."""
+"""What makes simulated cars differ as real ones do: tyres that lag and wear, payloads,
+installations, drivers who correct, traffic.
+"""
 
 import math
 from dataclasses import replace
@@ -32,7 +34,9 @@ def _lagging(lengths=LENGTHS):
 
 
 def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
-    """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a plant without lag asks for there."""
+    """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a
+    plant without lag asks for there.
+    """
     plant = _lagging()
     plain = _lagging((0.0, 0.0))
     states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]

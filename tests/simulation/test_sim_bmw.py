@@ -1,4 +1,6 @@
-"""The data set sim_bmw stands in for the recordings of Bertipaglia et al. 2024: mix, length, splits, and the car."""
+"""The data set sim_bmw stands in for the recordings of Bertipaglia et al. 2024: mix, length,
+splits, and the car.
+"""
 
 from collections import Counter
 from functools import cache, partial
@@ -15,8 +17,8 @@ from vehest.sources.simulated import SimulatedSource
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf"
 
-# Section IV-A: "23 manoeuvres: two braking in the turn, two skidpad, five J-turn, four slalom, four lane change, two random steers, three
-# spiral and one lap track".
+# Section IV-A: "23 manoeuvres: two braking in the turn, two skidpad, five J-turn, four slalom, four
+# lane change, two random steers, three spiral and one lap track".
 TEST_MANOEUVRES = {
     "braking_in_turn": 2,
     "skidpad": 2,

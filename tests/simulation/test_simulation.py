@@ -108,13 +108,22 @@ def test_courses_do_not_come_near_themselves(name):
 
 def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile():
     course = course_by_name("palm_beach_like")
-    # A turn is a stretch to one side; the two compound corners count as two turns, the opening kink after a corner as none.
+    # A turn is a stretch to one side; the two compound corners count as two turns, the opening kink
+    # after a corner as none.
     straight = np.abs(course.curvature) < 1e-9
     changes = np.flatnonzero(np.diff(straight.astype(int)))
     runs = np.diff(np.concatenate([changes, [changes[0] + len(straight) - 1]]))
     assert runs.max() * course.arc_length[1] == pytest.approx(0.6 * 1609.0, rel=0.05)
-    radii = [1.0 / abs(corner.curvature) for segment in LAYOUTS["palm_beach_like"].segments if not isinstance(segment, Straight)
-             for corner in (segment.parts if isinstance(segment, Compound) else (segment,))]  # fmt: skip
+    bends = [
+        segment
+        for segment in LAYOUTS["palm_beach_like"].segments
+        if not isinstance(segment, Straight)
+    ]
+    radii = [
+        1.0 / abs(corner.curvature)
+        for bend in bends
+        for corner in (bend.parts if isinstance(bend, Compound) else (bend,))
+    ]
     assert len([radius for radius in radii if radius < 240.0]) == 11
     assert math.degrees(np.abs(course.bank).max()) == pytest.approx(6.0)
 

@@ -1,4 +1,6 @@
-"""Manoeuvres of the proving ground, with every shipped car: what each is for, how it ends, and what the seed decides."""
+"""Manoeuvres of the proving ground, with every shipped car: what each is for, how it ends, and what
+the seed decides.
+"""
 
 import math
 from dataclasses import fields, replace
@@ -273,7 +275,8 @@ def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
     ("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)]
 )
 def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(car, reached):
-    # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6 to 10.8 m/s² for the Ferrari.
+    # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6
+    # to 10.8 m/s² for the Ferrari.
     trip = go(car, seed=100, name="laps", course="palm_beach_like", severity=0.95, laps=1)
     assert (trip.flags.spun, trip.flags.left_road, trip.flags.completed) == (False, False, True)
     assert trip.flags.largest_lateral_error < 1.5
@@ -301,7 +304,8 @@ def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
 
 
 def test_fast_lap_has_the_papers_speeds_and_names_the_reachable_limit():
-    # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan that has them exactly.
+    # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan
+    # that has them exactly.
     trip = go("heavy_truck", name="fast_lap")
     duration = len(trip.motion) / 100.0
     assert 3.6 * course_by_name("vairano_like").length / duration == pytest.approx(76.0, rel=0.02)

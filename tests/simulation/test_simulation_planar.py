@@ -1,4 +1,6 @@
-"""The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what the simulated tyre sets hold."""
+"""The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what
+the simulated tyre sets hold.
+"""
 
 import math
 import re
@@ -296,7 +298,8 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
     )
     for pattern, minutes in (("learn_a", 3.0), ("test_a", 1.5), ("test_d", 3.0)):
         assert len(of(pattern, "vx")) / 6000.0 == pytest.approx(minutes, rel=0.1)
-    # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
+    # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above
+    # 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
     for pattern in ("learn_a", "test_a", "test_d"):
         vx = of(pattern, "vx_ref")
         vy = of(pattern, "vy_ref")

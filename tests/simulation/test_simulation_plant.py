@@ -1,4 +1,6 @@
-"""The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
+"""The plant: library's equations, what was added to them, and that it holds from standstill to a
+spin.
+"""
 
 import fcntl
 import math
@@ -37,7 +39,8 @@ FERRARI = shipped("ferrari_250_lm")
 CORVETTE = shipped("corvette_grand_sport")
 TRUCK = shipped("heavy_truck")
 
-# CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py): BMW 320i, state, derivatives.
+# CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py):
+# BMW 320i, state, derivatives.
 PUBLISHED_INPUTS = (0.15, 0.63 * GRAVITY)
 PUBLISHED_STATE = [
     *(
@@ -124,7 +127,9 @@ PUBLISHED_DERIVATIVES = [
 
 
 class TwoTyres:
-    """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one for two, and so on."""
+    """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one
+    for two, and so on.
+    """
 
     def __init__(self, vehicle):
         self.values = library_parameters(vehicle)
@@ -139,7 +144,9 @@ class TwoTyres:
 
 
 def in_python(function):
-    """A compiled function as plain Python, with all it calls: Python's sines are those of the library."""
+    """A compiled function as plain Python, with all it calls: Python's sines are those of the
+    library.
+    """
     plain = function.py_func
     functions = {
         name: plain.__globals__[name]
@@ -359,7 +366,8 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
 
 @pytest.mark.parametrize("moment", [0.0, 900.0, -900.0])
 def test_tyre_forces_account_for_all_accelerations(moment):
-    # Masses times accelerations by differences of velocities of the body and of both axles, against the sum of forces.
+    # Masses times accelerations by differences of velocities of the body and of both axles, against
+    # the sum of forces.
     plant = MultiBodyPlant(FERRARI)
     slope = road_gravity(bank=0.05, grade=0.03)
     p = plant.parameters
@@ -383,7 +391,8 @@ def test_tyre_forces_account_for_all_accelerations(moment):
         mass * (change[:, place] + vx * yaw_rate - slope[1])
         for mass, place in ((p.m_s, VY), (p.m_uf, 15), (p.m_ur, 20))
     )
-    joint = 8.0  # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
+    # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
+    joint = 8.0
     np.testing.assert_allclose(forces[1].sum(axis=1), lateral, atol=joint)
     arm_x = np.array([p.a, p.a, -p.b, -p.b])
     arm_y = 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])

@@ -1,4 +1,6 @@
-"""Networks over windows in plain PyTorch: trained, estimated, run online and trained as members without a hook of their own."""
+"""Networks over windows in plain PyTorch: trained, estimated, run online and trained as members
+without a hook of their own.
+"""
 
 from functools import cache
 
@@ -244,7 +246,8 @@ def masked():
         (nn.Identity, "Identity has no parameters to train"),
         (
             lambda: nn.Sequential(nn.Linear(4, 1), nn.Flatten()),
-            r"Sequential maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one lateral velocity a window, \(64,\)",
+            r"Sequential maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one "
+            r"lateral velocity a window, \(64,\)",
         ),
     ],
 )

@@ -1,4 +1,6 @@
-"""Training through a filter: truncation, curriculum, placing, what learns in which phase, and that a killed training ends the same."""
+"""Training through a filter: truncation, curriculum, placing, what learns in which phase, and that
+a killed training ends the same.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Training: members as if alone, early stopping, checkpoints that go on to the same result, clean stops."""
+"""Training: members as if alone, early stopping, checkpoints that go on to the same result, clean
+stops.
+"""
 
 import numpy as np
 import pytest
@@ -137,7 +139,9 @@ def test_diverging_training_and_invalid_settings_are_clear_errors():
 
 
 def _plant(monkeypatch, member, bad_above, epoch=5):
-    """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger than ``bad_above``."""
+    """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger
+    than ``bad_above``.
+    """
     train_epoch = supervised._Run.train_epoch
     descend = supervised._Batch.descend
 
@@ -228,7 +232,9 @@ def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
 
 
 def _loop_with_all_its_weights(averaging):
-    """A plain loop over the same batches that keeps the weights of every step, and averages them by the closed form at each epoch's end."""
+    """A plain loop over the same batches that keeps the weights of every step, and averages them by
+    the closed form at each epoch's end.
+    """
     member = estimator_class("ksnn").from_config({"n_hidden": 1, "bias": True})
     member.seed(3)
     network = member._seeded_network(list(DATA.train), torch.float64)

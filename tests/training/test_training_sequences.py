@@ -1,4 +1,6 @@
-"""Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is kept, bad steps are skipped."""
+"""Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is
+kept, bad steps are skipped.
+"""
 
 import math
 from dataclasses import replace
@@ -50,7 +52,9 @@ def _phase(network, name="fit", trainable=None, loss=None, validation=None, **se
 
 
 def _two_phases(network):
-    """The read-out first, then all together, in steps so large that patience ends it after its fourth epoch, the second being the best."""
+    """The read-out first, then all together, in steps so large that patience ends it after its
+    fourth epoch, the second being the best.
+    """
     first = _phase(
         network,
         "read-out",
@@ -223,7 +227,9 @@ def test_adam_is_that_of_torch_bit_by_bit(decay):
 
 
 def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
-    """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
+    """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of
+    the other as it is.
+    """
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
     phase = Phase(
@@ -308,7 +314,8 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     )
     with pytest.raises(
         DataError,
-        match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate",
+        match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its "
+        r"learning_rate",
     ):
         train_phases([phase], 0, FitContext())
     network = _network()
@@ -342,7 +349,9 @@ def runs(monkeypatch):
 
 
 def _planted(network, runs, bad_above, **settings):
-    """A phase whose loss is NaN from its fifth epoch on while the step size is larger than ``bad_above``."""
+    """A phase whose loss is NaN from its fifth epoch on while the step size is larger than
+    ``bad_above``.
+    """
     phase = _phase(network, "all", max_epochs=40, learning_rate=4e-2, **settings)
 
     def loss(batch):

@@ -1,4 +1,6 @@
-"""The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear single track."""
+"""The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear
+single track.
+"""
 
 import math
 

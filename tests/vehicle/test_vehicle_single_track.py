@@ -1,4 +1,6 @@
-"""The linear single track against Newton's laws, its characteristic polynomial and the steady-state yaw gain."""
+"""The linear single track against Newton's laws, its characteristic polynomial and the steady-state
+yaw gain.
+"""
 
 import numpy as np
 import pytest

@@ -63,7 +63,10 @@ def _with_header(content, change, rng):
 
 @generator("study", weight=8)
 def manifest(case):
-    """Manifests and files of every stage; a file is spoilt while the manifest still agrees with its size."""
+    """Manifests and files of every stage.
+
+    A file is spoilt while the manifest still agrees with its size.
+    """
     case.copy("study")
     folder = case.rng.choice(
         [
@@ -104,7 +107,10 @@ def manifest(case):
 
 @generator("study", weight=10)
 def model(case):
-    """model.yaml, model.safetensors with its header, manifest.json; names of models and folders that are none."""
+    """model.yaml, model.safetensors with its header, manifest.json.
+
+    Names of models and folders that are none.
+    """
     case.copy("study")
     folder = case.rng.choice(sorted((case.place / "outputs" / "train").iterdir()))
     rng = case.rng
@@ -178,7 +184,9 @@ def tracked(folder):
 
 @generator("tracked", weight=2)
 def tracking_store(case):
-    """The store is damaged, or something else stands in its place: work goes on without it and says so."""
+    """The store is damaged, or something else stands in its place: work goes on without it and says
+    so.
+    """
     case.copy("tracked")
     store = case.place / "outputs" / "mlflow.db"
     kind = case.idea(4)

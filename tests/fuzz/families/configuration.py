@@ -1,4 +1,7 @@
-"""./conf, which Hydra alone reads: files of every group, spoilt; tags, interpolations, other encodings. ./pipelines, bombs of aliases."""
+"""./conf, which Hydra alone reads: files of every group, spoilt.
+
+Tags, interpolations, other encodings. ./pipelines, bombs of aliases.
+"""
 
 import yaml
 
@@ -39,7 +42,8 @@ CARS = {
     "heavy_truck": "sim_heavy",
     "bmw_545i": "sim_bmw",
 }
-PACKAGED = {  # file of the packaged configuration -> commands that read it, of which the first succeeds
+# file of the packaged configuration -> commands that read it, of which the first succeeds
+PACKAGED = {
     "training/supervised": [("train", *KSNN, "--dry-run")],
     "training/nelder_mead": [("train", *LUENBERGER, "--dry-run")],
     "common": [("ingest", "mine")],
@@ -152,7 +156,10 @@ PIPELINES = (
 
 
 def _write(case, name, tree, head=""):
-    """Write a configuration file, spoilt unless the case is honest; of one that builds on others, the rest."""
+    """Write a configuration file, spoilt unless the case is honest.
+
+    Of one that builds on others, the rest.
+    """
     if case.honest:
         case.write(name, head + yaml_of(tree))
     elif "defaults" in tree or case.rng.random() < 0.3:
@@ -165,7 +172,9 @@ def _write(case, name, tree, head=""):
 
 @generator("drives", weight=8)
 def dataset(case):
-    """A table's channels, transforms, points, poses, held channels, rows that are dropped, time that restarts."""
+    """A table's channels, transforms, points, poses, held channels, rows that are dropped, time
+    that restarts.
+    """
     case.copy("drives")
     _write(
         case,
@@ -219,7 +228,10 @@ def split(case):
 
 @generator("drives", "steered", weight=20)
 def packaged_file(case):
-    """A file that comes with vehest, of any group or at the root, stands spoilt in ./conf; or one that holds any value at all."""
+    """A file that comes with vehest, of any group or at the root, stands spoilt in ./conf.
+
+    Or one that holds any value at all.
+    """
     case.copy("drives")
     case.copy("steered")
     if not case.honest and case.rng.random() < 0.1:
@@ -239,7 +251,10 @@ def packaged_file(case):
 
 @generator("drives", "study", weight=8)
 def pipeline(case):
-    """Studies of one's own and packaged ones; titles and texts that end up in tables, figures and pages."""
+    """Studies of one's own and packaged ones.
+
+    Titles and texts that end up in tables, figures and pages.
+    """
     kind = case.idea(8)
     case.copy("study" if kind == 0 else "drives")
     if kind == 0:

@@ -1,4 +1,7 @@
-"""Commands that misbehave on purpose, one for each verdict: they show that the harness notices. No part of a normal run."""
+"""Commands that misbehave on purpose, one for each verdict: they show that the harness notices.
+
+No part of a normal run.
+"""
 
 import os
 import signal

@@ -1,4 +1,6 @@
-"""ROS 2 bags, plain and zipped: bytes, databases that hold something else, metadata.yaml, layouts of messages."""
+"""ROS 2 bags, plain and zipped: bytes, databases that hold something else, metadata.yaml, layouts
+of messages.
+"""
 
 import shutil
 import sqlite3

@@ -12,8 +12,9 @@ from parquet_bomb import bomb
 from vehest.data.store import write_recording
 
 CELLS = (
-    "", "nan", "inf", "1e400", "-1e400", "1e308", "1e-400", "0x10", "1_000", "1;5", "१२", "1e", "--1", "None", "true", '"', '""', "\x00",
-    "\x1b[31m", "=1+1", "9" * 23, "1" * 5000, " ", "\t1", "1 2", "N/A", "😀", "\ufeff1",
+    "", "nan", "inf", "1e400", "-1e400", "1e308", "1e-400", "0x10", "1_000", "1;5", "१२", "1e",
+    "--1", "None", "true", '"', '""', "\x00", "\x1b[31m", "=1+1", "9" * 23, "1" * 5000, " ", "\t1",
+    "1 2", "N/A", "😀", "\ufeff1",
 )  # fmt: skip
 
 
@@ -48,7 +49,10 @@ def csv(case):
 
 @generator(weight=8)
 def parquet(case):
-    """Bytes, most of all of the footer, which says how to read the rest; zeros that pack to next to nothing; pages larger than said."""
+    """Bytes, most of all of the footer, which says how to read the rest.
+
+    Zeros that pack to next to nothing; pages larger than said.
+    """
     file = case.place / "lap.parquet"
     idea = case.idea(4)
     if idea == 1:
