@@ -81,10 +81,14 @@ def test_interval_score_of_a_gaussian_matches_its_closed_form():
     assert scores[1] == min(scores)
 
 
+def crps_of_gaussian(z):
+    """σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) at σ = 1 (Gneiting & Raftery 2007, Eq. 21)."""
+    return z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+
+
 def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
-    """Sample by sample against σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) (Gneiting & Raftery 2007, Eq. 21)."""
     z = np.linspace(-5.0, 5.0, 2001)
-    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    exact = crps_of_gaussian(z)
     scores = crps_of_levels(z, np.tile(GAUSSIAN, (len(z), 1)), LEVELS)
     np.testing.assert_allclose(scores[np.abs(z) < 2.0], exact[np.abs(z) < 2.0], atol=0.045)
     weight = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
@@ -92,7 +96,7 @@ def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
     assert weight @ scores == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
     levels = np.arange(0.002, 0.9999, 0.002)
     z = np.linspace(-2.0, 2.0, 41)
-    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    exact = crps_of_gaussian(z)
     half = np.tile(stats.norm.ppf(0.5 + 0.5 * levels), (len(z), 1))
     np.testing.assert_allclose(crps_of_levels(z, half, levels.tolist()), exact, atol=1e-3)
 
