@@ -11,6 +11,7 @@ from refusals import refusal
 
 from conftest import stop_after
 from dugoff_drive import NOISE, TYRES, dugoff_drive
+from every_estimator import online_rows
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
@@ -116,11 +117,7 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     )
     estimator = estimator_with(inputs)
     batch = estimator.estimate([drive.without_references()])[0]
-    stepper = estimator.online()
-    online = [
-        stepper.step({name: drive[name][k] for name in estimator.channels})
-        for k in range(len(drive))
-    ]
+    online = online_rows(estimator, drive)
     for name in ("vy", "yaw_rate"):
         np.testing.assert_allclose([row[name] for row in online], batch[name], rtol=0.0, atol=1e-9)
     assert np.isfinite(batch["sideslip"]).all()

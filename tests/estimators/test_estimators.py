@@ -12,7 +12,7 @@ from refusals import refusal
 
 import vehest
 from conftest import flat_weights, planar_drive
-from every_estimator import drive_for, fitted
+from every_estimator import drive_for, fitted, online_rows
 from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
@@ -74,13 +74,9 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     drive = drive_for(estimator)
     estimate = estimator.estimate([drive])[0]
     batch = estimate["vy"]
-    stepper = estimator.online()
-    assert stepper.horizon_steps == estimator.horizon_steps
-    steps = [
-        stepper.step({channel: drive[channel][k] for channel in drive.channels})
-        for k in range(len(drive))
-    ]
-    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in steps])[
+    assert estimator.online().horizon_steps == estimator.horizon_steps
+    steps = online_rows(estimator, drive, drive.channels)
+    online = np.array([math.nan] * estimator.horizon_steps + [row["vy"] for row in steps])[
         : len(drive)
     ]
     assert np.array_equal(np.isnan(online), np.isnan(batch))

@@ -10,6 +10,7 @@ from refusals import refusal
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from every_estimator import online_rows
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
@@ -112,13 +113,7 @@ def test_factor_graph_equals_least_squares_and_the_filter_over_a_long_window():
 def test_online_skips_gaps_as_batch_does_and_believes_a_state_handed_over():
     estimator = factor_graph(window=0.1)
     drive = drive_with_gaps()
-    stepper = estimator.online()
-    online = np.array(
-        [
-            stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
-            for k in range(len(drive))
-        ]
-    )
+    online = np.array([row["vy"] for row in online_rows(estimator, drive)])
     assert np.abs(online - estimator.estimate([drive])[0]["vy"]).max() < 1e-9
     drive = linear_drive(1.0)[0]
     for window in (None, 0.05):

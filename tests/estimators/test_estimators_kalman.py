@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 
+from every_estimator import online_rows
 from single_track_drive import NOISE, linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import FitData
@@ -211,10 +212,6 @@ def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     estimator = kalman(**CONFIGURED_NOISE, offsets=OFFSETS, gate=5.0)
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
     drive, _ = with_planted_offsets(1, 0.6, 0.01)
-    stepper = estimator.online()
     batch = estimator.estimate([drive])[0]
-    online = [
-        stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
-        for k in range(len(drive))
-    ]
+    online = [row["vy"] for row in online_rows(estimator, drive)]
     assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9

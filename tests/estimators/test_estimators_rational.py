@@ -107,6 +107,15 @@ def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
         )
 
 
+def filtered_as_readable(estimator, samples):
+    """The compiled filter's result, whose means and last covariance are the readable filter's."""
+    ours = estimator.filter_samples(samples)
+    theirs = readable(estimator, samples).filtered
+    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
+    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    return ours
+
+
 @pytest.mark.parametrize("unstable", [False, True])
 def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     """A bend of 15 s without measurements: with too soft a rear axle the model spins, of which no
@@ -118,10 +127,7 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     samples = np.full((count, 4), np.nan)
     samples[:, 1] = 25.0
     samples[:, 3] = 0.02
-    ours = estimator.filter_samples(samples)
-    theirs = readable(estimator, samples).filtered
-    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
-    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    ours = filtered_as_readable(estimator, samples)
     unscented = rational("rational", curves=curves, filter="unscented").filter_samples(samples)
     for filtered in (ours, unscented):
         begun_anew = np.isclose(filtered.deviation[1:, 0], 0.05) & (filtered.mean[1:, 2] == 0.0)
@@ -137,10 +143,7 @@ def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres
     estimator = rational(tyres, largest_sideslip=np.radians(1.5))
     short = drive.cut(0.0, 8.0)
     samples = short.stack(estimator.channels)
-    ours = estimator.filter_samples(samples)
-    theirs = readable(estimator, samples).filtered
-    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
-    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    ours = filtered_as_readable(estimator, samples)
     free = rational(tyres).filter_samples(samples).mean
     assert np.abs(free[:, 0]).max() > np.radians(1.5)
     assert np.mean(np.abs(ours.mean[:, 0]) > np.radians(1.5)) < np.mean(

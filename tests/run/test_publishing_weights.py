@@ -52,6 +52,11 @@ def digests(output):
     }
 
 
+def models_published(pair):
+    """Models in the file of published weights."""
+    return PublishedWeights(pair.folder / FILE)._models
+
+
 def stop_once_published(patch, n_models):
     """Send Ctrl-C after so many models have been published."""
 
@@ -71,7 +76,7 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
         code, _, _ = pair(*RUN)
     assert code == 128 + signal.SIGINT
     assert sorted(os.listdir("results/pair")) == ["weights.safetensors"]
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 4
+    assert len(models_published(pair)) == 4
     assert len(digests(pair.folder / "outputs")) == 4
     shutil.rmtree("outputs")
     _, err = pair.done(*RUN)
@@ -95,7 +100,7 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
 
 def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
     pair.done(*RUN[:3])
-    former = PublishedWeights(pair.folder / FILE)
+    former = models_published(pair)
     report = (pair.folder / "results/pair/report.md").read_bytes()
     pipeline = pair.change("pipelines/pair.yaml")
     pipeline["parts"]["back"]["sweeps"] = [[*GRU[:2], "seed=2", GRU[3]]]
@@ -103,14 +108,13 @@ def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
     with monkeypatch.context() as patch:
         stop_once_published(patch, 7)
         assert pair(*RUN)[0] == 128 + signal.SIGINT
-    grown = PublishedWeights(pair.folder / FILE)
-    assert grown._models.items() > former._models.items()
+    assert models_published(pair).items() > former.items()
     assert (pair.folder / "results/pair/report.md").read_bytes() == report
     (pair.folder / FILE).unlink()
     _, err = pair.done(*RUN)
     assert "epochs," not in err
     assert "3 models added to results/pair/weights.safetensors" in " ".join(err.split())
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 4  # the report is published anew
+    assert len(models_published(pair)) == 4  # the report is published anew
 
 
 def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monkeypatch):
@@ -122,7 +126,7 @@ def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monke
         patch.setattr(runner.Runner, "_report", report)
         code, _, err = pair(*RUN)
     assert (code, "the best so far is kept" in " ".join(err.split())) == (130, True)
-    labels = [model.label for model in PublishedWeights(pair.folder / FILE)._models.values()]
+    labels = [model.label for model in models_published(pair).values()]
     assert labels == ["luenberger-luenberger-seed0"]
 
 
@@ -219,7 +223,7 @@ def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others
     with monkeypatch.context() as patch:
         stop_once_published(patch, 3)
         pair(*RUN)
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 3
+    assert len(models_published(pair)) == 3
     shutil.rmtree("outputs")
     pair.change("results/stale.yaml", pair="its second part is not trained")
     _, err = pair.done(*PUBLISH)

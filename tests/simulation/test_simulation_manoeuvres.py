@@ -60,6 +60,12 @@ def moderate(car, case):
     )
 
 
+def among_cones(car, case):
+    """A moderate trip, its manoeuvre, and the car's width [m]."""
+    width = car_of(MultiBodyPlant(vehicle(car))).width
+    return moderate(car, case), manoeuvre_from_config(MODERATE[case]), width
+
+
 def go(car, seed=1, surface="dry", stability_control=False, **configuration):
     plant = MultiBodyPlant(vehicle(car) if isinstance(car, str) else car)
     manoeuvre = manoeuvre_from_config(configuration)
@@ -70,6 +76,13 @@ def go(car, seed=1, surface="dry", stability_control=False, **configuration):
         surface=surface_from_config(surface),
         stability_control=stability_control,
     )
+
+
+def assert_finite(motion):
+    """All quantities that the motion has are finite."""
+    for entry in fields(motion):
+        values = getattr(motion, entry.name)
+        assert values is None or np.isfinite(values).all(), entry.name
 
 
 def side_of(trip):
@@ -114,20 +127,13 @@ def test_moderate_severity_is_completed_by_every_car(car, case):
     # The circuit's banked corner takes a little more than a level road's grip.
     grip = car_of(MultiBodyPlant(vehicle(car))).grip
     assert 0.25 * grip < flags.largest_ay < 1.1 * grip
-    for values in (
-        getattr(motion, entry.name)
-        for entry in fields(motion)
-        if getattr(motion, entry.name) is not None
-    ):
-        assert np.isfinite(values).all()
+    assert_finite(motion)
 
 
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("case", ["lane change", "obstacle"])
 def test_lane_change_keeps_the_car_between_the_cones(car, case):
-    trip = moderate(car, case)
-    manoeuvre = manoeuvre_from_config(MODERATE[case])
-    width = car_of(MultiBodyPlant(vehicle(car))).width
+    trip, manoeuvre, width = among_cones(car, case)
     x = trip.motion.x
     y = side_of(trip) * trip.motion.y
     for gate in manoeuvre.gates(width):
@@ -157,9 +163,7 @@ def test_gates_are_those_of_the_standards():
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("case", ["slalom 18 m", "slalom 30 m"])
 def test_slalom_passes_the_cones_on_alternating_sides(car, case):
-    trip = moderate(car, case)
-    manoeuvre = manoeuvre_from_config(MODERATE[case])
-    width = car_of(MultiBodyPlant(vehicle(car))).width
+    trip, manoeuvre, width = among_cones(car, case)
     cones = np.arange(manoeuvre.cones) * manoeuvre.spacing
     at_cones = side_of(trip) * np.interp(cones, trip.motion.x, trip.motion.y)
     alternating = np.where(np.arange(manoeuvre.cones) % 2 == 0, 1.0, -1.0)
@@ -340,12 +344,7 @@ def test_spin_is_recorded_and_flagged_until_a_second_after_the_stand():
     assert speed[0] > 25.0
     last_moving = np.flatnonzero(speed > 0.01)[-1]
     assert (len(motion) - 1 - last_moving) / 100.0 == pytest.approx(1.0, abs=0.05)
-    for values in (
-        getattr(motion, entry.name)
-        for entry in fields(motion)
-        if getattr(motion, entry.name) is not None
-    ):
-        assert np.isfinite(values).all()
+    assert_finite(motion)
 
 
 @pytest.mark.parametrize("seed", [1, 2])  # to the right and to the left

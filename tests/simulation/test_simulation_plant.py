@@ -337,6 +337,14 @@ def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     )
 
 
+def velocities_and_rates(motion):
+    """Both velocities with their derivatives by the kinematics of the plane."""
+    return (
+        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
+        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
+    )
+
+
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
     motion, states = drive(
@@ -344,10 +352,7 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     )
     assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
     assert motion.vx[-1] == 0.0
-    for velocity, rate in (
-        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
-        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
-    ):
+    for velocity, rate in velocities_and_rates(motion):
         error = np.abs((velocity[2:] - velocity[:-2]) / 2e-3 - rate[1:-1])
         assert np.median(error) < 1e-5
         # Inputs that jump (brakes at 2 s) and the stop itself leave a few samples with half a jump.
@@ -356,10 +361,7 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     motion, states = spin
     sliding = np.array([state.regime == Regime.SLIDING for state in states])
     inside = np.flatnonzero(sliding[:-2] & sliding[2:])
-    for velocity, rate in (
-        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
-        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
-    ):
+    for velocity, rate in velocities_and_rates(motion):
         error = np.abs((velocity[inside + 2] - velocity[inside]) / 0.02 - rate[inside + 1])
         assert np.median(error) < 0.02  # the sampling is ten times coarser here
 

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from conftest import flat_weights, planar_drive, stop_after
+from every_estimator import online_rows
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.networks.standardised import StandardisedNetwork
@@ -139,11 +140,7 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     member = network_type(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
     batch = member.estimate([drive])[0]["vy"]
-    stepper = member.online()
-    online = [
-        stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
-        for k in range(len(drive))
-    ]
+    online = [row["vy"] for row in online_rows(member, drive, drive.channels)]
     assert np.isnan(batch[:WINDOW]).all()
     assert np.abs(np.array(online)[WINDOW - 1 : -1] - batch[WINDOW:]).max() <= tolerance
 

@@ -27,6 +27,11 @@ SHAPES = [
 ]
 
 
+RUN = supervised._Run
+BATCH = supervised._Batch
+"""Classes of a training in progress, into which tests plant faults."""
+
+
 @pytest.fixture(autouse=True)
 def _looks_up_after_every_batch(monkeypatch):
     monkeypatch.setattr(supervised, "BATCHES", 1)
@@ -41,6 +46,12 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
         members.append(member)
     records = kind.fit_members(members, data, settings, context or FitContext())
     return members, records
+
+
+def validation_loss_of(member):
+    """Mean squared error of the lateral velocity on the validation recordings [m²/s²]."""
+    windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
+    return np.mean((member._predict(windows.series, windows.starts) - windows.targets) ** 2)
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
@@ -69,9 +80,7 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     best = int(losses.argmin())
     assert record.metrics["best_epoch"] == best + 1
     assert len(losses) == min(best + 1 + settings.patience, settings.max_epochs)
-    windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
-    error = member._predict(windows.series, windows.starts) - windows.targets
-    assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
+    assert validation_loss_of(member) == pytest.approx(losses[best], rel=1e-9)
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
@@ -142,8 +151,8 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
     """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger
     than ``bad_above``.
     """
-    train_epoch = supervised._Run.train_epoch
-    descend = supervised._Batch.descend
+    train_epoch = RUN.train_epoch
+    descend = BATCH.descend
 
     def spoilt_epoch(self):
         def spoilt_descend(batch, data, windows):
@@ -154,11 +163,11 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
             return losses
 
         with monkeypatch.context() as patch:
-            patch.setattr(supervised._Batch, "descend", spoilt_descend)
+            patch.setattr(BATCH, "descend", spoilt_descend)
             train_epoch(self)
 
-    monkeypatch.setattr(supervised._Run, "train_epoch", spoilt_epoch)
-    monkeypatch.setattr(supervised._Run, "planted", member, raising=False)
+    monkeypatch.setattr(RUN, "train_epoch", spoilt_epoch)
+    monkeypatch.setattr(RUN, "planted", member, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -183,9 +192,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     losses = np.array(records[1].history["validation_loss"])
     assert np.isnan(losses).sum() == halvings + ended
     assert metrics["best_epoch"] == np.nanargmin(losses) + 1
-    windows = windows_of(DATA.validation, spoilt[1].channels, "vy_ref", spoilt[1].settings.window)
-    error = spoilt[1]._predict(windows.series, windows.starts) - windows.targets
-    assert np.mean(error**2) == pytest.approx(np.nanmin(losses), rel=1e-5)
+    assert validation_loss_of(spoilt[1]) == pytest.approx(np.nanmin(losses), rel=1e-5)
     folders = [tmp_path / str(seed) for seed in range(3)]
     for _ in range(20):
         context = FitContext(folders, should_stop=stop_after(23))
@@ -197,7 +204,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     ):
         assert np.array_equal(flat_weights(expected), flat_weights(actual))
         np.testing.assert_equal(dict(record.history), dict(resumed_record.history))
-    monkeypatch.setattr(supervised._Run, "planted", 0)
+    monkeypatch.setattr(RUN, "planted", 0)
     (alone,), _ = _fit("ksnn", {}, [1], settings)
     assert np.array_equal(flat_weights(alone), flat_weights(spoilt[1]))
 

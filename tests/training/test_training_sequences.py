@@ -338,13 +338,14 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
 def runs(monkeypatch):
     """Trainings that have begun, so that a planted loss can ask for the step size and the epoch."""
     begun = []
-    prepare = sequences._Run.__post_init__
+    run_type = sequences._Run
+    prepare = run_type.__post_init__
 
     def watched(self):
         begun.append(self)
         prepare(self)
 
-    monkeypatch.setattr(sequences._Run, "__post_init__", watched)
+    monkeypatch.setattr(run_type, "__post_init__", watched)
     return begun
 
 
