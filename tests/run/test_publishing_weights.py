@@ -9,11 +9,9 @@ import subprocess
 import sys
 
 import pytest
-from safetensors.numpy import save_file
 
 from place import write_drives
 from vehest.artefacts.artefact import read_artefact
-from vehest.data.errors import DataError
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.text_files import read_json
 from vehest.run import runner, weights
@@ -152,15 +150,15 @@ def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatc
     assert (pair.folder / "results/pair/report.md").is_file()
 
 
-def test_weights_whose_descriptions_inflate_beyond_the_limit_are_damaged(tmp_path, monkeypatch):
-    file = tmp_path / "weights.safetensors"
-    metadata = weights.compressed({"key": {"label": "a" * 1000, "code": "", "digest": ""}})
-    assert len(metadata) < 200
-    save_file({}, file, metadata={"models": metadata})
-    assert "key" in PublishedWeights(file)
-    monkeypatch.setattr(weights, "MAX_DESCRIPTION_BYTES", 1000)
-    with pytest.raises(DataError, match="is damaged"):
-        PublishedWeights(file)
+def test_contents_are_compressed_and_earlier_plain_ones_are_read(monkeypatch):
+    content = ("epoch,train_loss\n" + 500 * "1,0.25\n").encode()
+    text = weights.compressed(content)
+    assert len(text) < len(content) / 10
+    assert weights.uncompressed(text) == weights.uncompressed(content.decode()) == content
+    monkeypatch.setattr(weights, "MAX_FILE_BYTES", len(content) - 1)
+    for damaged in (text, text[:-8], weights.COMPRESSED + "bm90IHpsaWI=", "zlib,*"):
+        with pytest.raises(ValueError, match="compressed file"):
+            weights.uncompressed(damaged)
 
 
 def trained(pair):
