@@ -13,7 +13,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
-from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
+from vehest.estimators.filtering.car_filter import MIN_ENTROPY
 from vehest.estimators.learned_ukf import SHORT, LearnedUkf
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
@@ -229,7 +229,7 @@ def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
     )
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(
-        DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"
+        DataError, match="has no channel 'vx_ref', on which estimator 'learned_ukf' is trained"
     ):
         estimator().fit(FitData([missing], [missing]), quick())
     gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})
@@ -282,7 +282,7 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
     with torch.no_grad():
         expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
         of_process = with_entropy(
-            made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY
+            made.filter.process_noise(torch.from_numpy(states), nothing), MIN_ENTROPY
         ).numpy()
     np.testing.assert_allclose(
         covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0

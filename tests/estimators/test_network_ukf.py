@@ -14,10 +14,11 @@ from vehest.data.schema import settings_from_config
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import EndToEnd, EndToEndSettings
-from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.ensemble_ukf import EnsembleSettings, scaled_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.filtering.track_filter import EXACT_STATE_DEVIATION, TrackFilter, error_over
-from vehest.estimators.network_ukf import LEAST_VARIANCE
+from vehest.estimators.network_ukf import MIN_VARIANCE
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
 from vehest.filters.unscented_scan import TorchModel
@@ -103,11 +104,11 @@ def test_a_word_counts_as_much_as_its_variance_says():
 def test_the_ensembles_variance_is_that_of_its_networks_scaled_by_the_papers_formula():
     variance = np.array([1e-6, 4e-4])
     np.testing.assert_allclose(
-        scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE
+        scaled_variance(variance, np.array([0.0, 1.0])), variance + MIN_VARIANCE
     )
     np.testing.assert_allclose(
         scaled_variance(variance, np.array([-4.269, 0.7901])),
-        10**-4.269 * variance**0.7901 + LEAST_VARIANCE,
+        10**-4.269 * variance**0.7901 + MIN_VARIANCE,
     )
     inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").network_inputs)
     told = {}
@@ -121,7 +122,7 @@ def test_the_ensembles_variance_is_that_of_its_networks_scaled_by_the_papers_for
     np.testing.assert_allclose(
         told["models"].sideslip, np.clip(said.mean(0), -1.5, 1.5), rtol=1e-12
     )
-    np.testing.assert_allclose(told["models"].variance, said.var(0) + LEAST_VARIANCE, rtol=1e-9)
+    np.testing.assert_allclose(told["models"].variance, said.var(0) + MIN_VARIANCE, rtol=1e-9)
     assert (told["mixture"].variance > told["models"].variance).all()
 
 
@@ -170,7 +171,7 @@ def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_wher
     word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)[:3])
     np.testing.assert_allclose(np.sqrt(word.process), [[2e-3, 2e-3]] * 3, rtol=1e-4)
     np.testing.assert_allclose(
-        word.variance, float(estimator.network.unit) ** 2 + LEAST_VARIANCE, rtol=1e-4
+        word.variance, float(estimator.network.unit) ** 2 + MIN_VARIANCE, rtol=1e-4
     )
 
 

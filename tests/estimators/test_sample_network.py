@@ -161,7 +161,7 @@ def test_masks_hide_their_share_and_follow_from_the_seed_and_what_is_missing_is_
     drive = dugoff_drive(2.0)
     with pytest.raises(
         DataError,
-        match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu",
+        match=r"'fx_fl', on which estimator 'sideslip_ffnn' is trained; set estimator.inputs=imu",
     ):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
 

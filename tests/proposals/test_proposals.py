@@ -898,6 +898,23 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
     )
 
 
+def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offered(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "t [s]": d["t"],
+            "vx [m/s]": d["vx"],
+            "yaw_rate [rad/s]": 100.0 * d["r"],
+            "ay [m/s²]": d["ay"],
+        }
+    )
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"vx": "vx [m/s]", "ay": "ay [m/s²]"}
+    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[1].split()
+    assert (name, unit, sign) == ("yaw_rate", "rad/s", "+1")
+    assert float(factor) == pytest.approx(0.01, rel=0.05)
+
+
 def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
     table = usual(drive())
     table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
@@ -1246,6 +1263,10 @@ def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_on
             "heading_error": d["r"] / 3.0,
         }
     )
+    assert left_out(tmp_path, table)[0] == {"yaw_rate": "r [rad/s]"}
+    table = table.rename(columns={"r [rad/s]": "r", "dpsi [rad]": "dpsi"})
+    assert "dpsi" not in left_out(tmp_path, table)[1]
+    table = table.rename(columns={"r": "r [rad/s]"})
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "r [rad/s]"}
     assert '--answer "Uy=vy_ref m/s"' in open_questions["Uy"].text

@@ -129,7 +129,7 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
     for text, view in {
         "": (100.0, 120.0),
         "whole range": (0.0, 3599.95),
-        "busiest 20 s": (100.0, 120.0),
+        "20 s of largest sideslip": (100.0, 120.0),
     }.items():
         if text:
             press(chromium, text)
@@ -153,7 +153,7 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
 
 def test_errors_can_be_taken_over_the_segment_in_view(chromium, hour):
     opened(chromium, hour)
-    press(chromium, "busiest 20 s")
+    press(chromium, "20 s of largest sideslip")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
     assert chromium.find_element("css selector", ".said").text.startswith(
         "401 of 72000 samples, 20.1 s"
@@ -287,6 +287,29 @@ def test_appendices_are_one_folded_list_at_the_end(chromium, toy):
     assert contents == ["Verdict", "Minutes of reference", "Appendices"]
     last = "return document.querySelector('#appendices ~ details:last-of-type h2').textContent"
     assert chromium.execute_script(last) == "Note"
+
+
+def test_a_figure_that_scrolls_on_a_phone_says_so(chromium, toy):
+    opened(chromium, toy[0], width=390)
+    places = chromium.execute_script(
+        "return [...document.querySelectorAll('.static')].filter((place) => place.clientWidth)"
+        ".map((place) => [place.scrollWidth > place.clientWidth,"
+        " getComputedStyle(place, '::before').content.includes('scroll sideways')])"
+    )
+    assert {True, False} == {scrolls for scrolls, _ in places}
+    assert all(scrolls == says_so for scrolls, says_so in places)
+
+
+def test_forest_plot_is_beside_the_verdict_on_a_wide_screen(chromium, toy):
+    opened(chromium, toy[0], width=1280)
+    text, figure = chromium.execute_script(
+        "return ['.text', '.text + figure'].map((selector) => {"
+        " const box = document.querySelector(selector).getBoundingClientRect();"
+        " return [box.left, box.right, box.top, box.bottom] })"
+    )
+    assert text[1] <= figure[0]
+    assert text[2] < figure[3]
+    assert figure[2] < text[3]
 
 
 def test_page_shows_the_figure_where_scripts_may_not_run(chromium, toy):

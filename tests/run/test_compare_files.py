@@ -210,7 +210,7 @@ def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp
     assert {row["estimate"] for row in found["rows"]} == {"good", "bad", "zero", "static_map"}
     assert found["verdict"].startswith("Best: good, ")
     assert (
-        "It is significantly better than the zero-sideslip baseline and the static map."
+        "good is significantly better than the zero-sideslip baseline and the static map."
         in (found["verdict"])
     )
     alike = compare_estimates(drive, {"one": estimates["good"], "other": estimates["good"]})

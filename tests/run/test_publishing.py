@@ -17,6 +17,7 @@ from safetensors.numpy import load, load_file, save_file
 from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.artefacts.artefact import TIMINGS, read_artefact
 from vehest.run import published as study_keys
+from vehest.run import report as report_stage
 from vehest.run.publishing import PROVENANCE, published_content
 from vehest.run.versions import VERSIONS, code_of
 
@@ -445,6 +446,34 @@ def test_results_of_a_work_tree_with_changes_are_not_published(published, place,
     subprocess.run(["git", *author, "commit", "-qam", "b"], check=True)
     place.done(*RUN)
     assert metrics.read_text() != "changed\n"
+
+
+def test_an_edited_template_draws_the_report_again_and_makes_nothing_stale(
+    published, place, monkeypatch, tmp_path
+):
+    """The report of the old text was published again, as no key had the template in it."""
+    shutil.rmtree(place.folder)
+    shutil.copytree(published, place.folder)
+    shutil.rmtree(place.folder / "outputs" / "finished")
+    monkeypatch.chdir(place.folder)
+    module_folder = tmp_path / "study"
+    module_folder.mkdir()
+    template = module_folder / "report.md.j2"
+    digests = []
+    for text in ("**Question.** Which?", "**Question.** Which estimator?"):
+        template.write_text(text, encoding="utf-8")
+        with monkeypatch.context() as patch:
+            study = SimpleNamespace(__file__=str(module_folder / "document.py"))
+            patch.setattr(report_stage, "study_module", {"small": study}.get)
+            digests.append(report_stage.template_digests("small"))
+    assert [list(digest) for digest in digests] == [["report.md.j2"]] * 2
+    assert digests[0] != digests[1]
+    folder = place.folder / "outputs" / "report"
+    assert len(list(folder.iterdir())) == 1
+    monkeypatch.setattr(report_stage, "template_digests", lambda name: digests[1])
+    place.done(*RUN)
+    assert len(list(folder.iterdir())) == 2
+    assert place(*CHECK)[:2] == (0, "small: up to date\n")
 
 
 def test_the_list_of_stale_studies_only_shrinks():

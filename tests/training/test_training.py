@@ -68,7 +68,7 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     assert record.metrics["best_epoch"] == best + 1
     assert len(losses) == min(best + 1 + settings.patience, settings.max_epochs)
     windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
-    error = member._predict(windows.series, windows.starts) - windows.targets
+    error = member.predict(windows.series, windows.starts) - windows.targets
     assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
 
 
@@ -180,7 +180,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     assert np.isnan(losses).sum() == halvings + ended
     assert metrics["best_epoch"] == np.nanargmin(losses) + 1
     windows = windows_of(DATA.validation, spoilt[1].channels, "vy_ref", spoilt[1].settings.window)
-    error = spoilt[1]._predict(windows.series, windows.starts) - windows.targets
+    error = spoilt[1].predict(windows.series, windows.starts) - windows.targets
     assert np.mean(error**2) == pytest.approx(np.nanmin(losses), rel=1e-5)
     folders = [tmp_path / str(seed) for seed in range(3)]
     for _ in range(20):
@@ -231,7 +231,7 @@ def _loop_with_all_its_weights(averaging):
     """A plain loop over the same batches that keeps the weights of every step, and averages them by the closed form at each epoch's end."""
     member = estimator_class("ksnn").from_config({"n_hidden": 1, "bias": True})
     member.seed(3)
-    network = member._seeded_network(list(DATA.train), torch.float64)
+    network = member.seeded_network(list(DATA.train), torch.float64)
     sets = [
         windows_of(part, member.channels, "vy_ref", member.settings.window)
         for part in (DATA.train, DATA.validation)

@@ -1,5 +1,6 @@
-"""Kinematic Luenberger observer with reset: Farrelly & Wellstead 1996, as in Da Lio et al. 2023,
-Appendix A.
+"""Kinematic Luenberger observer with reset.
+
+Source: Farrelly & Wellstead 1996, as in Da Lio et al. 2023, Appendix A.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ class Luenberger(Recursive):
         box=(0.0, 0.5),
         of_largest="yaw_rate",
     )
-    style = "#767676", "solid", "s"
+    style = "#5b8c00", "solid", "s"
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Lateral and forward velocity [m/s]."""
@@ -132,7 +133,7 @@ class Luenberger(Recursive):
         return {"vy": vy, "vx": vx}, (float(vy[-1]), float(vx[-1]))
 
     def c_values(self) -> dict[str, Any]:
-        """Its gain and threshold."""
+        """Gain and threshold for the C template."""
         return {**self.values, "step": 1.0 / self.rate_hz}
 
 
