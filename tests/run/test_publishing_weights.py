@@ -7,9 +7,11 @@ import subprocess
 import sys
 
 import pytest
+from safetensors.numpy import save_file
 
 from place import write_drives
 from vehest.artefacts.artefact import read_artefact
+from vehest.data.errors import DataError
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.text_files import read_json
 from vehest.run import runner, weights
@@ -142,6 +144,17 @@ def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatc
     assert "the report is published without weights" in said
     assert not (pair.folder / FILE).exists()
     assert (pair.folder / "results/pair/report.md").is_file()
+
+
+def test_weights_whose_descriptions_inflate_beyond_the_limit_are_damaged(tmp_path, monkeypatch):
+    file = tmp_path / "weights.safetensors"
+    metadata = weights.compressed({"key": {"label": "a" * 1000, "code": "", "digest": ""}})
+    assert len(metadata) < 200
+    save_file({}, file, metadata={"models": metadata})
+    assert "key" in PublishedWeights(file)
+    monkeypatch.setattr(weights, "MAX_DESCRIPTION_BYTES", 1000)
+    with pytest.raises(DataError, match="is damaged"):
+        PublishedWeights(file)
 
 
 def trained(pair):

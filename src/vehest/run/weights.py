@@ -10,10 +10,13 @@ by training, and is replaced in one step.
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
@@ -29,10 +32,14 @@ from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
 from vehest.run.console import Messages
 from vehest.run.train import FIT_METRICS, HISTORY
 
-MODELS = "models"  # the only entry of the file's metadata
+MODELS = "models"
+"""The only entry of the file's metadata: descriptions and loss curves of all models, as JSON that
+is compressed (zlib) and written in base64; files of earlier versions have plain JSON.
+"""
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
 FORMAT = 2  # in the key of a report that has weights: 2 has a digest for each model
 MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
+MAX_DESCRIPTION_BYTES = 500_000_000  # uncompressed, so that no file can fill the memory
 
 
 class WeightsTooLargeError(VehestError):
@@ -102,7 +109,7 @@ class PublishedWeights:
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
         records = self._models | {key: _record_of(model) for key, model in added.items()}
         about = {key: asdict(record) for key, record in sorted(records.items())}
-        content = save(tensors, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
+        content = save(tensors, metadata={MODELS: compressed(about)})
         megabytes = len(content) / 1e6
         if megabytes > MAX_MEGABYTES:
             raise WeightsTooLargeError(
@@ -152,14 +159,31 @@ class PublishedWeights:
         try:
             with safe_open(self.path, framework="np") as file:
                 self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
-                    file.metadata()[MODELS]
+                    uncompressed(file.metadata()[MODELS])
                 )
-        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError, zlib.error) as error:
             raise DataError(
                 f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout "
                 f"{self.path}', "
                 "remove it, or add --retrain"
             ) from error
+
+
+def compressed(about: dict[str, Any]) -> str:
+    """The metadata of a file of weights."""
+    text = json.dumps(about, ensure_ascii=False)
+    return base64.b64encode(zlib.compress(text.encode(), level=9)).decode()
+
+
+def uncompressed(text: str) -> bytes:
+    """JSON of `compressed` metadata; raises ValueError or `zlib.error` where it is damaged."""
+    if text.startswith("{"):
+        return text.encode()
+    inflation = zlib.decompressobj()
+    content = inflation.decompress(base64.b64decode(text, validate=True), MAX_DESCRIPTION_BYTES)
+    if not inflation.eof:
+        raise ValueError(f"descriptions are cut off or exceed {MAX_DESCRIPTION_BYTES / 1e6:g} MB")
+    return content
 
 
 def _record_of(model: Artefact) -> PublishedModel:
