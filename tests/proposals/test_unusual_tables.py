@@ -111,9 +111,10 @@ def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
 def test_a_row_of_numbers_that_is_cut_off_is_an_error(tmp_path):
     lines = lines_of(usual(drive()))
     file = tmp_path / "lap.csv"
-    file.write_text("\n".join(lines)[:-30], encoding="utf-8")
-    with pytest.raises(DataError, match="Expected 7 columns"):
-        inspect("my_car", [file])
+    for text in ("\n".join(lines)[:-30], "\n".join([*lines[:500], "bad,1.0,2.0", *lines[500:]])):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(DataError, match="Expected 7 columns"):
+            inspect("my_car", [file])
 
 
 def test_a_unit_of_time_that_the_steps_contradict_is_asked_with_the_one_that_fits(tmp_path):

@@ -86,7 +86,9 @@ def test_band_covers_its_half_width_about_the_estimate_and_is_in_the_legend():
         (figure.axes[0], estimate.sideslip, 0.5),
         (figure.axes[2], estimate.vy, 0.25),
     ):
-        (area,) = [own for own in axes.collections if isinstance(own, PolyCollection)]
+        (area,) = [
+            collection for collection in axes.collections if isinstance(collection, PolyCollection)
+        ]
         corners = area.get_paths()[0].vertices
         at_start = corners[corners[:, 0] == TIME[50], 1]
         assert (at_start.min(), at_start.max()) == pytest.approx(
@@ -96,7 +98,7 @@ def test_band_covers_its_half_width_about_the_estimate_and_is_in_the_legend():
     assert set(labels) == {"measured", "GRU", "90 % band of GRU"}
 
 
-def test_agreement_has_one_panel_an_estimator_with_equal_limits():
+def test_agreement_has_a_panel_per_estimator_with_equal_limits():
     reference = 3.0 * np.sin(TIME)
     clouds = [Cloud(f"estimator {i}", GRU.colour, reference, 0.9 * reference) for i in range(5)]
     figure = agreement_figure(reference, clouds)

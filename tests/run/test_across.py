@@ -13,7 +13,7 @@ from vehest.run.study import read_study
 
 PLAIN = ["estimator=zero,static_map,kinematic"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
-LACKING = ["estimator=kalman"]  # there is no steering angle
+UNUSABLE = ["estimator=kalman"]  # there is no steering angle
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def across(place):
         "pipelines/vehicles.yaml",
         study="vehicles",
         report="transfer",
-        parts=parts_of(PLAIN, LUENBERGER, LACKING),
+        parts=parts_of(PLAIN, LUENBERGER, UNUSABLE),
     )
     return place
 
@@ -57,7 +57,9 @@ def parts_of(*sweeps):
 
 
 def rmse_by_hand(output, models, protocol_skip=1.5):
-    """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings [deg], with NumPy alone."""
+    """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings
+    [deg], with NumPy alone.
+    """
     errors = []
     folders = sorted((output / "evaluate").glob(f"{models}-on-folded_fold_*"))
     assert len(folders) == 3
@@ -110,7 +112,7 @@ def test_errors_of_all_folds_count_together(across):
     }
 
 
-def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across):
+def test_vehicles_are_listed_side_by_side_including_failed_ones(across):
     code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
     assert code == 5, err
     assert "steer" in err
@@ -247,6 +249,6 @@ def test_a_pipeline_of_folds_has_a_part_a_fold(across):
     ],
     ids=str,
 )
-def test_a_report_that_does_not_suit_is_refused_in_one_line(across, content, says):
+def test_unsuitable_reports_are_refused_in_a_single_line(across, content, says):
     across.change("pipelines/odd.yaml", study="odd", **content)
     across.refused("run", "odd", code=2, says=says)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Estimate
+from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.data.schema import settings_from_config
 from vehest.declared import Declaration, Group, setting
@@ -443,11 +443,9 @@ class Estimator(ABC):
         Sideslip is atan2(vy, vx) with the measured vx.
         """
         channels = {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"]), **quantities}
-        mode = "causal" if self.causal else "offline"
+        mode: Mode = "causal" if self.causal else "offline"
         clock = (recording.rate_hz, recording.start_time)
-        return Estimate(  # type: ignore[arg-type]
-            recording.id, self.name, *clock, channels, mode, covariance, covariance_of
-        )
+        return Estimate(recording.id, self.name, *clock, channels, mode, covariance, covariance_of)
 
     def _estimate_all(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]

@@ -28,8 +28,7 @@ def implicit_euler_observer(
     vy: FloatArray,
     vx: FloatArray,
 ) -> None:
-    """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the
-    time of each sample, (T,).
+    """Run the observer over a recording, writing ``vy`` and ``vx`` [m/s] of each sample, (T,).
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
@@ -98,8 +97,7 @@ def observe(
 
 
 class Luenberger(Recursive):
-    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small to observe
-    anything.
+    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small.
 
     Source: Da Lio et al. 2023, Appendix A (gains in the order that its Appendix B implies).
     """

@@ -194,8 +194,7 @@ def model_digest(folder: Path) -> str:
 def _built(
     kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path
 ) -> Estimator:
-    """An estimator of these settings, once they are known to ask for no more parameters than there
-    are weights.
+    """Build an estimator, unless its settings need more parameters than there are weights.
 
     Raises
     ------

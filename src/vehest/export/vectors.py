@@ -91,8 +91,9 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
 
 
 def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]:
-    """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that
-    is the same on every machine.
+    """Swerves at a varying speed with noise that is the same on every machine.
+
+    They are as large as 0.3 of the largest values in training.
     """
     names = list(stepper.channels)
     limits = stepper.guard.limits[:, :2]
@@ -146,8 +147,9 @@ def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]
 
 
 def _noise(n: int, seed: int) -> FloatArray:
-    """Uniform between -1 and 1, (n,), by a linear congruential generator (Numerical Recipes, 2007,
-    Section 7.1).
+    """Uniform between -1 and 1, (n,), by a linear congruential generator.
+
+    Source: Numerical Recipes, 2007, Section 7.1.
     """
     state = (1664525 * seed + 1013904223) % 2**32
     noise = np.empty(n)

@@ -12,7 +12,9 @@ _MARK = "\0"  # before and after the place of a table or figure
 
 
 def fill_template(path: Path, values: Mapping[str, Any], blocks: Iterable[Block]) -> list[Block]:
-    """Fill in a template: values, loops over rows, ``{{ table("name") }}``, ``{{ figure("name") }}``.
+    """Fill in a template: values, loops over rows, places of tables and figures.
+
+    Places are ``{{ table("name") }}`` and ``{{ figure("name") }}``.
 
     Parameters
     ----------

@@ -16,7 +16,6 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
 from safetensors import SafetensorError, safe_open
@@ -32,14 +31,15 @@ from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
 from vehest.run.console import Messages
 from vehest.run.train import FIT_METRICS, HISTORY
 
-MODELS = "models"
-"""The only entry of the file's metadata: descriptions and loss curves of all models, as JSON that
-is compressed (zlib) and written in base64; files of earlier versions have plain JSON.
+MODELS = "models"  # the only entry of the file's metadata
+COMPRESSED = "zlib,"
+"""Begins the content of a file that is compressed and written in base64; files of weights of
+earlier versions have plain text.
 """
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
 FORMAT = 2  # in the key of a report that has weights: 2 has a digest for each model
 MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
-MAX_DESCRIPTION_BYTES = 500_000_000  # uncompressed, so that no file can fill the memory
+MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
 
 
 class WeightsTooLargeError(VehestError):
@@ -53,7 +53,7 @@ class PublishedModel:
     label: str
     code: str  # version of the training
     digest: str  # of the training's artefact
-    files: dict[str, str] = field(default_factory=dict)  # those of `FILES` that it has -> content
+    files: dict[str, str] = field(default_factory=dict)  # of `FILES` -> content, `compressed`
 
 
 class PublishedWeights:
@@ -109,7 +109,7 @@ class PublishedWeights:
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
         records = self._models | {key: _record_of(model) for key, model in added.items()}
         about = {key: asdict(record) for key, record in sorted(records.items())}
-        content = save(tensors, metadata={MODELS: compressed(about)})
+        content = save(tensors, metadata={MODELS: json.dumps(about)})
         megabytes = len(content) / 1e6
         if megabytes > MAX_MEGABYTES:
             raise WeightsTooLargeError(
@@ -131,9 +131,15 @@ class PublishedWeights:
             The model is not the one that was published.
         """
         record = self._models[key]
-        for name in FILES:
-            if name in record.files:
-                (folder / name).write_bytes(record.files[name].encode())
+        try:
+            for name in FILES:
+                if name in record.files:
+                    (folder / name).write_bytes(uncompressed(record.files[name]))
+        except ValueError as error:
+            raise DataError(
+                f"'{self.path}' is damaged ({error}, in {record.label}); restore it by 'git "
+                f"checkout {self.path}', or add --retrain"
+            ) from error
         (folder / TIMINGS).write_text("metric,value\n", encoding="utf-8")
         prefix = f"{key}/"
         with safe_open(self.path, framework="np") as file:
@@ -159,9 +165,9 @@ class PublishedWeights:
         try:
             with safe_open(self.path, framework="np") as file:
                 self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
-                    uncompressed(file.metadata()[MODELS])
+                    file.metadata()[MODELS]
                 )
-        except (SafetensorError, OSError, KeyError, TypeError, ValueError, zlib.error) as error:
+        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout "
                 f"{self.path}', "
@@ -169,26 +175,34 @@ class PublishedWeights:
             ) from error
 
 
-def compressed(about: dict[str, Any]) -> str:
-    """The metadata of a file of weights."""
-    text = json.dumps(about, ensure_ascii=False)
-    return base64.b64encode(zlib.compress(text.encode(), level=9)).decode()
+def compressed(content: bytes) -> str:
+    """A file's content as text in a `PublishedModel`."""
+    return COMPRESSED + base64.b64encode(zlib.compress(content, level=9)).decode()
 
 
 def uncompressed(text: str) -> bytes:
-    """JSON of `compressed` metadata; raises ValueError or `zlib.error` where it is damaged."""
-    if text.startswith("{"):
+    """A file's content; raises `ValueError` where it is damaged or above `MAX_FILE_BYTES`."""
+    if not text.startswith(COMPRESSED):
         return text.encode()
     inflation = zlib.decompressobj()
-    content = inflation.decompress(base64.b64decode(text, validate=True), MAX_DESCRIPTION_BYTES)
+    try:
+        content = inflation.decompress(
+            base64.b64decode(text.removeprefix(COMPRESSED), validate=True), MAX_FILE_BYTES
+        )
+    except (ValueError, zlib.error) as error:
+        raise ValueError(f"a compressed file is damaged: {error}") from error
     if not inflation.eof:
-        raise ValueError(f"descriptions are cut off or exceed {MAX_DESCRIPTION_BYTES / 1e6:g} MB")
+        raise ValueError(
+            f"a compressed file is cut off or has more than {MAX_FILE_BYTES / 1e6:g} MB"
+        )
     return content
 
 
 def _record_of(model: Artefact) -> PublishedModel:
     files = {
-        name: (model.folder / name).read_bytes().decode() for name in FILES if name in model.outputs
+        name: compressed((model.folder / name).read_bytes())
+        for name in FILES
+        if name in model.outputs
     }
     return PublishedModel(model.label, model.code, model.digest, files)
 

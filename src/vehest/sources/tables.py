@@ -30,8 +30,8 @@ from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
-# first cell of a row of numbers, of which one may be missing
-ROW_OF_NUMBERS = r'^\s*"?([-+.,;|\t\d]|$|(nan|na|n/a|null|none|inf)\b)'
+# a row with a cell that is a number, or whose first one is missing
+ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -259,7 +259,7 @@ def _options(
     threads: bool = True,
 ) -> dict[str, Any]:
     def handle(row: pc.InvalidRow) -> Literal["skip", "error"]:
-        if re.match(ROW_OF_NUMBERS, row.text, re.IGNORECASE):
+        if re.search(ROW_OF_NUMBERS, row.text, re.IGNORECASE):
             return "error"
         lines_of_text.append(row.text)
         return "skip"

@@ -200,8 +200,9 @@ class PackedBands(NamedTuple):
 
 @entry(nogil=True)
 def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-untyped-def]
-    """``bands`` of one level, (T, 2), v [m/s] and β [rad], of inputs (T, C), estimates [m/s] and
-    their variances [m²/s²] or NaN.
+    """Write ``bands`` of one level, (T, 2), v [m/s] and β [rad].
+
+    Inputs are ``rows`` (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
 
     NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and
     ``numbers`` are of `PackedBands`.
@@ -262,8 +263,9 @@ def with_bands(
 def band_inputs(
     estimate: Estimate, measured: Recording, channels: Sequence[str], horizon_steps: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as
-    bands take them; raises `DataError`.
+    """Rows (T, C), estimates (T,) and their variances (T,) for bands; raises `DataError`.
+
+    Variances are NaN where the method has none.
 
     A row is the last sample that the estimate was made of, so that online they are the same.
     """

@@ -273,8 +273,9 @@ class HealthModel:
             for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)
         ]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
-        counts = (len(names), len(self.coefficients), len(self.relations))
-        return Layout(*counts, *columns, *rows, len(self.statistics))
+        counts = [len(names), len(self.coefficients), len(self.relations)]
+        sizes = [*counts, *columns, *rows, len(self.statistics)]
+        return Layout(*sizes)
 
     @property
     def statistics(self) -> list[Statistic]:

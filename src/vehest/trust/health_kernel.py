@@ -96,9 +96,7 @@ class Layout(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Scalars: speed, yaw rate and ay of standstill, sampling interval [s], yaw rate and u r of a
-    spin, forgetting factors.
-    """
+    """Limits of standstill and spin, sampling interval [s], and forgetting factors."""
 
     least_speed: float
     still_yaw_rate: float
@@ -368,9 +366,7 @@ def _describe(model, state):
 
 @part()
 def _predictable(i, model, state):
-    """Whether channel i was measured, and so was what its relation is made of, for long enough to
-    be predicted.
-    """
+    """Whether channel i and the channels of its relation were measured for long enough."""
     r = model.layout.yaw_rate
     u = model.layout.speed
     if state.rows[0] < model.layout.settling or model.modelled[i] == 0 or state.gap[i] != 0.0:
@@ -607,8 +603,9 @@ def _look_at_relations(is_standing, model, state):
 
 @part()
 def _find_reason(slow, model, state):
-    """Kind, channel and partner of the weightiest statistic beyond its limit, and the largest
-    statistic over its limit.
+    """Kind, channel and partner of the most specific statistic beyond its limit.
+
+    Also returns the largest statistic over its limit.
     """
     values = state.statistics.all_values
     highest = 0.0

@@ -44,8 +44,9 @@ def _fields(kind: Any) -> dict[str, Any]:
 
 
 def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any, int]:
-    """Views of a flat array from ``begin`` on, scalars as arrays without dimensions, and the place
-    behind the last.
+    """Views of a flat array from ``begin`` on, and the place behind the last.
+
+    Scalars are arrays without dimensions.
     """
     arrays = {}
     for name, declared in _fields(kind).items():
@@ -159,8 +160,9 @@ def _opened_field(context: Any, builder: Any, view_type: Views, value: Any, name
 
 @intrinsic
 def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-def]
-    """`views` from the first number on, compiled: without references, so that the flat array has to
-    outlive them.
+    """`views` from the first number on, compiled.
+
+    They have no references, so that the flat array has to outlive them.
     """
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:

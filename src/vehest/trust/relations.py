@@ -130,9 +130,7 @@ def speed_channel(channels: Sequence[str]) -> str | None:
 
 
 def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...], bool]]:
-    """Target, partner, features and whether it holds at each instant, of every relation that these
-    channels allow.
-    """
+    """Every relation that channels allow: target, partner, features, whether it is instant."""
     speed = speed_channel(channels)
     has = set(channels)
     declared: list[tuple[str, str, tuple[str, ...], bool]] = []
@@ -184,8 +182,9 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
 
 
 def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
-    """v r, (T,): v is what the relation of ay leaves, integrated with the leakage of
-    `SLIDE_SECONDS`, at most the speed.
+    """v r, (T,), with v from the residual of the relation of ay, at most the speed.
+
+    It is integrated with the leakage of `SLIDE_SECONDS`.
     """
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
     drift = scipy.signal.lfilter(
@@ -195,8 +194,9 @@ def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: flo
 
 
 def without_spikes(samples: FloatArray) -> FloatArray:
-    """NaN for single samples, glitches of the recording, whose second difference exceeds ten times
-    its 99.9 % quantile.
+    """Replace glitches of single samples by NaN.
+
+    Their second difference exceeds ten times its 99.9 % quantile.
     """
     if len(samples) < LEAST_ROWS:
         return samples

@@ -130,8 +130,9 @@ class Monitor:
         vx: FloatArray,
         variance: FloatArray,
     ) -> FloatArray:
-        """Complete the verdict of `before`, in place, and give half widths of v [m/s] and β [rad],
-        (T, 2); NaN where none are known.
+        """Complete the verdict of `before`, in place, and return half widths, (T, 2).
+
+        They are of v [m/s] and β [rad]; NaN without calibrated bands.
 
         Parameters
         ----------
@@ -231,8 +232,9 @@ def isolate_rows(  # type: ignore[no-untyped-def]
 def verdict_rows(  # type: ignore[no-untyped-def]
     vy, marks, flow, measured, required, numbers, status, reason
 ):
-    """Add the findings of guard (``flow``, ``measured``) and watch (``vy``, ``marks``) to ``status,
-    reason`` of health, in place.
+    """Add the findings of guard and watch to ``status, reason`` of health, in place.
+
+    Those of the guard are ``flow`` and ``measured``, those of the watch ``vy`` and ``marks``.
 
     ``required`` are channels that the estimator cannot do without, ``numbers`` those in codes,
     (C,).

@@ -44,8 +44,8 @@ CHANGES = (("wide", "fast"), ("fast", "rough"), ("more", "level"))
 """Pairs of parts of which one condition of the training differs."""
 OVERVIEW_CAPTION = (
     "Errors of all steps on simulated cars, and on the whole recording of the real Ferrari: "
-    "medians over seeds, for FVU also the lowest and highest. β₁(0): weight of the integrated acceleration "
-    "at zero yaw rate (Eq. 7a). Below: baselines, and two values of Da Lio et al. 2023."
+    "medians over seeds, for FVU also the lowest and highest. β₁(0): weight of the integrated "
+    "acceleration at zero yaw rate (Eq. 7a). Below: baselines, and two values of Da Lio et al. 2023."
 )
 SPREAD_CAPTION = (
     "Unexplained fraction of the variance of v (FVU) on the real Ferrari, every seed. In brackets: "
@@ -234,8 +234,8 @@ def _traces(choice: Choice) -> Figure:
     )
     caption = (
         "Lateral velocity and sideslip angle of the real Ferrari: measured (black) and estimated "
-        f"by seed {model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with the "
-        "largest mean square of the measured sideslip."
+        f"by seed {model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with "
+        "the largest mean square of the measured sideslip."
     )
     drawn = figures.zoom_figure(
         scored.time[window], scored.ay[window], reference, [estimate], "time [s]"

@@ -3,17 +3,17 @@ given the fault.
 
 The test (oracle) is given the effect of a fault on the channels, its start and its size, and
 decides whether it is present. Channels less their instantaneous relations are predicted by an
-autoregression with innovations ε ~ N(0, S). A signature that is added to the channels adds s_k to the innovations,
-the signature through the same filter, and the logarithm of the likelihood ratio of "fault" over "no
-fault" grows at each sample by
+autoregression with innovations ε ~ N(0, S). A signature that is added to the channels adds s_k to
+the innovations, the signature through the same filter, and the logarithm of the likelihood ratio of
+"fault" over "no fault" grows at each sample by
 
     s_kᵀS⁻¹ε_k + ½ s_kᵀS⁻¹s_k    with the fault,      s_kᵀS⁻¹ε_k - ½ s_kᵀS⁻¹s_k    without it,
 
 ε being the innovations of the healthy drive. The fault is detected where the sum first exceeds
-log A; A bounds the probability of a false alarm by 1/A (Wald, Sequential Analysis, 1947; Basseville &
-Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have heavier
-tails than a normal distribution, so that A is raised to the largest value of the same test on
-healthy drives, with the margin of the limits of health (`vehest.trust.health.margin`).
+log A; A bounds the probability of a false alarm by 1/A (Wald, Sequential Analysis, 1947; Basseville
+& Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have
+heavier tails than a normal distribution, so that A is raised to the largest value of the same test
+on healthy drives, with the margin of the limits of health (`vehest.trust.health.margin`).
 """
 
 from __future__ import annotations

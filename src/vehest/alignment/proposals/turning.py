@@ -295,9 +295,6 @@ def _scored(
     score -= (
         3.0 if any(column.is_of_bus and "ay" in column.hints for column in columns) else 0.5
     ) * named["ay"].is_reference + 5.0 * n_implausible
-    level = np.abs(named["vx"].slow)
-    if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
-        score -= 2.0
     score += (
         -5.0
         if n_contradicted or mismatch >= FAR_MISMATCH

@@ -226,10 +226,10 @@ class CarFilter(nn.Module):
         self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """States of training sequences, which start from ``start``, (B, 5), and their covariances,
-        (B, T, 5, 5), differentiable.
+        """States and covariances of training sequences that start from ``start``, (B, 5).
 
-        Gradients reach back ``steps`` samples; none: all.
+        Covariances are (B, T, 5, 5); both are differentiable. Gradients reach back ``steps``
+        samples; none: all.
         """
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())

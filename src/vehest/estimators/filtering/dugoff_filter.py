@@ -261,8 +261,8 @@ class DugoffFilter(SigmaPointEstimator):
                     for sensors_only, angle in zip(measured, added, strict=True)
                 ]
                 if added[0].process is not None:
-                    process = padded([angle.process for angle in added], None)  # type: ignore[misc]
-                    steps_noise = torch.diag_embed(torch.as_tensor(process))
+                    variances = padded([angle.process for angle in added], None)  # type: ignore
+                    steps_noise = torch.diag_embed(torch.as_tensor(variances))
             measurements = torch.as_tensor(padded(measured, np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
             noise = sensors[

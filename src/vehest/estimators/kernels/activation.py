@@ -43,8 +43,9 @@ def arctan(x: Any) -> Any:
 
 
 def rational_tanh(x: Any) -> Any:
-    """tanh by Lambert's continued fraction n/d at x/4, then tanh(2y) = 2nd/(d² + n²) twice, divided
-    once; error below 2e-7.
+    """tanh by Lambert's continued fraction n/d at x/4; error below 2e-7.
+
+    tanh(2y) = 2nd/(d² + n²) follows twice, divided once.
 
     Source: Abramowitz & Stegun, equations 4.5.70 and 4.5.24.
     """

@@ -185,8 +185,9 @@ def squared_error(values, targets):
 
 @part(_nrt=False)
 def step_of_adam(flat, gradient, adam, m, batches):
-    """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the
-    bounds (Kingma & Ba 2015, Algorithm 1).
+    """Step ``batches`` of this call for member m, as `torch.optim.Adam`, back into the bounds.
+
+    Source: Kingma & Ba 2015, Algorithm 1.
 
     The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t
     (Section 7.2).

@@ -1,5 +1,6 @@
-"""The network of the KS-NN in PyTorch, with its compiled recursion
-(`vehest.estimators.kernels.ksnn`) differentiable.
+"""The network of the KS-NN in PyTorch, its readable definition.
+
+The compiled recursion is `vehest.estimators.kernels.ksnn`, differentiable here.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class SampleNetworkEstimator(Network):
     def prepare_network(
         self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
     ) -> tuple[SampleNetwork, Samples, Samples]:
-        """A new network with initial weights, a seed a member, and samples of training and
+        """A new network with initial weights, one seed a member, and samples of training and
         validation as it takes them.
         """
         raw, judged = (

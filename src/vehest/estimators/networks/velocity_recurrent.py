@@ -52,8 +52,9 @@ State = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class SequenceSettings(Group):
-    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024,
-    Section IV).
+    """Training of recurrent networks on sequences cut from recordings.
+
+    Source: Węgrzynowski et al. 2024, Section IV.
     """
 
     group = "training"
@@ -153,8 +154,7 @@ class VelocityNetwork(StandardisedNetwork):
     def forward(
         self, measured: Tensor, state: State, mask: Tensor | None = None
     ) -> tuple[Tensor, State]:
-        """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the
-        last, of measurements (B, T, C) [SI].
+        """Velocities (B, T, O) [m/s, rad/s] of measurements (B, T, C) [SI], and the last state.
 
         The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B,
         T, H), is what the hidden state is multiplied by on its way out, none outside training.

@@ -465,7 +465,8 @@ def _busiest(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
     starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
         changes = [
-            [np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts]
+            np.nanstd(values[: len(starts) * minute].reshape(-1, minute), axis=1)
+            / np.nanstd(values)
             for values in columns
         ]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)

@@ -138,9 +138,9 @@ def survey_table(file: Path) -> Log:
         shape = shape_of(file)
         table, skipped = _table(file, shape)
         cells, repeated, marks = _without_texts(table, shape.names)
-        values, clocks, odd_marks, reasons = _columns(file, shape, cells)
+        values, clocks, odd_marks, unread = _columns(file, shape, cells)
         marks |= odd_marks
-        skipped += reasons
+        skipped += unread
         units = dict(shape.units)
         always = ("delimiter", "decimal")
         usual = asdict(TextLayout())
@@ -390,7 +390,7 @@ def _without_texts(
         cell
         for column in removed.columns
         for cell in column.cast(pa.string()).to_pylist()
-        if not re.match(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
+        if not re.search(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
     }
     return table.filter(pa.array(~is_text)), tuple((np.flatnonzero(is_text) + 1).tolist()), cells
 
