@@ -133,7 +133,7 @@ example_log: $(INSTALLED) ## docs/examples/lap.csv, the log of the how-to guides
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
 
-ksnn: $(INSTALLED) ## every statement of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on real ones: hours
+ksnn: $(INSTALLED) ## every claim of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on real ones: hours
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
 learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about a day on two cores
@@ -142,28 +142,28 @@ learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, 
 learned_ukf_quick: $(INSTALLED) ## NNTF_UH, PC and GRU trained anew, one seed each, and whether their order is the published one; needs VEHEST_DATA, 15 min on two cores
 	$(BIN)/vehest run pipelines/learned_ukf_quick.yaml --json tracking=none | $(BIN)/python -m vehest_papers.learned_ukf.order
 
-heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
+heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, continues where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
-cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: about 15 h on one core if nothing is published, goes on where it was stopped
+cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: about 15 h on one core if nothing is published, continues where it was stopped
 	$(BIN)/vehest run pipelines/cnn_ukf.yaml
 
 scorecard: $(INSTALLED) ## four papers, published and ours, from committed claims and errors by block: results/scorecard.md (seconds)
 	$(BIN)/python -m vehest_papers.scorecard
 
-planted_truth: $(INSTALLED) ## how often the scorecard's verdicts are right: 18,000 simulated studies made of real errors (minutes)
+planted_truth: $(INSTALLED) ## how often the scorecard's verdicts are right: 18,000 simulated studies composed of real errors (minutes)
 	$(BIN)/python -m vehest_papers.planted_truth
 
 error_traces: ferrari_drive ## the real errors that planted_truth is made of, from the study before; needs VEHEST_DATA
 	$(BIN)/python -m vehest_papers.planted_truth --evaluations "$${VEHEST_OUTPUT:-outputs}/evaluate"
 
-proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
+proving_ground: $(INSTALLED) ## simulated cars compared with papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml
 
-real_cars: $(INSTALLED) ## what the real recordings hold, and which can rank estimators; needs VEHEST_DATA
+real_cars: $(INSTALLED) ## what the real recordings contain, and which can rank estimators; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/real_cars.yaml
 
-leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that learnt on others; needs VEHEST_DATA, and half an hour
+leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that were trained on others; needs VEHEST_DATA, and half an hour
 	$(BIN)/vehest run pipelines/leave_one_out.yaml
 
 sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHEST_DATA
@@ -172,19 +172,19 @@ sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHE
 reference_minutes: $(INSTALLED) ## how many minutes of reference an estimator needs; needs VEHEST_DATA (half an hour on two cores)
 	$(BIN)/vehest run pipelines/reference_minutes.yaml
 
-trust: $(INSTALLED) ## how far estimates can be trusted: bands, faults; needs VEHEST_DATA, and an hour
+trust: $(INSTALLED) ## coverage of bands and detection of faults; needs VEHEST_DATA, and an hour
 	$(BIN)/vehest run pipelines/trust.yaml
 
-online_faults: $(INSTALLED) ## every family online under every fault, a row a case; with VEHEST_DATA also on real recordings; half an hour
+online_faults: $(INSTALLED) ## every family online under every fault, one row per case; with VEHEST_DATA also on real recordings; half an hour
 	$(BIN)/python tests/faults/online_faults.py --out results/reliability/online_faults.csv
 
-own_car_proposals: $(INSTALLED) ## what vehest new makes of twelve logs whose columns are known: results/own_car/proposals.csv; needs VEHEST_DATA
+own_car_proposals: $(INSTALLED) ## columns that vehest new proposes for twelve logs, compared with the right ones: results/own_car/proposals.csv; needs VEHEST_DATA
 	PYTHONPATH=tests/proposals $(BIN)/python tests/proposals/own_car_proposals.py --out results/own_car/proposals.csv
 
 front_door: $(INSTALLED) ## ten logs as users bring them, from vehest new to a verdict; needs VEHEST_DATA (40 minutes)
 	PYTHONPATH=tests/proposals $(BIN)/python tests/proposals/front_door.py
 
-unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that nobody has trained on (results/unseen_car); needs VEHEST_DATA, and committed choices
+unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that were not used for training (results/unseen_car); needs VEHEST_DATA, and committed choices
 	$(BIN)/python docs/make_unseen_car.py
 
 unseen_car_planted: $(INSTALLED) ## the same filter on 200 drawn cars in town and 100 at the limit, simulated (results/unseen_car/drawn_cars.md)
@@ -193,14 +193,14 @@ unseen_car_planted: $(INSTALLED) ## the same filter on 200 drawn cars in town an
 unseen_car_record: $(INSTALLED) ## vehest identify on drives of one car, on 200 planted cars and in scenes (results/unseen_car/record.md); needs VEHEST_DATA
 	$(BIN)/python docs/unseen_car_record.py
 
-pretrained: sim_to_real ## the model for cars that nobody has trained on, from the study before
+pretrained: sim_to_real ## the models for cars without a training of their own, from the study sim_to_real
 	PYTHONPATH=docs $(BIN)/python tools/make_pretrained.py
 
 sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quickstart, simulated; SEEDS="range(3)")
 	$(BIN)/vehest sweep split=$(SPLIT) estimator=ksnn estimator.n_local=2,3,4,5,6 estimator.n_hidden=0,1,2,3 estimator.bias=true,false \
 	  'seed=$(SEEDS)' training.max_epochs=60 tracking=none
 
-bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
+bench-training: $(INSTALLED) ## compiled recursions and batched trainings against plain PyTorch
 	$(BIN)/python benchmarks/training.py
 
 bench-ksnn: $(INSTALLED) ## 64 seeds of a KS-NN trained together against one after another in plain PyTorch
@@ -215,16 +215,16 @@ bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 column
 bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data sets on all cores against one (10 minutes)
 	$(BIN)/python benchmarks/simulation.py
 
-bench-trust: $(INSTALLED) ## what contract, band and health cost a step online and a minute in batch, against the estimator alone
+bench-trust: $(INSTALLED) ## time of contract, band and health, for a step online and a minute in batch, against the estimator alone
 	$(BIN)/python benchmarks/trust.py
 
-bench-health: $(INSTALLED) ## alarms of health an hour against faults found, as its limits rise; needs VEHEST_DATA (15 minutes on one core)
+bench-health: $(INSTALLED) ## alarms of health per hour against detected faults, for several limits; needs VEHEST_DATA (15 minutes on one core)
 	$(BIN)/python benchmarks/health_statistics.py
 
-bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
+bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled rational EKF, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
 
-bench-launchers: $(INSTALLED) ## what a task costs the local launcher and Ray, and from which length on a second node pays; installs Ray (10 minutes)
+bench-launchers: $(INSTALLED) ## overhead of a task in the local launcher and in Ray, and the length from which a second node is faster; installs Ray (10 minutes)
 	$(BIN)/python -m pip install -q $(LOCKED) -e ".[ray]"
 	$(BIN)/python benchmarks/launchers.py
 
@@ -253,5 +253,5 @@ lock: $(INSTALLED) ## write the installed versions to constraints.txt (after mak
 	$(BIN)/python -m pip install -q -e ".[dev,ray,slurm,bench]"
 	$(BIN)/python -m pip freeze --exclude-editable | sed -E '/ @ |^(pip|setuptools|wheel|nvidia-.*|cuda-.*|triton)==/d; s/^(torch==[^+]*).*/\1/' > constraints.txt
 
-clean: ## remove what can be made again (not outputs/)
+clean: ## remove generated files (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

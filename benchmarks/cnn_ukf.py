@@ -100,7 +100,7 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
 def plain(estimator: Any, training: Any, batch: Any) -> Any:
     """The loss as one would write it down: layers of torch, then a filter that loops over samples."""
     from vehest.estimators.cnn_ukf import START
-    from vehest.estimators.network_ukf import LEAST_VARIANCE
+    from vehest.estimators.network_ukf import MIN_VARIANCE
 
     parameters = dict(estimator.network.named_parameters())
     hidden = batch.inputs
@@ -111,9 +111,7 @@ def plain(estimator: Any, training: Any, batch: Any) -> Any:
     shares = torch.sigmoid(hidden[..., 1:])
     process = torch.diag_embed(shares[..., 1:].square())
     of_sensors = training.sensors[batch.trusted.long()].diagonal(dim1=-2, dim2=-1)
-    sensors = torch.diag_embed(
-        torch.cat([of_sensors, shares[..., :1].square() + LEAST_VARIANCE], -1)
-    )
+    sensors = torch.diag_embed(torch.cat([of_sensors, shares[..., :1].square() + MIN_VARIANCE], -1))
     measured = torch.cat([batch.measured, angle.unsqueeze(-1)], -1)
     track = training.filter.track
     n = 2
@@ -324,10 +322,10 @@ def tell(what: str, details: str, *, met: bool) -> None:
 
 def main() -> None:
     """Measure, write, print."""
-    from vehest.estimators.kernels.blas import one_blas_thread
+    from vehest.estimators.kernels.blas import single_blas_thread
 
     torch.set_num_threads(THREADS)
-    with one_blas_thread():  # as a group of jobs has it; torch has matrix products of its own
+    with single_blas_thread():  # as a group of jobs has it; torch has matrix products of its own
         measure()
 
 

@@ -83,7 +83,7 @@ def main() -> None:
         alone = in_own_process(one_epoch, structure, True, 1)
         cases.append(
             case(
-                f"{structure}: {MEMBERS} members, plain PyTorch against compiled, one epoch",
+                f"{structure}: {MEMBERS} trainings, plain PyTorch against compiled, one epoch",
                 plain,
                 together,
             )

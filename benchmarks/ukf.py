@@ -102,7 +102,8 @@ def problem(
     """NNTF_UH before training or as a file has it, noise started from residuals, sequences at random places of the training recordings."""
     import torch
 
-    from vehest.estimators.learned_ukf import WEIGHTS, LearnedUkf
+    from vehest.estimators.filtering.car_fit import WEIGHTS, scale_network
+    from vehest.estimators.learned_ukf import LearnedUkf
     from vehest.training.through_filter import Drive, placed
 
     torch.set_default_dtype(torch.float32)
@@ -110,7 +111,7 @@ def problem(
     train = [
         estimator.drive(recording, torch.float32) for recording in recordings(TRAINED_ON[dataset()])
     ]
-    estimator._scale(train)
+    scale_network(estimator.filter, train, estimator.car.mass, estimator.rate_hz)
     generator = torch.Generator().manual_seed(0)
     estimator.filter.reset(generator)
     if weights:

@@ -368,7 +368,7 @@ def timed(work: Any, filter_: Any, repeats: int, wait: Any) -> tuple[float, floa
 
 def run(file: str) -> None:
     """Measure, write, print."""
-    from vehest.estimators.learned_ukf import WEIGHTS
+    from vehest.estimators.filtering.car_fit import WEIGHTS
     from vehest.training.through_filter import Drive
 
     held = torch.load(file, weights_only=True)

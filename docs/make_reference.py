@@ -55,6 +55,7 @@ HEADINGS = {
 }
 """Headings of reports' tables -> those of pages."""
 CELLS = {
+    "v = 0": "zero",
     "not told apart": "no significant difference",
     "Zero (v = 0)": "Zero",
     "made on it": "development",
@@ -352,7 +353,7 @@ def figures(shown: str, *estimators: str) -> Iterable[str]:
     yield from _on_the_same_drive(estimators)
     for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
         rows = [
-            tuple(_rounded(row[key]) for key in columns)
+            tuple(CELLS.get(row[key], _rounded(row[key])) for key in columns)
             for row in _rows(RESULTS / study / "tables" / "overview.csv")
         ]
         if rows:
@@ -491,7 +492,7 @@ def benchmarks(*names: str) -> Iterable[str]:
     """Time and memory of the plain way and of vehest, a row a case of the benchmarks named."""
     lines = [
         (
-            case["case"],
+            case["case"].replace(" members, ", " trainings, "),
             _seconds(case["baseline_seconds"]),
             _seconds(case["ours_seconds"]),
             _two_digits(case["baseline_seconds"] / case["ours_seconds"]),

@@ -103,6 +103,15 @@ def _fit(name, dtype, config):
     return estimator
 
 
+def online_rows(estimator, drive, channels=None):
+    """Results of the estimator's stepper for each sample of the channels, by default its inputs."""
+    stepper = estimator.online()
+    return [
+        stepper.step({name: drive[name][k] for name in channels or estimator.channels})
+        for k in range(len(drive))
+    ]
+
+
 def drive_for(estimator):
     """A drive that it has not seen, of a car that it can estimate."""
     if "motor_current" in estimator.channels:

@@ -211,7 +211,7 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
         (
             lambda: vehest.train("static_map", [bare], [lap]),
             DataError,
-            "no channel 'vy_ref', which estimator 'static_map' learns from",
+            "no channel 'vy_ref', on which estimator 'static_map' is trained",
         ),
         (
             lambda: vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"]),

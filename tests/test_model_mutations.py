@@ -161,6 +161,6 @@ def test_settings_with_which_no_estimator_can_be_built_are_one_line(tmp_path, mo
     def damaged(self):
         raise TypeError("a defect")
 
-    monkeypatch.setattr(kind, "fewest_weights", damaged)
+    monkeypatch.setattr(kind, "min_weights", damaged)
     with pytest.raises(DataError, match=r"model\.yaml': no estimator can be built .*a defect"):
         load_model(tmp_path)

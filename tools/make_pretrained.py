@@ -53,27 +53,10 @@ FILTER_NOTE = (
 
 
 def chosen_step(table: Path = TABLE) -> pd.Series:
-    """The row of the study's table that has the model, with its median FVU on the car that made the choice."""
+    """The row of the study's table that has the model."""
     frame = pd.read_csv(table)
-    scores = pd.read_csv(table.parents[1] / "metrics.csv")
     (row,) = (row for _, row in frame[frame["model"].notna()].iterrows())
-    own = (
-        scores["trained_on"].str.endswith(f"/{row['part']}")
-        & (scores["test_set"] == "other_simulator")
-        & (scores["metric"] == "fvu")
-    )
-    return pd.concat(
-        [
-            row,
-            pd.Series(
-                {
-                    "other_simulator_fvu": scores.loc[
-                        own & (scores["condition"] == "nominal"), "value"
-                    ].median()
-                }
-            ),
-        ]
-    )
+    return row
 
 
 def note_of(row: pd.Series, estimator: Estimator) -> str:

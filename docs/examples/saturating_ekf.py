@@ -92,7 +92,7 @@ class SaturatingEkf(Recursive):
         return (*astuple(self.car), self.friction, 1.0 / self.rate_hz)
 
     def first_state(self, sample, given):
-        """No sample before, and (v, ω), 0 where a protocol hands over nothing."""
+        """No sample before, and (v, ω), 0 where a protocol gives no initial state."""
         return (
             np.empty((0, 4)),
             np.array([given.get("vy", 0.0), given.get("yaw_rate", 0.0)]),

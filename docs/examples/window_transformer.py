@@ -1,6 +1,6 @@
 """A small Transformer over windows in plain PyTorch: a network with nothing of vehest's but its standardisation.
 
-Embedding and learnt positions, encoder layers of torch's own, and a read-out of the last sample's encoding (Vaswani et al., NeurIPS 2017).
+Embedding and trained positions, encoder layers of torch's own, and a read-out of the last sample's encoding (Vaswani et al., NeurIPS 2017).
 """
 
 import torch
@@ -37,7 +37,7 @@ class TransformerNetwork(StandardisedNetwork):
 
 
 class WindowTransformer(WindowedEstimator):
-    """The network as an estimator; training, members, estimating, running online and saving come with `WindowedEstimator`."""
+    """The network as an estimator; training, batched trainings, estimating, running online and saving come with `WindowedEstimator`."""
 
     name = "window_transformer"
     title = "Transformer"
@@ -47,7 +47,7 @@ class WindowTransformer(WindowedEstimator):
     dropout: float = setting(0.0, "share of activations that training drops", least=0.0, below=1.0)
 
     def check(self) -> None:
-        """Each head sees as much as the others."""
+        """All heads have the same width."""
         if self.width % self.heads:
             raise ConfigurationError("estimator.width must be a multiple of estimator.heads")
 

@@ -98,7 +98,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings 
 Jobs = Annotated[
     int | None,
     typer.Option(
-        "--jobs", "-j", min=1, help="Processes that run side by side; by default one a core."
+        "--jobs", "-j", min=1, help="Number of parallel processes; by default one per core."
     ),
 ]
 LauncherName = Annotated[
@@ -292,7 +292,7 @@ def simulate(
 ) -> None:
     """Simulate a data set into the store: `vehest simulate sim_bmw seed=1`.
 
-    The same seed gives the same samples. Drives are made side by side; a run that was stopped
+    The same seed gives the same samples. Drives are made in parallel; a run that was stopped
     continues with the missing ones. Drives that spin or leave the road are kept, flagged in their
     provenance, and counted.
     """
@@ -345,7 +345,7 @@ def train(
     """Fit one estimator: `vehest train estimator=ksnn estimator.n_local=3 split=ferrari_drive
     seed=7`.
 
-    Ctrl-C keeps the best so far; the same command goes on from there.
+    Ctrl-C keeps the best weights so far; the same command continues from there.
     """
     from vehest.run.study_run import train_estimator
 
@@ -455,8 +455,8 @@ def estimate(
     estimator.wheelbase=2.7` uses the self-calibrating filter, with a note; estimator.smoothed=true
     smooths over the whole drive (offline).
 
-    Columns named like channels, in SI units, need no more; others are described once by `vehest new
-    NAME lap.csv`, then add `dataset=NAME`.
+    Columns named like channels, in SI units, are read as they are; others are described once by
+    `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
@@ -496,15 +496,19 @@ def plot_drive(
         Path,
         typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg, or .html, a page."),
     ] = Path("drive.png"),
-    start: Annotated[float | None, typer.Option("--start", help="Draw from here on [s].")] = None,
-    stop: Annotated[float | None, typer.Option("--stop", help="Draw up to here [s].")] = None,
+    start: Annotated[
+        float | None, typer.Option("--start", help="Start of the drawn range [s].")
+    ] = None,
+    stop: Annotated[
+        float | None, typer.Option("--stop", help="End of the drawn range [s].")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Draw a recording and estimates of it: `vehest plot lap.csv estimate.parquet -o drive.pdf`.
 
     β with the 90 % band and the health of the first estimate, v, the measured channels, the course
-    in colours of β; with a reference also estimate over reference. The course is reckoned from u, v
-    and the yaw rate, and drifts over minutes.
+    in colours of β; with a reference also estimate over reference. The course is integrated from
+    u, v and the yaw rate, and drifts over minutes.
     """
     from vehest.run.plot import plot_files
 
@@ -557,7 +561,7 @@ def replay(
     ] = "pretrained",
     dbc: Annotated[
         Path | None,
-        typer.Option("--dbc", help="What describes the bus; by default the data set's."),
+        typer.Option("--dbc", help="DBC file of the bus; by default that of the data set."),
     ] = None,
     dataset: Annotated[
         str | None,
@@ -577,7 +581,7 @@ def replay(
         ),
     ] = "",
     speed: Annotated[
-        str, typer.Option("--speed", help="Times real time, or max: as fast as it goes.")
+        str, typer.Option("--speed", help="Multiple of real time, or max: as fast as possible.")
     ] = "1",
     bus_rate: Annotated[
         float | None,
@@ -754,7 +758,7 @@ def compare(
         typer.Option(
             "--model",
             "-m",
-            help="A model to run on the recording and compare too; may be repeated.",
+            help="A model to run on the recording and compare too; repeatable.",
             autocompletion=MODELS,
         ),
     ] = None,
@@ -811,7 +815,7 @@ def run(
         typer.Option(
             help=(
                 "Stop after this time, report included; unfinished jobs are listed, and the same "
-                "command goes on with them."
+                "command continues with them."
             )
         ),
     ] = None,
@@ -949,7 +953,7 @@ def sweep(
 
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval
     (Student's t), and marks the one that is best on the validation range. Existing artefacts are
-    reused, a failed job stops no other, the same command finishes what is missing.
+    reused, the other jobs continue where one fails, and the same command completes what is missing.
     """
     options = RunOptions(
         force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ()
@@ -972,11 +976,13 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.configuration.composition import GIVEN
+    from vehest.configuration.composition import OVERRIDDEN_RATES_KEY
     from vehest.run.setting_lines import config_as_commented_yaml
 
     config = {
-        key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN
+        key: value
+        for key, value in _compose(command, overrides or []).items()
+        if key != OVERRIDDEN_RATES_KEY
     }
     text = as_json_text(config) if as_json else config_as_commented_yaml(config).rstrip()
     echo(text, keep="\n")
@@ -1158,14 +1164,14 @@ def data_align(
         str | None,
         typer.Option(
             "--steering-channel",
-            help="What to find the steering ratio of; by default handwheel, or else steer.",
+            help="Channel whose steering ratio is estimated; by default handwheel, else steer.",
         ),
     ] = None,
     cutoff: Annotated[
         float | None,
         typer.Option(
             "--cutoff",
-            help="Low-pass that both sides go through [Hz]; by default 2, or less below 23 Hz.",
+            help="Cut-off of the low-pass on both sides [Hz]; by default 2, or less below 23 Hz.",
         ),
     ] = None,
     max_delay: Annotated[

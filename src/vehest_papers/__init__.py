@@ -1,1 +1,3 @@
-"""Studies that re-create published papers, beside the library: found by entry point, as anybody's own study is."""
+"""Studies that re-create published papers, beside the library: found by entry point, as anybody's
+own study is.
+"""

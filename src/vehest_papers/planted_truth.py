@@ -1,9 +1,12 @@
-"""How often the engine's verdicts are right: studies of which the truth is known, made of real errors (`make planted_truth`).
+"""How often the engine's verdicts are right: studies of which the truth is known, made of real
+errors (`make planted_truth`).
 
-The material is `results/scorecard/error_traces.csv`: squared errors of the lateral velocity over each second of a real drive, of 30
-networks of two kinds, autocorrelated and heavy-tailed. A simulated study compares two candidates. Its drive is put together from stretches
-of the real one; in each of them a coin decides which candidate takes the errors of recurrent networks and which those of KS-NN, all
-of different trainings. By this symmetry neither candidate is better; the first one's errors are then multiplied by the ratio that is planted.
+The material is `results/scorecard/error_traces.csv`: squared errors of the lateral velocity over
+each second of a real drive, of 30 networks of two kinds, autocorrelated and heavy-tailed. A
+simulated study compares two candidates. Its drive is put together from stretches of the real one;
+in each of them a coin decides which candidate takes the errors of recurrent networks and which
+those of KS-NN, all of different trainings. By this symmetry neither candidate is better; the first
+one's errors are then multiplied by the ratio that is planted.
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ class Design:
 def draw_drive(
     run: NDArray[np.int64], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Seconds of a drive of `DRIVE_SECONDS`, in stretches of random length, and each one's stretch."""
+    """Seconds of a drive of `DRIVE_SECONDS` in segments of random length, and their segments."""
     seconds: list[int] = []
     stretches: list[float] = []
     while len(seconds) < DRIVE_SECONDS:
@@ -107,7 +110,8 @@ def _stretch(run: NDArray[np.int64], length: int, rng: np.random.Generator) -> l
 def simulate_study(
     traces: Traces, design: Design, n_seeds: int, ratio: float, rng: np.random.Generator
 ) -> tuple[dict[Key, BlockErrors], int]:
-    """Errors by block of one study in which the first candidate has ``ratio`` times the RMSE of the second.
+    """Errors by block of one study in which the first candidate has ``ratio`` times the RMSE of the
+    second.
 
     Returns
     -------
@@ -215,9 +219,11 @@ def read_traces(path: Path) -> Traces:
 
 
 def write_traces(evaluations: Path, path: Path) -> None:
-    """Mean squared error of the lateral velocity [m²/s²] over each second, from evaluations of the study ferrari_drive.
+    """Mean squared error of the lateral velocity [m²/s²] over each second, from evaluations of the
+    study ferrari_drive.
 
-    All networks of one variant are multiplied by one factor, so that their mean over the drive is 1.
+    All networks of one variant are multiplied by one factor, so that their mean over the drive is
+    1.
     """
     folders = sorted(evaluations.glob("*-on-ferrari_drive-*"))
     families = tuple(f"{family}-" for kind in KINDS for family in kind)

@@ -1,6 +1,7 @@
 """The four papers on one page: what each claims and tabulates, beside ours (`make scorecard`).
 
-Made of claims.yaml, results/STUDY/tables/blocks.csv and training.csv alone: no model and no recording is needed.
+Made of claims.yaml, results/STUDY/tables/blocks.csv and training.csv alone: no model and no
+recording is needed.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from vehest_papers.kit.verdict_table import (
     epochs_in_words,
     figure_in_words,
     figures_in_words,
-    one_line,
     published_in_words,
     unit_of,
+    without_line_breaks,
 )
 from vehest_papers.kit.verdicts import (
     NOT_PUBLISHED,
@@ -52,6 +53,7 @@ from vehest_papers.kit.verdicts import (
     least_training,
 )
 
+DATA_KINDS = ("real", "simulated", "computed")
 PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
 TITLES = {
     "ksnn": "KS-NN",
@@ -93,32 +95,41 @@ CSV_COLUMNS = (
 LEGEND = (
     (
         "NNTF_UH, RATTE, …",
-        "the papers' names of their methods; `candidates` in `src/vehest_papers/*/claims.yaml` describes each",
+        "the papers' names of their methods, described at the beginning of each paper's section",
     ),
     ("published", "value of the paper"),
     (
         "ours",
-        "the same error of our run with its 95 % interval; the data are marked as real or simulated",
+        "the same error of our run with its 95 % interval; the data are marked as real or "
+        "simulated",
     ),
     (
         "metric",
-        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], `rmse_sideslip` [deg] and the "
-        "others: [metrics](../docs/evaluation.md#metrics)",
-    ),
-    (
-        "ratio",
-        "error of the first candidate of a claim over that of the second, all samples together; below 1 the first "
-        "one is better",
+        "`fvu`: share of the variance of v that is not explained; `rmse_vy` [m/s], "
+        "`rmse_sideslip` [deg] and the others: [metrics](../docs/evaluation.md#metrics)",
     ),
     (
         "mean of blocks' ratios",
-        "the ratio within each manoeuvre, lap or segment (a block), averaged with the same weight for each",
+        "error of the first candidate of a claim over that of the second within each manoeuvre, "
+        "lap or segment (a block), averaged with the same weight for each; below 1 the first one "
+        "is better. It decides whether a difference is significant",
+    ),
+    (
+        "ratio",
+        "the same for all samples together; it is compared with the size that the paper states",
     ),
     ("epochs", "of our training, of the paper's, and whether ours has been shown to be sufficient"),
     (
         "verdict",
-        "from the errors by block and seed ([definitions, and how often they are right](../docs/scorecard.md)); in "
-        "*italics* where the training has not been shown to be sufficient",
+        "from the errors by block and seed ([definitions, and how often they are "
+        "right](../docs/scorecard.md)); in *italics* where the training has not been shown to be "
+        "sufficient",
+    ),
+    (
+        "verdict on a value of a table",
+        "agrees: the 90 % interval of ours lies within ±10 % of the published value; lower, "
+        "higher: it lies outside; else inconclusive. Where ours are other data than the paper's, "
+        "a difference says nothing against the method",
     ),
 )
 """Columns of the page's tables and what they hold."""
@@ -134,18 +145,37 @@ class Study:
     rows: Sequence[tuple[Table, Row, Judgement]]
     is_published: bool  # whether there are errors by block
 
+    @property
+    def claims_of_paper(self) -> list[Claim]:
+        """Claims without the comparisons that we added."""
+        return [claim for claim in self.paper.claims if not claim.is_added]
+
     def counts(self) -> Counter[str]:
-        """Verdict -> number of the paper's claims, without comparisons that we added."""
+        """Verdict -> number of the paper's claims."""
+        return Counter(self.claims[claim.id].verdict for claim in self.claims_of_paper)
+
+    def provisional_counts(self) -> Counter[str]:
+        """Verdict -> number of the paper's claims whose training was not shown to suffice."""
         return Counter(
-            self.claims[claim.id].verdict for claim in self.paper.claims if not claim.is_added
+            self.claims[claim.id].verdict
+            for claim in self.claims_of_paper
+            if _is_provisional(self.claims[claim.id], least_training(claim, self.training)[1])
+        )
+
+    def counts_of_data(self) -> Counter[str]:
+        """Data -> number of the paper's claims that errors by block on these data decide."""
+        return Counter(
+            self.paper.parts[claim.part]
+            for claim in self.claims_of_paper
+            if self.claims[claim.id].n_blocks
         )
 
     def counts_of_training(self) -> Counter[str]:
         """Training -> number of the paper's claims that errors by block decide."""
         return Counter(
             state.state if state is not None else "not applicable"
-            for claim in self.paper.claims
-            if not claim.is_added and self.claims[claim.id].n_blocks
+            for claim in self.claims_of_paper
+            if self.claims[claim.id].n_blocks
             for _, state in [least_training(claim, self.training)]
         )
 
@@ -169,7 +199,9 @@ def read_study(name: str, results: Path, claims_folder: Path = CLAIMS_FOLDER) ->
 
 
 def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[str, str]:
-    """Content of scorecard.md, scorecard.csv and scorecard/changed_verdicts.csv, as they belong into ``results``."""
+    """Content of scorecard.md, scorecard.csv and scorecard/changed_verdicts.csv, as they belong
+    into ``results``.
+    """
     studies = [read_study(name, results, claims_folder) for name in PAPERS]
     before = claims_folder / "claims_before.csv"
     return {
@@ -180,7 +212,9 @@ def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the scorecard; with ``--check`` exit with 1 where it is not what the committed inputs give."""
+    """Write the scorecard; with ``--check`` exit with 1 where it is not what the committed inputs
+    give.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", type=Path, default=Path("results"))
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
@@ -210,18 +244,24 @@ def _page(studies: Sequence[Study], results: Path) -> str:
     lines = [
         "# Scorecard: published and ours",
         "",
-        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs of their methods in vehest:",
-        "first whether to use each method, then how many claims of its paper were reproduced, then every table row and",
+        "Four papers on the estimation of lateral velocity and sideslip angle, beside our runs "
+        "of their methods in vehest:",
+        "first whether to use each method, then how many claims of its paper were reproduced, "
+        "then every table row and",
         "claim with the published value and ours.",
         "",
         "## Should I use this method?",
         "",
         *_table(
             ("paper", "answer"),
-            [(_linked(study), one_line(study.paper.recommendation)) for study in studies],
+            [
+                (_linked(study), without_line_breaks(study.paper.recommendation))
+                for study in studies
+            ],
         ),
         "",
-        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, which was made with",
+        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, "
+        "which was made with",
         "earlier code and shorter trainings.",
         "",
         "## How to read the tables",
@@ -230,9 +270,24 @@ def _page(studies: Sequence[Study], results: Path) -> str:
         "",
         "## Verdicts on the papers' claims",
         "",
-        *_table_of_counts(studies, "verdict", VERDICTS, [study.counts() for study in studies]),
+        *_table_of_counts(
+            studies,
+            "verdict",
+            VERDICTS,
+            [study.counts() for study in studies],
+            [study.provisional_counts() for study in studies],
+        ),
         "",
+        "*Provisional*: the training of a candidate was not shown to suffice, or its networks were "
+        "trained too shortly.",
         f"*Not assessed*: {NOT_PUBLISHED}, or not of this candidate.",
+        "",
+        "Data that decided the claims; simulated drives stand in for recordings that are not "
+        "public:",
+        "",
+        *_table_of_counts(
+            studies, "data", DATA_KINDS, [study.counts_of_data() for study in studies]
+        ),
         "",
         "Training of the least trained candidate of each claim that was assessed:",
         "",
@@ -250,12 +305,33 @@ def _page(studies: Sequence[Study], results: Path) -> str:
 
 
 def _table_of_counts(
-    studies: Sequence[Study], heading: str, words: Sequence[str], counts: Sequence[Counter[str]]
+    studies: Sequence[Study],
+    heading: str,
+    words: Sequence[str],
+    counts: Sequence[Counter[str]],
+    provisional: Sequence[Counter[str]] | None = None,
 ) -> list[str]:
-    """Number of claims of each paper, a row a word, with their sum."""
-    rows = [(word, *(str(number[word] or MISSING) for number in counts)) for word in words]
+    """Number of claims of each paper, a row a word, with their sum; of these, provisional ones."""
+    rows = [
+        (
+            word,
+            *(
+                _counted(n_claims[word], n_provisional[word])
+                for n_claims, n_provisional in zip(
+                    counts, provisional or [Counter()] * len(counts), strict=True
+                )
+            ),
+        )
+        for word in words
+    ]
     rows.append(("all", *(str(number.total()) for number in counts)))
     return _table((heading, *(_linked(study) for study in studies)), rows, n_text=1)
+
+
+def _counted(n_claims: int, n_provisional: int) -> str:
+    if not n_claims:
+        return MISSING
+    return f"{n_claims} ({n_provisional} provisional)" if n_provisional else str(n_claims)
 
 
 def _section(study: Study, results: Path) -> list[str]:
@@ -265,18 +341,28 @@ def _section(study: Study, results: Path) -> list[str]:
     lines = [
         f"## {TITLES[paper.paper]}",
         "",
-        f"{one_line(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
+        f"{without_line_breaks(paper.reference)}. [doi:{paper.doi}](https://doi.org/{paper.doi}).{link}",
         "",
-        f"**{one_line(paper.recommendation)}**",
+        f"**{without_line_breaks(paper.recommendation)}**",
         "",
     ]
     if not study.is_published:
         lines += [f"Not assessed yet: {NOT_PUBLISHED}.", ""]
+    lines += [f"### Methods of {TITLES[paper.paper]}", ""]
+    lines += _table(
+        ("name", "method"),
+        [
+            (_text(name), _text(without_line_breaks(declared.description)))
+            for name, declared in paper.candidates.items()
+        ],
+        n_text=2,
+    )
+    lines.append("")
     for table in paper.tables:
         lines += _section_of_table(study, table)
     lines += [f"### Claims of {TITLES[paper.paper]}", ""]
-    lines += _table_of_claims(study, [own for own in paper.claims if not own.is_added])
-    if added := [own for own in paper.claims if own.is_added]:
+    lines += _table_of_claims(study, study.claims_of_paper)
+    if added := [claim for claim in paper.claims if claim.is_added]:
         lines += [f"### Beside the paper: {TITLES[paper.paper]}", ""]
         lines += ["Comparisons that the paper does not make; they are in no count above.", ""]
         lines += _table_of_claims(study, added)
@@ -299,11 +385,11 @@ def _section_of_table(study: Study, table: Table) -> list[str]:
                 f"{significant(row.published)}{unit}",
                 figures_in_words(judgement, unit, _text),
                 epochs_in_words(study.paper, row.candidate, state),
-                _verdict(judgement, state),
+                _in_italics(_of_value(judgement, row.published), judgement, state),
             )
         )
-    about = one_line(study.paper.test_sets[table.test_set])
-    note = f" {one_line(table.note)}" if table.note else ""
+    about = without_line_breaks(study.paper.test_sets[table.test_set])
+    note = f" {without_line_breaks(table.note)}" if table.note else ""
     return [
         f"### {table.table}, {TITLES[study.paper.paper]}: {table.test_set} ({table.part})",
         "",
@@ -345,11 +431,16 @@ def _section_of_planted_truth(results: Path) -> list[str]:
         "## How often these verdicts are right",
         "",
         f"Per cent of {rows[0]['studies']} simulated studies each, made of real errors",
-        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant difference where there",
-        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where it is true or",
-        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in their interval. The",
-        "rows with one seed show why a candidate that was trained once gets no verdict. *Reproduced* excludes that there",
-        "is no effect, not that the effect is half the paper's: the interval of the size shows what is excluded.",
+        "([how](../docs/scorecard.md#how-often-the-verdicts-are-right)). Wrong: any significant "
+        "difference where there",
+        "is no effect, else the wrong direction; of an equality within ±10 %, contradicted where "
+        "it is true or",
+        "reproduced where it is not. Nominal: at most 5 % wrong without effect, 95 % of sizes in "
+        "their interval. The",
+        "rows with one seed show why a candidate that was trained once gets no verdict. "
+        "*Reproduced* excludes that there",
+        "is no effect, not that the effect is half the paper's: the interval of the size shows "
+        "what is excluded.",
         "",
         *_table(list(headings.values()), cells, n_text=3),
         "",
@@ -365,12 +456,12 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
         reason = "" if judgement.reason == NOT_PUBLISHED else _text(judgement.reason)
         cells.append(
             (
-                f"{_text(one_line(claim.claim))} ({_text(claim.source)})",
+                f"{_text(without_line_breaks(claim.claim))} ({_text(claim.source)})",
                 published_in_words(claim, _text),
                 figures_in_words(judgement, unit_of(claim), _text),
                 f"{origin}, {claim.test_set}" if origin else MISSING,
                 epochs_in_words(study.paper, name, state),
-                _verdict(judgement, state),
+                _in_italics(judgement.verdict, judgement, state),
                 reason or MISSING,
             )
         )
@@ -386,11 +477,27 @@ def _table_of_claims(study: Study, claims: Iterable[Claim]) -> list[str]:
     return [*_table(headings, cells), ""]
 
 
-def _verdict(judgement: Judgement, training: Training | None) -> str:
-    """The verdict, in italics where it rests on networks whose training was not shown to suffice."""
+def _in_italics(verdict: str, judgement: Judgement, training: Training | None) -> str:
+    """The verdict, in italics where the training of a network was not shown to suffice."""
+    return f"*{verdict}*" if _is_provisional(judgement, training) else verdict
+
+
+def _is_provisional(judgement: Judgement, training: Training | None) -> bool:
     is_assessed = judgement.n_blocks > 0
     is_sufficient = training is None or training.state in ("sufficient", "not applicable")
-    return f"*{judgement.verdict}*" if is_assessed and not is_sufficient else judgement.verdict
+    return is_assessed and not is_sufficient
+
+
+def _of_value(judgement: Judgement, published: float) -> str:
+    """The verdict on a table's value in words of its own: a difference on other data than the
+    paper's contradicts no claim.
+    """
+    ours = next(iter(judgement.values.values()), None)
+    if judgement.verdict == "reproduced":
+        return "agrees"
+    if judgement.verdict == "contradicted" and ours is not None:
+        return "lower" if ours.value < published else "higher"
+    return judgement.verdict
 
 
 def _csv_rows(study: Study) -> list[dict[str, str]]:
@@ -406,22 +513,22 @@ def _csv_rows(study: Study) -> list[dict[str, str]]:
             metric=row.metric,
             published={row.candidate: row.published},
         )
-        rows.append(_csv_row(study, claim, judgement, "table"))
+        of_value = {"row": "table", "verdict": _of_value(judgement, row.published)}
+        rows.append(_csv_row(study, claim, judgement) | of_value)
     for claim in study.paper.claims:
-        kind = "added comparison" if claim.is_added else "claim"
-        rows.append(_csv_row(study, claim, study.claims[claim.id], kind))
+        rows.append(_csv_row(study, claim, study.claims[claim.id]))
     return rows
 
 
-def _csv_row(study: Study, claim: Claim, judgement: Judgement, kind: str) -> dict[str, str]:
+def _csv_row(study: Study, claim: Claim, judgement: Judgement) -> dict[str, str]:
     name, state = least_training(claim, study.training)
     declared = study.paper.candidates.get(name)
     of_paper = "" if declared is None or declared.epochs_paper is None else declared.epochs_paper
     return {
         "paper": study.paper.paper,
-        "row": kind,
+        "row": "added comparison" if claim.is_added else "claim",
         "id": claim.id,
-        "text": one_line(claim.claim),
+        "text": without_line_breaks(claim.claim),
         "source": claim.source,
         "data": study.paper.parts.get(claim.part, ""),
         "part": claim.part,
@@ -469,10 +576,10 @@ def _changes(studies: Sequence[Study], before: Path) -> tuple[Sequence[str], lis
     rows = []
     for row in read_rows(before, ("paper", "old_claim", "data", "verdict", "id", "reason")):
         ids = [] if row["id"] == "removed" else row["id"].split()
-        absent = [name for name in ids if (row["paper"], name) not in judged]
-        if absent:
+        missing = [name for name in ids if (row["paper"], name) not in judged]
+        if missing:
             raise DataError(
-                f"'{before}': {row['paper']} has no claim {absent[0]!r}; write an id of claims.yaml"
+                f"'{before}': {row['paper']} has no claim {missing[0]!r}; write an id of claims.yaml"
             )
         now = [judged[row["paper"], name] for name in ids]
         rows.append(

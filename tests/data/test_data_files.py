@@ -36,7 +36,7 @@ def write_half(path, make):
 
 
 @pytest.mark.parametrize("make", [Path.touch, Path.mkdir])
-def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path, make):
+def test_failed_writes_leave_existing_files_unchanged(tmp_path, make):
     with pytest.raises(InterruptedHereError):
         write_half(tmp_path / "new", make)
     assert list(tmp_path.iterdir()) == []
@@ -47,7 +47,7 @@ def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path, make):
     assert [(path.name, path.stat().st_ino) for path in tmp_path.iterdir()] == [("old", before)]
 
 
-def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path):
+def test_folders_are_replaced_completely_on_request(tmp_path):
     for content in ("one", "two"):
         with written_aside(tmp_path / "folder", replace_folder=True) as aside:
             aside.mkdir()
@@ -72,7 +72,7 @@ def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path):
     ]
 
 
-def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp_path):
+def test_files_of_dead_writers_are_swept_and_those_of_living_writers_stay(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     (tmp_path / f"{ASIDE_PREFIX}{dead.pid}-abc-file").write_text("half")
@@ -87,9 +87,12 @@ def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp
     assert remove_leftovers(tmp_path / "nowhere") == 0
 
 
-def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
+def test_killed_writers_leave_only_temporary_files(tmp_path):
     script = "import os, sys, pathlib\nfrom vehest.data.files import written_aside\n"
-    script += "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n    os.kill(os.getpid(), 9)\n"
+    script += (
+        "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n   "
+        " os.kill(os.getpid(), 9)\n"
+    )
     (tmp_path / "file").write_text("old")
     assert (
         subprocess.run(

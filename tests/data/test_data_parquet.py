@@ -1,4 +1,7 @@
-"""Parquet files of others: numbers come out as they went in; files that are damaged or beyond the limits are refused in one line."""
+"""Parquet files of others: numbers come out as they went in.
+
+Files that are damaged or beyond the limits are refused in one line.
+"""
 
 import numpy as np
 import pyarrow as pa
@@ -54,7 +57,7 @@ def test_numbers_come_out_as_they_went_in(tmp_path, options):
         assert values[name].dtype == np.float64
 
 
-def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_path):
+def test_missing_values_are_nan_and_integers_of_any_width_are_read(tmp_path):
     content = {
         "a": pa.array([1, None, 3], pa.uint8()),
         "b": pa.array([1.5, 2.5, None], pa.float16()),
@@ -79,8 +82,8 @@ def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_
     file = written(tmp_path, columns())
     with use_limits(Limits(samples=999)):
         assert (
-            "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER"
-            in refused(file)
+            "holds 1000 rows, more than the limit of 999; if that is meant, raise it: "
+            "limits.samples=NUMBER" in refused(file)
         )
     zeros = written(
         tmp_path, {name: np.zeros(100_000) for name in ("time", "vx", "ay")}, compression="zstd"
@@ -90,8 +93,8 @@ def test_rows_memory_and_description_are_checked_before_anything_is_decoded(tmp_
         group = table.metadata.row_group(0)
         pages = sum(largest_page(stream, group.column(k)) for k in range(3))
     with use_limits(Limits(memory=2_400_000 + pages - 10 * size - 1)):
-        assert f"unpacks to {2_400_000 + pages} bytes" in (said := refused(zeros))
-        assert said.endswith("if that is meant, raise it: limits.memory=NUMBER")
+        assert f"unpacks to {2_400_000 + pages} bytes" in (message := refused(zeros))
+        assert message.endswith("if that is meant, raise it: limits.memory=NUMBER")
         assert set(read(zeros, "time", "vx")) == {"time", "vx"}
     file = written(tmp_path, {f"c{k}": [1.0] for k in range(300)})
     with use_limits(Limits(text_bytes=10_000)):

@@ -1,4 +1,6 @@
-"""Sizes of pages in Parquet files: as pyarrow writes them, and of pages that unpack to more than a file says and may take."""
+"""Sizes of pages in Parquet files: as pyarrow writes them, and of pages that unpack to more than a
+file says and may take.
+"""
 
 import subprocess
 import sys
@@ -25,7 +27,7 @@ def read(file):
 @pytest.mark.parametrize("compression", ["snappy", "gzip", "brotli", "zstd", "lz4"])
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
 @pytest.mark.parametrize("use_dictionary", [False, True])
-def test_the_size_of_a_page_is_what_the_metadata_say_less_its_header(
+def test_page_sizes_match_the_metadata_less_the_header(
     tmp_path, compression, version, use_dictionary
 ):
     values = pa.array([None, *np.random.default_rng(1).integers(0, 9, N_IN_A_PAGE)], pa.float64())
@@ -67,7 +69,7 @@ def test_pages_count_towards_the_memory_that_reading_a_file_may_take(tmp_path):
     assert np.array_equal(read(file)["ay"], np.zeros(N))
 
 
-def test_a_page_without_a_header_is_one_line(tmp_path):
+def test_page_without_a_header_is_refused_in_a_single_line(tmp_path):
     file = bomb(tmp_path / "lap.parquet", 40_000_000)
     column = pq.read_metadata(file).row_group(0).column(1)
     content = bytearray(file.read_bytes())

@@ -1,4 +1,6 @@
-"""Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles nothing."""
+"""Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles
+nothing.
+"""
 
 import math
 from itertools import pairwise
@@ -27,9 +29,9 @@ def counting(length, rate_hz=100.0, start_time=0.0, **changes):
 
 @PROPERTY
 @given(st.integers(1, 400), RATES, STARTS, st.lists(st.floats(-0.2, 1.2), max_size=5))
-def test_consecutive_ranges_cover_every_sample_once(length, rate_hz, start_time, where):
+def test_consecutive_ranges_cover_every_sample_once(length, rate_hz, start_time, split_points):
     recording = counting(length, rate_hz, start_time)
-    inner = [start_time + share * recording.duration for share in where]
+    inner = [start_time + share * recording.duration for share in split_points]
     bounds = [-math.inf, *sorted(inner), math.inf]
     covered = []
     for start, stop in pairwise(bounds):
@@ -62,11 +64,11 @@ def test_empty_ranges_missing_channels_and_unknown_quantities_are_refused():
         counting(100, 100.0, 10.0).cut(10.501, 10.502)
     with pytest.raises(DataError, match=r"'lap' has no channel 'vx' \(it has ay\)"):
         _ = counting(3)["vx"]
-    for channels, said in (
+    for channels, message in (
         ({"vz": np.zeros(3)}, "unknown quantity 'vz'"),
         ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             Estimate("r", "ekf", 20.0, 0.0, channels)
     with pytest.raises(ValueError, match=r"not None and \(vy\)"):
         Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
@@ -93,7 +95,7 @@ def test_samples_are_immutable_copies_and_estimators_receive_no_references():
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         ({"channels": {}}, "one common length"),
         ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "one common length"),
@@ -113,7 +115,7 @@ def test_samples_are_immutable_copies_and_estimators_receive_no_references():
         ({"kind": "reel"}, "real or simulated"),
     ],
 )
-def test_what_cannot_be_a_recording_is_refused(changes, what):
+def test_invalid_recordings_are_refused(changes, message):
     arguments = {
         "id": "r",
         "vehicle": "car",
@@ -121,27 +123,26 @@ def test_what_cannot_be_a_recording_is_refused(changes, what):
         "start_time": 0.0,
         "channels": {"ay": np.zeros(3)},
     }
-    assert what in refusal(lambda: Recording(**(arguments | changes)))
+    assert message in refusal(lambda: Recording(**(arguments | changes)))
 
 
 @PROPERTY
 @given(st.integers(1, 60), RATES, STARTS, st.integers(1, 20))
-def test_held_estimates_are_the_latest_that_are_not_in_the_future(
-    length, rate_hz, start_time, finer
-):
+def test_resampled_estimates_are_the_latest_not_in_the_future(length, rate_hz, start_time, finer):
     values = np.arange(float(length))
     estimate = Estimate("r", "ekf", rate_hz, start_time, {"vy": values, "sideslip": values})
     ticks = np.arange(-finer, (length + 1) * finer)  # sample k of the estimate is tick k·finer
-    held = estimate.held_at(start_time + ticks / (rate_hz * finer), "vy")
+    resampled = estimate.held_at(start_time + ticks / (rate_hz * finer), "vy")
     naive = [
         float(tick // finer) if 0 <= tick // finer < length else math.nan for tick in ticks.tolist()
     ]
-    np.testing.assert_array_equal(held, naive)
+    np.testing.assert_array_equal(resampled, naive)
 
 
 SHAPES = [(shape, ("vy", "vx")) for shape in ((3, 2), (2, 2, 2), (3, 2, 1), (4, 2, 2))]
 NAMES = [
-    ((3, 2, 2), own) for own in ((), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate"))
+    ((3, 2, 2), quantities)
+    for quantities in ((), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate"))
 ]
 
 
@@ -159,7 +160,7 @@ def test_a_covariance_has_a_row_a_name(shape, names):
         )
 
 
-def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
+def test_covariances_are_resampled_like_their_quantities_and_read_by_name():
     covariance = np.arange(27.0).reshape(3, 3, 3)
     estimate = Estimate(
         "r",
@@ -170,10 +171,10 @@ def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
         covariance=covariance,
         covariance_of=("vx", "vy", "friction"),
     )
-    held = estimate.covariance_at(np.array([-0.05, 0.1, 0.19, 0.3]), ["friction", "vx"])
-    assert np.isnan(held[[0, 3]]).all()
-    assert (held[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
-    assert (held[2] == held[1]).all()
+    resampled = estimate.covariance_at(np.array([-0.05, 0.1, 0.19, 0.3]), ["friction", "vx"])
+    assert np.isnan(resampled[[0, 3]]).all()
+    assert (resampled[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
+    assert (resampled[2] == resampled[1]).all()
     assert "a covariance of vx, vy, friction, not of yaw_rate" in refusal(
         lambda: estimate.covariance_at(np.zeros(1), ["yaw_rate"])
     )
@@ -190,7 +191,7 @@ def test_units_of_something_else_and_unknown_channels_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("unit", "si_unit", "one_is"),
+    ("unit", "si_unit", "si_value"),
     [
         ("km/h", "m/s", 1000 / 3600),
         ("mph", "m/s", 1609.344 / 3600),
@@ -205,5 +206,5 @@ def test_units_of_something_else_and_unknown_channels_are_refused():
         ("ns", "s", 1e-9),
     ],
 )
-def test_units_convert_as_defined(unit, si_unit, one_is):
-    assert factor_to_si(unit, si_unit) == pytest.approx(one_is, rel=1e-15)
+def test_units_convert_as_defined(unit, si_unit, si_value):
+    assert factor_to_si(unit, si_unit) == pytest.approx(si_value, rel=1e-15)

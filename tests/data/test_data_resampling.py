@@ -55,13 +55,13 @@ def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
     expected = signal.resample_poly(extended, up, down, window=taps)[margin * up // down :][
         : -(-length * up // down)
     ]
-    found = Resample(new_rate)(recorded(samples, rate, start_time=1_700_000_000.25))
-    np.testing.assert_array_equal(found["ay"], expected)
-    assert (found.start_time, found.rate_hz) == (1_700_000_000.25, new_rate)
+    resampled = Resample(new_rate)(recorded(samples, rate, start_time=1_700_000_000.25))
+    np.testing.assert_array_equal(resampled["ay"], expected)
+    assert (resampled.start_time, resampled.rate_hz) == (1_700_000_000.25, new_rate)
 
 
 @pytest.mark.parametrize(("rate", "new_rate"), [ratio for ratio in RATIOS if ratio[1] < ratio[0]])
-def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate, new_rate):
+def test_frequencies_above_the_new_nyquist_are_attenuated_by_60_db(rate, new_rate):
     seconds = 200 / new_rate
     time = np.arange(round(seconds * rate)) / rate
     for frequency in np.linspace(new_rate / 2, rate / 2, 23):

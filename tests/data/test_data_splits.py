@@ -1,4 +1,6 @@
-"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings, and splits of papers are theirs."""
+"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings,
+and splits of papers are theirs.
+"""
 
 import math
 import re
@@ -73,13 +75,20 @@ def roles(draw):
 @given(roles(), st.sampled_from([20.0, 100.0, 125.0]))
 def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
     train, validation, test = parts
-    taken = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
-    shared = bool(taken[0] & taken[1] or taken[0] & taken[2] or taken[1] & taken[2])
-    apart = not any(
-        a.overlaps(b) for one, other in combinations(parts, 2) for a in one for b in other
+    samples_by_role = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
+    shared = bool(
+        samples_by_role[0] & samples_by_role[1]
+        or samples_by_role[0] & samples_by_role[2]
+        or samples_by_role[1] & samples_by_role[2]
     )
-    assert not (apart and shared)
-    if apart:
+    has_no_overlap = not any(
+        a.overlaps(b)
+        for first_role, second_role in combinations(parts, 2)
+        for a in first_role
+        for b in second_role
+    )
+    assert not (has_no_overlap and shared)
+    if has_no_overlap:
         Split("drive", train, validation, {"test": test})
     else:
         with pytest.raises(ConfigurationError, match="share samples of recording"):
@@ -96,7 +105,8 @@ def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     )
     with pytest.raises(
         ConfigurationError,
-        match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, 6\) s\)",
+        match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, "
+        r"6\) s\)",
     ):
         Split("s", (Span("d", "r", 0, 10),), (Span("d", "v"),), {"wet": (Span("d", "r", 5, 6),)})
 
@@ -123,7 +133,7 @@ def test_plain_values_make_a_split_with_tests_alone():
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         ({"train": []}, "nothing to train on"),
         ({"validation": []}, "nothing to validate on"),
@@ -134,18 +144,21 @@ def test_plain_values_make_a_split_with_tests_alone():
         ),
         (
             {"train": "a"},
-            'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"',
+            'train must be a list of ranges, a percentage such as "60 %" or laps such as "last '
+            'lap"',
         ),
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
-def test_a_misspelt_split_is_refused_in_one_line(changes, what):
-    assert what in refusal(BASE | changes)
+def test_misspelt_splits_are_refused_in_a_single_line(changes, message):
+    assert message in refusal(BASE | changes)
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
-def test_every_split_that_is_shipped_is_one(file):
-    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
+def test_shipped_splits_are_valid(file):
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any
+    other has what the split names.
+    """
 
     def cruising(dataset):
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
@@ -189,7 +202,7 @@ def drives(ay, vx=None, start_time=0.0):
     return lambda dataset: {name: reader(name) for name in ay}
 
 
-def kept_of(keep, catalogue, **entry):
+def selected_ranges(keep, catalogue, **entry):
     """A split whose training is cut by a condition."""
     train = {"recordings": "train_*", **entry, "keep": keep}
     return split_from_config(
@@ -210,10 +223,10 @@ def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
         Span("d", "train_a", 1.0),
         Span("d", "train_b", 1.0),
     )
-    asked = []
+    requested = []
 
     def catalogue(dataset):
-        asked.append(dataset)
+        requested.append(dataset)
         return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
 
     plain = {
@@ -223,18 +236,19 @@ def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
         "validation": [{"recording": "b1"}],
     }
     split_from_config(plain, catalogue)
-    assert asked == []
+    assert requested == []
     split_from_config(
         plain | {"train": [{"recordings": "a*"}], "validation": [{"recordings": "b*"}]}, catalogue
     )
-    assert asked == ["d"]
+    assert requested == ["d"]
 
 
-def test_a_condition_keeps_whole_stretches_that_last():
-    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
+def test_conditions_select_segments_of_the_minimum_duration():
+    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the
+    # end. Limits belong to what is kept.
     ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
     keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
-    split = kept_of(keep, drives({"train_1": ay}, start_time=50.0))
+    split = selected_ranges(keep, drives({"train_1": ay}, start_time=50.0))
     assert [(span.start, span.stop) for span in split.train] == [(52.0, 54.0), (54.01, math.inf)]
 
 
@@ -247,7 +261,7 @@ def test_a_condition_keeps_whole_stretches_that_last():
     ),
     st.integers(0, 30),
 )
-def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces, shortest):
+def test_conditions_match_a_plain_loop_over_samples(pieces, shortest):
     ay = [value for value, length in pieces for _ in range(length)]
     expected = set()
     run = []
@@ -261,24 +275,25 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
     keep = {"magnitude": {"ay": {"at_most": 5.0}}, "at_least_seconds": shortest / 100.0}
     if not expected:
         with pytest.raises(ConfigurationError, match="keeps nothing"):
-            kept_of(keep, catalogue)
+            selected_ranges(keep, catalogue)
         return
     recording = catalogue("d")["train_1"](["ay"])
     ranges = [
-        recording.index_range(span.start, span.stop) for span in kept_of(keep, catalogue).train
+        recording.index_range(span.start, span.stop)
+        for span in selected_ranges(keep, catalogue).train
     ]
     assert {k for first, end in ranges for k in range(first, end)} == expected
-    assert all(one[1] < other[0] for one, other in pairwise(ranges))
+    assert all(earlier[1] < later[0] for earlier, later in pairwise(ranges))
 
 
 def test_all_channels_of_a_condition_must_meet_it_within_the_range():
     ay = [0.0] * 50 + [9.0] * 50 + [0.0] * 100
     vx = [10.0] * 150 + [4.0] * 50
     keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
-    spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
+    spans = selected_ranges(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
     keep = {"magnitude": {"ay": {"at_most": 7.0}}}
-    spans = kept_of(
+    spans = selected_ranges(
         keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5
     ).train
     assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
@@ -288,7 +303,7 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
 
 
 @pytest.mark.parametrize(
-    ("entry", "what"),
+    ("entry", "message"),
     [
         ({"recordings": "lap_*"}, "no recording of data set 'd' matches 'lap_*' (it has train_1)"),
         (
@@ -315,15 +330,17 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
         ),
     ],
 )
-def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
+def test_invalid_patterns_and_conditions_are_refused_in_a_single_line(entry, message):
     named = {} if "recording" in entry else {"recordings": "train_*"}
-    assert what in refusal(BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200}))
+    assert message in refusal(
+        BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200})
+    )
 
 
 @pytest.mark.parametrize(
     "entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}]
 )
-def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
+def test_patterns_and_conditions_require_recordings(entry):
     assert "its patterns and the like need the recordings of data set 'd'" in refusal(
         BASE | {"train": [entry]}
     )
@@ -342,7 +359,9 @@ def test_windows_share_memory_and_gaps_and_missing_channels_are_refused_by_name(
         windows_of([recording], ["vx", "ay"], "vy_ref", 3)
     assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
     with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
-        kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
+        selected_ranges(
+            {"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10})
+        )
 
 
 def recorded(name, length, offset):
@@ -375,7 +394,10 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
 
 
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
-    """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
+    """A course of two straights and two unlike bends, driven at a speed of its own every lap.
+
+    And the distance of a lap [m].
+    """
     straight = 200.0
     radii = (60.0, 30.0)
     bends = [np.pi * radius for radius in radii]
@@ -406,7 +428,7 @@ def catalogue_of(*recordings):
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_one_round_and_count_from_either_end():
+def test_laps_last_a_round_and_count_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4
@@ -416,7 +438,7 @@ def test_laps_last_one_round_and_count_from_either_end():
         for start, stop in laps
     ]
     np.testing.assert_allclose(driven, length, rtol=0.01)
-    assert all(one[1] == other[0] for one, other in pairwise(laps))
+    assert all(earlier[1] == later[0] for earlier, later in pairwise(laps))
     entry = {"recording": "lap"}
     config = {
         "name": "s",
@@ -430,7 +452,7 @@ def test_laps_last_one_round_and_count_from_either_end():
     assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
-def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_none():
+def test_laps_are_full_turns_of_ovals_and_circles_and_roads_have_none():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
     bend = (
@@ -459,9 +481,9 @@ def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_non
     )
 
 
-def test_percentages_follow_one_another_over_every_recording():
-    one = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
-    other = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
+def test_percentages_are_consecutive_over_every_recording():
+    first = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
+    second = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
     config = {
         "name": "s",
         "dataset": "d",
@@ -469,7 +491,7 @@ def test_percentages_follow_one_another_over_every_recording():
         "validation": "15%",
         "tests": {"wet": "20 %", "dry": "5 %"},
     }
-    split = split_from_config(config, catalogue_of(one, other))
+    split = split_from_config(config, catalogue_of(first, second))
     assert split.train == (Span("d", "a", -math.inf, 110.0), Span("d", "b", -math.inf, 12.0))
     assert split.validation == (Span("d", "a", 110.0, 125.0), Span("d", "b", 12.0, 15.0))
     assert split.tests["wet"] == (Span("d", "a", 125.0, 145.0), Span("d", "b", 15.0, 19.0))
@@ -486,7 +508,7 @@ def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     tested = sorted((span.start, span.stop) for split in splits for span in split.tests["test"])
     assert tested[0][0] == recording.start_time
     assert tested[-1][1] == recording.end_time
-    assert all(one[1] == other[0] for one, other in pairwise(tested))
+    assert all(earlier[1] == later[0] for earlier, later in pairwise(tested))
     for split, after in zip(splits, [*splits[1:], splits[0]], strict=True):
         (tested_span,) = split.tests["test"]
         (stopped_on,) = after.tests["test"]
@@ -522,7 +544,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         (
             {"train": "70 %", "validation": "20 %", "tests": {"t": "20 %"}},
@@ -559,14 +581,17 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
     ],
     ids=str,
 )
-def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
-    assert what in refusal(
+def test_invalid_portions_are_refused_in_a_single_line(changes, message):
+    assert message in refusal(
         BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0])
     )
 
 
-def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():
-    """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
+def test_folds_are_never_scraps_and_gaps_stay_complete():
+    """What is before the first lap and after the last belongs to them.
+
+    A gap reaches over blocks that are shorter than it.
+    """
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
         config = {
@@ -600,12 +625,12 @@ def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(lap
         + 0.3 * np.sin(6.0 * np.pi * time / 60.0 + 1.0)
         - (0.2 - 2.0 * np.pi / 60.0)
     )
-    found = laps_of(
+    detected = laps_of(
         Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate})
     )
-    assert len(found) == int(laps)
+    assert len(detected) == int(laps)
     np.testing.assert_allclose(
-        [stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3
+        [stop for _, stop in detected], 60.0 * np.arange(1, int(laps) + 1), atol=0.3
     )
 
 
@@ -618,22 +643,22 @@ def total(spans):
 
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
 @pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
-def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
-    kept = limit_minutes(SPANS, seconds, at)
-    assert total(kept) == pytest.approx(seconds)
+def test_limited_minutes_have_their_duration_from_any_offset(seconds, at):
+    limited = limit_minutes(SPANS, seconds, at)
+    assert total(limited) == pytest.approx(seconds)
     assert all(
         any(
-            own.start >= span.start and own.stop <= span.stop
+            limited_span.start >= span.start and limited_span.stop <= span.stop
             for span in SPANS
-            if span.recording == own.recording
+            if span.recording == limited_span.recording
         )
-        for own in kept
+        for limited_span in limited
     )
-    for position, one in enumerate(kept):
-        assert not any(one.overlaps(other) for other in kept[position + 1 :])
+    for position, first in enumerate(limited):
+        assert not any(first.overlaps(second) for second in limited[position + 1 :])
 
 
-def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
+def test_minutes_begin_at_their_offset_and_leave_tests_unchanged():
     assert limit_minutes(SPANS, 60.0, 0.5) == (
         Span("d", "one", 10.0, 25.0),
         Span("d", "two", 115.0, 160.0),
@@ -685,11 +710,11 @@ def sets_of(spans):
 
 @pytest.mark.parametrize("place", ["", "_sim"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_schemes_learn_on_one_car_stop_on_the_other_or_the_same_and_test_on_both(scheme, place):
-    found = split(scheme + place)
-    assert (sets_of(found.train), sets_of(found.validation)) == SCHEMES[scheme]
+def test_schemes_train_and_validate_on_their_cars_and_test_on_both(scheme, place):
+    parts = split(scheme + place)
+    assert (sets_of(parts.train), sets_of(parts.validation)) == SCHEMES[scheme]
     third = {"j1": ["J-1"] * 2} if place else {}
-    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {
+    assert {name: sets_of(spans) for name, spans in parts.tests.items()} == {
         "c2": ["C-2"] * 2,
         "f2": ["F-2"] * 2,
         **third,

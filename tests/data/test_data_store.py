@@ -1,4 +1,6 @@
-"""The store: what is read back is what was written, bit for bit, and a failure leaves what was there before."""
+"""The store: what is read back is what was written, bit for bit, and a failure leaves what was
+there before.
+"""
 
 import math
 import tempfile
@@ -108,7 +110,7 @@ def test_other_tools_read_the_same_numbers_and_writing_twice_gives_the_same_byte
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_chosen_channels_are_read_in_the_order_asked_for_and_missing_ones_named(tmp_path):
+def test_channels_are_read_in_the_requested_order_and_missing_channels_are_named(tmp_path):
     channels = {name: np.full(3, float(k)) for k, name in enumerate(("vx", "ax", "ay"))}
     recording = Recording("r", "car", 10.0, 0.0, channels, gappy=frozenset({"ax"}))
     write_recording(recording, tmp_path / "r.parquet")
@@ -158,7 +160,7 @@ def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
         assert bits(read.covariance.ravel()) == bits(estimate.covariance.ravel())
 
 
-def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothing(tmp_path):
+def test_unreadable_and_unwritable_files_are_refused_and_leave_nothing(tmp_path):
     assert "JSON" in refusal(
         lambda: write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet")
     )
@@ -172,10 +174,10 @@ def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothin
     assert (tmp_path / "file").read_text() == "not a folder"
 
 
-@pytest.mark.parametrize("kept", [1, 4, 200, -8, -1])
-def test_a_truncated_file_is_refused_in_one_line(tmp_path, kept):
+@pytest.mark.parametrize("n_bytes", [1, 4, 200, -8, -1])
+def test_truncated_files_are_refused_in_a_single_line(tmp_path, n_bytes):
     write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
-    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
+    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:n_bytes])
     assert "r.parquet' is truncated or damaged" in refusal(
         lambda: read_recording(tmp_path / "r.parquet")
     )
@@ -206,7 +208,7 @@ def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
         {b"vehest": b"\xff"},
     ],
 )
-def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path, metadata):
+def test_foreign_parquet_files_are_refused_in_a_single_line(tmp_path, metadata):
     pq.write_table(
         pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet"
     )

@@ -52,7 +52,9 @@ def fitted_sine(samples, time, frequency):
 
 
 def bilinear(frequency, cutoff_hz):
-    """Response of a second-order Butterworth filter made digital by the bilinear transform with pre-warping."""
+    """Response of a second-order Butterworth filter made digital by the bilinear transform with
+    pre-warping.
+    """
     warped = 1j * np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff_hz / RATE)
     return complex(1.0 / (warped**2 + math.sqrt(2.0) * warped + 1.0))
 
@@ -101,7 +103,9 @@ def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length):
 
 
 def test_reference_lever_brings_velocities_to_the_centre_of_gravity():
-    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
+    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a
+    fixed point.
+    """
     yaw_rate = np.array([0.0, 0.4, -0.3])
     vx = np.full(3, 15.0)
     vy = np.array([0.0, -0.2, 0.4])
@@ -140,11 +144,11 @@ def test_outlier_removal_removes_planted_spikes_and_keeps_steps_and_ramps():
         np.mean(RemoveOutliers()(recorded(ay=noisy))["ay"] == noisy) > 0.99
     )  # six deviations of eleven normal samples: a few in 1000
     for wrong in ({"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}):
-        said = refusal(
+        message = refusal(
             lambda wrong=wrong: transform_from_config({"name": "remove_outliers", **wrong}),
             ConfigurationError,
         )
-        assert "greater than 0" in said
+        assert "greater than 0" in message
 
 
 @PROPERTY
@@ -172,9 +176,11 @@ def test_a_few_impossible_samples_are_bridged_by_lines_and_many_stay(beside):
 
 
 def rigid_body(lever_x, lever_y, yaw):
-    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
+    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does
+    at its centre of gravity.
 
-    The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
+    The sensor's acceleration comes from differentiating its position in the plane twice, not from
+    rigid-body formulae.
     """
     time = np.arange(800) / RATE
     step = 2e-4
@@ -222,7 +228,7 @@ def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x, lever_y, yaw
     assert before > 0.1
 
 
-def test_mounting_correction_of_one_sample_knows_the_centripetal_part():
+def test_mounting_correction_of_a_single_sample_includes_the_centripetal_part():
     recording = recorded(ax=np.array([1.0]), ay=np.array([2.0]), yaw_rate=np.array([0.5]))
     corrected = MountingCorrection(lever_x=2.0, lever_y=-1.0)(recording)
     assert corrected["ax"].tolist() == [1.0 + 0.25 * 2.0]
@@ -255,7 +261,7 @@ def test_transforms_are_built_from_plain_values():
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
-    others = {
+    configurations = {
         "resample",
         "low_pass",
         "remove_outliers",
@@ -270,11 +276,11 @@ def test_transforms_are_built_from_plain_values():
         "sideslip_from_velocity",
         "scale_to_wheelbase",
     }
-    assert set(TRANSFORMS) == others | of_an_alignment | deriving
+    assert set(TRANSFORMS) == configurations | of_an_alignment | deriving
 
 
 @pytest.mark.parametrize(
-    ("config", "what"),
+    ("config", "message"),
     [
         ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
         ({"name": "low_pass"}, "transform 'low_pass': cutoff_hz"),
@@ -286,15 +292,18 @@ def test_transforms_are_built_from_plain_values():
         ({"name": "low_pass", "cutoff_hz": 5, "zero": 1}, "transform 'low_pass': "),
     ],
 )
-def test_a_misspelt_transform_is_refused_in_one_line(config, what):
-    assert what in refusal(lambda: transform_from_config(config), ConfigurationError)
+def test_misspelt_transforms_are_refused_in_a_single_line(config, message):
+    assert message in refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
 
 
-def rolling(**shown):
-    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
+def rolling(**damages):
+    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed.
+
+    ``shown`` replaces channels.
+    """
     time = np.arange(2000) / RATE
     u = 8.0 + 3.0 * np.sin(0.7 * time)
     yaw_rate = 0.3 * np.sin(0.9 * time)
@@ -308,17 +317,17 @@ def rolling(**shown):
         "steer": steer,
         "ax": 2.1 * np.cos(0.7 * time),
         **wheels,
-    } | shown
+    } | damages
     gappy = frozenset(name for name, samples in channels.items() if np.isnan(samples).any())
     return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
 
 
 def damaged(value, *wheels, start=500, stop=650):
     """The same with some wheels that show another value for a while."""
-    whole, _ = rolling()
+    complete, _ = rolling()
     broken = {}
     for wheel in wheels:
-        broken[f"wheel_speed_{wheel}"] = np.array(whole[f"wheel_speed_{wheel}"])
+        broken[f"wheel_speed_{wheel}"] = np.array(complete[f"wheel_speed_{wheel}"])
         broken[f"wheel_speed_{wheel}"][start:stop] = value
     return rolling(**broken)
 
@@ -329,17 +338,19 @@ def test_speed_from_wheels_inverts_rolling_wheels():
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
     missing = np.full(2000, math.nan)
     assert "no wheel speed was measured" in refusal(lambda: WHEELS(rolling(yaw_rate=missing)[0]))
-    whole, u = rolling()
-    rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
+    complete, u = rolling()
+    rear = complete.select(["wheel_speed_rl", "wheel_speed_rr"])
     np.testing.assert_allclose(
         SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12
     )  # left and right make up for the track
-    one = whole.select(["wheel_speed_rl"])
+    single_wheel = complete.select(["wheel_speed_rl"])
     np.testing.assert_allclose(
-        SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12
+        SpeedFromWheels(wheel_radius=0.48)(single_wheel)["vx"],
+        0.48 * complete["wheel_speed_rl"],
+        atol=1e-12,
     )
     assert "has no wheel speed to make vx of" in refusal(
-        lambda: SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
+        lambda: SpeedFromWheels(wheel_radius=0.48)(complete.select(["yaw_rate"]))
     )
 
 
@@ -373,9 +384,11 @@ def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter(
     amplitude = 3.0 * 2 * np.pi * frequency
     late = math.sqrt(2.0) / (2.0 * np.pi * 5.0) + 0.5 / rate
     for direction, delay in (("zero_phase", 0.0), ("causal", late)):
-        made = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)
+        derived = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)
         expected = amplitude * np.cos(2 * np.pi * frequency * (time - delay))
-        np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
+        np.testing.assert_allclose(
+            derived["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude
+        )
     causal = AccelerationFromSpeed()
     np.testing.assert_array_equal(causal(drive.cut(0.0, 9.0))["ax"], causal(drive)["ax"][:900])
     assert "cutoff_hz must lie below half of 100 Hz" in refusal(
@@ -386,26 +399,30 @@ def test_acceleration_from_speed_is_its_derivative_with_the_delay_of_the_filter(
 def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
     angle = np.deg2rad(np.array([-58.0, -3.0, 0.0, 12.0]))
     drive = recorded(vx=np.array([5.0, 20.0, 30.0, 10.0]), sideslip_ref=angle)
-    there = VelocityFromSideslip()(drive)
-    np.testing.assert_allclose(there["vy_ref"], drive["vx"] * np.tan(angle))
-    back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
+    with_velocity = VelocityFromSideslip()(drive)
+    np.testing.assert_allclose(with_velocity["vy_ref"], drive["vx"] * np.tan(angle))
+    back = SideslipFromVelocity()(with_velocity.select(["vx", "vy_ref"]))
     np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
     assert "less than 90 degrees" in refusal(
         lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
     )
-    standing = VelocityFromSideslip()(
+    at_standstill = VelocityFromSideslip()(
         recorded(vx=np.array([0.01, 0.05, 20.0]), sideslip_ref=np.array([3.1, 0.2, 0.1]))
     )
-    np.testing.assert_allclose(standing["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)])
+    np.testing.assert_allclose(
+        at_standstill["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)]
+    )
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
-    made = VelocityFromSideslip()(drive)
-    assert "vy_ref" in made.gappy
-    np.testing.assert_array_equal(np.isnan(made["vy_ref"]), [False, True, False])
+    derived = VelocityFromSideslip()(drive)
+    assert "vy_ref" in derived.gappy
+    np.testing.assert_array_equal(np.isnan(derived["vy_ref"]), [False, True, False])
 
 
 def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
-    """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of smooth signals."""
+    """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of
+    smooth signals.
+    """
     time = np.arange(4000) / 100.0
     vx = 3.0 + 0.5 * np.sin(time)
     vy = 0.4 * np.sin(1.3 * time)
@@ -453,7 +470,7 @@ def lap(rate_hz=100.0, n_samples=400):
     ],
     ids=str,
 )
-def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
+def test_excessive_requests_are_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
     changed = transform_from_config(
         {key: value for key, value in config.items() if value != "long"}
@@ -463,10 +480,10 @@ def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limi
     assert "recording 'lap'" in message
 
 
-def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch):
-    whole = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
+def test_chunked_and_spectral_computations_equal_the_direct_computation(monkeypatch):
+    direct = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
     monkeypatch.setattr(transforms, "VALUES_AT_ONCE", 40)
-    np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)
+    np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], direct)
     low_pass = LowPass(2.0, design="fir", reach=50.0)
     through_spectra = low_pass(lap(n_samples=12_000))["ay"]
     monkeypatch.setattr(transforms, "MAX_DIRECT_TAPS", 20_000)
@@ -476,6 +493,7 @@ def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch)
 def test_a_window_longer_than_the_limit_is_refused():
     with pytest.raises(
         DataError,
-        match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples",
+        match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; "
+        r".*limits\.filter_samples",
     ):
         windows_of([lap()], ["vx"], "ay", 2_000_000)

@@ -45,13 +45,13 @@ class Kinds:
 
 
 def test_plain_values_become_dataclasses_that_may_take_further_keys():
-    given = {
+    values = {
         "names": ["a"],
         "inner": [{"gain": 1}, None],
         "pair": [0, "b"],
         "maps": {"c": {"d": {"gain": 0.5, "steps": 4}}},
     }
-    assert validated(Kinds, given, "'f'") == Kinds(
+    assert validated(Kinds, values, "'f'") == Kinds(
         ("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}}
     )
 
@@ -69,7 +69,8 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ({"names": "a"}, "it.names must be a list of names, not 'a'"),
         (
             {"inner": [{"gain": 1, "gian": 1}]},
-            "it.inner.0.gian is not an option of it.inner.0; did you mean 'it.inner.0.gain'? options: gain, steps",
+            "it.inner.0.gian is not an option of it.inner.0; did you mean 'it.inner.0.gain'? "
+            "options: gain, steps",
         ),
         ({"lists": [3]}, "it.lists.0 must be a list, not 3"),
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
@@ -85,7 +86,8 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ({"inner": [{"gain": float("nan")}]}, "'f': inner.0.gain must be a number, not nan"),
         (
             {"other": 1},
-            "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, maps",
+            "'f': unknown key 'other'; there are: names, inner, lists, pair, files, values, rate, "
+            "maps",
         ),
         (
             {"names": {1, 2}},
@@ -93,7 +95,7 @@ def test_plain_values_become_dataclasses_that_may_take_further_keys():
         ),
     ],
 )
-def test_a_refusal_is_one_line_that_says_what_the_type_of_the_key_takes(content, message):
+def test_refusals_name_the_type_of_the_key_in_a_single_line(content, message):
     of_a_file = message.startswith("'f'")
     options = {} if of_a_file else {"error": ConfigurationError, "group": "it"}
     with pytest.raises(DataError if of_a_file else ConfigurationError) as caught:
@@ -123,12 +125,12 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
         ("a: *nothing", "cannot be read as YAML"),
     ],
 )
-def test_yaml_that_is_none_is_one_line(text, message):
+def test_invalid_yaml_is_refused_in_a_single_line(text, message):
     with pytest.raises(DataError, match=message):
         parse_yaml(text, "'f'")
 
 
-def test_honest_yaml_with_anchors_is_read_and_json_that_is_none_is_one_line():
+def test_yaml_with_anchors_is_read_and_invalid_json_is_refused():
     for text in ("[" * 100000, b"\xff\xfe"):
         assert "cannot be read as JSON" in refusal(lambda text=text: parse_json(text, "'f'"))
     assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {
@@ -175,7 +177,8 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
     for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
         with pytest.raises(
             ConfigurationError,
-            match=r"limits\.(samples must be a whole number|samples: input should be greater than 0|values is not an option .*samples)",
+            match=r"limits\.(samples must be a whole number|samples: input should be greater than "
+            r"0|values is not an option .*samples)",
         ):
             limits_from_config(wrong)
 
@@ -188,26 +191,27 @@ def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more()
         check_unpacked("f", 200, 3000)
         with pytest.raises(
             DataError,
-            match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER",
+            match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, "
+            r".*limits\.memory=NUMBER",
         ):
             check_unpacked("f", 200, 3001)
 
 
 @given(st.text(max_size=300))
-def test_whatever_a_name_holds_it_stays_one_component(name):
-    made = file_name(name, ".csv")
-    assert Path(made).name == made
-    assert not made.startswith(".")
-    assert len(made.encode()) < 140
-    assert made == file_name(name, ".csv")
+def test_file_names_stay_a_single_path_component(name):
+    escaped = file_name(name, ".csv")
+    assert Path(escaped).name == escaped
+    assert not escaped.startswith(".")
+    assert len(escaped.encode()) < 140
+    assert escaped == file_name(name, ".csv")
 
 
 @given(st.text(max_size=40), st.text(max_size=40))
-def test_different_names_stay_different(one, other):
-    assert (file_name(one) == file_name(other)) == (one == other)
+def test_different_names_stay_different(first, second):
+    assert (file_name(first) == file_name(second)) == (first == second)
 
 
-def test_plain_names_stay_and_escapes_for_the_terminal_are_shown():
+def test_plain_names_stay_and_terminal_escapes_are_printed():
     assert file_name("ksnn-linear_bias_p2-seed0", ".csv") == "ksnn-linear_bias_p2-seed0.csv"
     assert printable("a\x1b[31mb\r\n\u202e") == "a\\x1b[31mb\\r\\n\\u202e"
     assert printable("größe β °") == "größe β °"

@@ -15,14 +15,14 @@ def recording():
     return Recording("lap <1>", "car", 50.0, 4.0, channels, gappy=frozenset({"ay"}))
 
 
-def test_repr_says_size_and_channels_on_one_line(recording):
+def test_repr_has_size_and_channels_on_a_single_line(recording):
     assert repr(recording) == "<Recording 'lap <1>': 0.06 s at 50 Hz; vx, ay>"
     estimate = Estimate("lap", "zero", 50.0, 4.0, dict.fromkeys(("vy", "sideslip"), np.zeros(3)))
     assert repr(estimate) == ("<Estimate of 'lap' by zero: 0.06 s at 50 Hz; vy, sideslip>")
-    many = planar_drive(4.0)
-    assert "\n" not in repr(many)
-    assert len(repr(many)) <= 100
-    assert repr(many).endswith(f"and {len(many.channels) - 4} more>")
+    all_channels = planar_drive(4.0)
+    assert "\n" not in repr(all_channels)
+    assert len(repr(all_channels)) <= 100
+    assert repr(all_channels).endswith(f"and {len(all_channels.channels) - 4} more>")
 
 
 def test_table_of_a_notebook_escapes_names_and_counts_missing_samples(recording):

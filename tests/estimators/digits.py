@@ -1,4 +1,6 @@
-"""Prints a digest of value and gradient of the compiled kernels named on the command line: ``digits.py networks`` or ``digits.py cars``."""
+"""Prints a digest of value and gradient of the compiled kernels named on the command line:
+``digits.py networks`` or ``digits.py cars``.
+"""
 
 import hashlib
 import sys

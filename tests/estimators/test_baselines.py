@@ -29,7 +29,9 @@ def fitted(name, drive, **settings):
 
 
 def steady_drive(car, seconds=30.0):
-    """Steady cornering of the linear single track at several speeds and steering angles: v and r solve 0 = A x + B δ at each sample."""
+    """Steady cornering of the linear single track at several speeds and steering angles: v and r
+    solve 0 = A x + B δ at each sample.
+    """
     generator = np.random.default_rng(3)
     vx = generator.uniform(8.0, 35.0, round(20 * seconds))
     steer = generator.uniform(-0.05, 0.05, len(vx))
@@ -47,7 +49,7 @@ def steady_drive(car, seconds=30.0):
 CAR = SingleTrackParameters(1000.0, 1600.0, 1.2, 1.3, 8.0e4, 1.1e5)
 
 
-def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_sheet_is_exact_on_one():
+def test_static_map_identifies_and_data_sheet_computes_a_linear_single_track():
     estimator, record = fitted("static_map", steady_drive(CAR))
     assert estimator.values["b"] == pytest.approx(CAR.cg_to_rear_axle, rel=1e-9)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
@@ -70,8 +72,10 @@ def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
 
-def test_prior_map_is_the_static_map_with_the_numbers_that_the_self_calibrating_filter_starts_from():
-    """At the filter's centre of gravity, for a car of full size and for a small one whose tyres slip more."""
+def test_prior_map_is_the_static_map_with_prior_parameters():
+    """At the filter's centre of gravity, for a car of full size and for a small one whose tyres
+    slip more.
+    """
     drive = steady_drive(CAR)
     for wheelbase, compliance in ((2.7, 0.0045), (0.3, 0.0135)):
         (estimate,) = new("prior_map", wheelbase=wheelbase).estimate([drive.without_references()])
@@ -81,15 +85,15 @@ def test_prior_map_is_the_static_map_with_the_numbers_that_the_self_calibrating_
         model = new("self_calibrating", wheelbase=wheelbase)
         assert model.prior[0][6] == pytest.approx(compliance)  # the mean of C
         assert model.rear == pytest.approx(0.48 * wheelbase)
-    given = new("prior_map", wheelbase=2.7, cg_to_rear_axle=1.1)
-    (estimate,) = given.estimate([drive.without_references()])
+    prior_map = new("prior_map", wheelbase=2.7, cg_to_rear_axle=1.1)
+    (estimate,) = prior_map.estimate([drive.without_references()])
     r = drive["yaw_rate"]
     np.testing.assert_allclose(estimate["vy"], r * (1.1 - 0.0045 * drive["vx"] ** 2), atol=1e-12)
     with pytest.raises(ConfigurationError, match="between 0 and the wheelbase"):
         new("prior_map", wheelbase=2.4, cg_to_rear_axle=3.0)
 
 
-def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_constant_it_finds():
+def test_kinematic_integration_solves_its_equation_and_fits_the_time_constant():
     drive = planar_drive(20.0)
     estimator = new("kinematic")
     estimator.values = {"time_constant": 2.5}

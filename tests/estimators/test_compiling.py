@@ -1,4 +1,6 @@
-"""Compilation that keeps a first training waiting is said beforehand, once, and what it compiles has the digits of every later run."""
+"""Compilation that keeps a first training waiting is said beforehand, once, and what it compiles
+has the digits of every later run.
+"""
 
 import ast
 import importlib
@@ -17,9 +19,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.trust.health import SLOW_KERNEL
 
 
-def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_without_compilation(
-    tmp_path, monkeypatch
-):
+def test_learned_filters_compile_until_their_code_is_cached(tmp_path, monkeypatch):
     monkeypatch.setattr(
         planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path)))
     )
@@ -35,13 +35,13 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_withou
 
 
 @pytest.mark.parametrize(
-    "where",
+    "module_name",
     sorted(
         {SLOW_KERNEL, *(estimator_class(name).slow_kernel for name in estimator_names())} - {""}
     ),
 )
-def test_slow_kernels_are_entries_that_are_there(where):
-    module, _, name = where.partition(":")
+def test_slow_kernels_are_entries_that_are_there(module_name):
+    module, _, name = module_name.partition(":")
     assert hasattr(getattr(importlib.import_module(module), name), "stats")
 
 
@@ -63,8 +63,8 @@ def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(t
     assert first == second
 
 
-def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only():
-    """`fastmath` outside `kernels.compiling` would bring back a first run with digits of its own."""
+def test_code_with_reordered_sums_is_compiled_in_a_single_way():
+    """`fastmath` outside `kernels.compiling` would give the first run different digits."""
     source = Path(vehest.__file__).parent
     decorated = [
         f"{path.relative_to(source)}:{call.lineno}"

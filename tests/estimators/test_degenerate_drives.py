@@ -1,4 +1,6 @@
-"""Trained on a drive that shows little, a family is refused in one line or becomes a finite model: no NaN is stored."""
+"""Trained on a drive that shows little, a family is refused in one line or becomes a finite model:
+no NaN is stored.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre forces and without."""
+"""The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre
+forces and without.
+"""
 
 import sys
 from dataclasses import replace
@@ -9,6 +11,7 @@ from refusals import refusal
 
 from conftest import stop_after
 from dugoff_drive import NOISE, TYRES, dugoff_drive
+from every_estimator import online_rows
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
@@ -78,7 +81,7 @@ def test_the_filter_follows_the_car_and_knows_how_well(inputs):
     assert set(estimate["nis_dof"]) == ({4.0} if inputs == "full" else {2.0})
 
 
-def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_with_a_hysteresis():
+def test_drives_of_any_length_are_independent_and_force_trust_has_hysteresis():
     drives = [
         dugoff_drive(seconds, seed).without_references()
         for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))
@@ -114,11 +117,7 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     )
     estimator = estimator_with(inputs)
     batch = estimator.estimate([drive.without_references()])[0]
-    stepper = estimator.online()
-    online = [
-        stepper.step({name: drive[name][k] for name in estimator.channels})
-        for k in range(len(drive))
-    ]
+    online = online_rows(estimator, drive)
     for name in ("vy", "yaw_rate"):
         np.testing.assert_allclose([row[name] for row in online], batch[name], rtol=0.0, atol=1e-9)
     assert np.isfinite(batch["sideslip"]).all()
@@ -132,7 +131,7 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     )
 
 
-def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
+def test_correlated_errors_count_as_fewer_measurements_and_states_are_restored():
     drive = dugoff_drive(2.0, 7).without_references()
     first = estimator_with().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
     assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
@@ -165,7 +164,7 @@ def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
     assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5
 
 
-def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_scored():
+def test_levels_come_from_moving_samples_and_are_tuned_on_the_scored_reference():
     drive = dugoff_drive(12.0, straight=4.0)
     is_standing = np.arange(1200) >= 700
     quiet = {
@@ -197,7 +196,9 @@ def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_
 
 
 def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
-    """Going on identifies again; a network trained behind half a search would then meet another filter."""
+    """Going on identifies again; a network trained behind half a search would then meet another
+    filter.
+    """
     drives = [dugoff_drive(3.0)]
     estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
     before = {
@@ -236,7 +237,7 @@ def test_stages_search_wide_bounds_and_then_close_to_the_best():
     assert search.cost == search.starts[:, -1].min()
 
 
-def test_what_makes_no_sense_or_is_not_installed_is_refused(monkeypatch):
+def test_invalid_settings_and_missing_packages_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     drives = [dugoff_drive(2.0)]
     with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):

@@ -1,4 +1,6 @@
-"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing, trainings that start from others."""
+"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing,
+trainings that start from others.
+"""
 
 import math
 from dataclasses import fields
@@ -10,7 +12,7 @@ from refusals import refusal
 
 import vehest
 from conftest import flat_weights, planar_drive
-from every_estimator import drive_for, fitted
+from every_estimator import drive_for, fitted, online_rows
 from vehest.configuration.composition import compose_config
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
@@ -25,7 +27,7 @@ fitted_once = cache(fitted)
 OF_A_DTYPE = [
     name
     for name in estimator_names()
-    if "dtype" in {own.name for own in fields(estimator_class(name).training_type)}
+    if "dtype" in {field.name for field in fields(estimator_class(name).training_type)}
 ]
 
 
@@ -72,13 +74,9 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     drive = drive_for(estimator)
     estimate = estimator.estimate([drive])[0]
     batch = estimate["vy"]
-    stepper = estimator.online()
-    assert stepper.horizon_steps == estimator.horizon_steps
-    steps = [
-        stepper.step({channel: drive[channel][k] for channel in drive.channels})
-        for k in range(len(drive))
-    ]
-    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in steps])[
+    assert estimator.online().horizon_steps == estimator.horizon_steps
+    steps = online_rows(estimator, drive, drive.channels)
+    online = np.array([math.nan] * estimator.horizon_steps + [row["vy"] for row in steps])[
         : len(drive)
     ]
     assert np.array_equal(np.isnan(online), np.isnan(batch))
@@ -111,7 +109,7 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 
 @pytest.mark.parametrize("size", [0, 40, -8])
-def test_truncated_weights_are_one_clear_error(tmp_path, size):
+def test_truncated_weights_are_a_clear_error(tmp_path, size):
     assert "holds no model" in refusal(lambda: load_model(tmp_path), MissingError)
     save_model(fitted_once("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
@@ -119,7 +117,7 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
     assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
-def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(
+def test_wrong_rate_missing_channel_gaps_and_unknown_names_are_refused(
     drive,
 ):
     estimator = fitted_once("ksnn", "float64")
@@ -143,7 +141,7 @@ def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_
     )
 
 
-def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
+def test_models_of_other_versions_are_refused_and_unversioned_ones_load(tmp_path, monkeypatch):
     estimator = fitted_once("luenberger", "float64")
     save_model(estimator, tmp_path)
     description = tmp_path / "model.yaml"
@@ -158,7 +156,7 @@ def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, m
     assert load_model(tmp_path).gain == estimator.gain
 
 
-def test_a_number_that_is_given_is_not_fitted(drive):
+def test_configured_numbers_are_not_fitted(drive):
     estimator = estimator_class("luenberger").from_config({"gain": 7.0})
     assert estimator.n_parameters == 1
     estimator.fit(FitData([drive], [drive]), DirectSearchSettings(grid=2, max_evaluations=10))
@@ -166,7 +164,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
     assert estimator.threshold >= 0.0
 
 
-def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
+def test_recordings_start_from_individual_or_shared_states(monkeypatch, drive):
     assert "no state to start from" in refusal(
         lambda: fitted_once("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError
     )
@@ -181,8 +179,8 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
     estimates = estimator.estimate([drive, drive], states)
     for state, estimate in zip(states, estimates, strict=True):
         assert np.array_equal(estimate["vy"], estimator.estimate([drive], state)[0]["vy"])
-    from_one_state = estimator.estimate([drive, drive], states[0])
-    assert np.array_equal(from_one_state[0]["vy"], from_one_state[1]["vy"])
+    from_shared_state = estimator.estimate([drive, drive], states[0])
+    assert np.array_equal(from_shared_state[0]["vy"], from_shared_state[1]["vy"])
     assert "2 initial states for 1 recordings" in refusal(
         lambda: estimator.estimate([drive], states)
     )
@@ -290,7 +288,7 @@ OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=fal
 NO_TRAINING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
-def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
+def test_training_without_epochs_keeps_the_start_and_foreign_settings_are_refused():
     from vehest.inference.models import pretrained_folder
 
     drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
@@ -318,7 +316,7 @@ def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_
         )
 
 
-def test_the_model_counts_as_an_input_and_is_found_by_name(place):
+def test_models_are_inputs_and_are_resolved_by_name(place):
     common = ("estimator=ksnn", "split=mine", "training.max_epochs=1", "tracking=none", *OF_SHIPPED)
     assert place("train", *common)[0] == 0
     code, out, _ = place("train", *common, "training.start_from=pretrained")

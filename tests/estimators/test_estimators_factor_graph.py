@@ -1,4 +1,6 @@
-"""The factor graph against sparse least squares over its factors, and against a filter with the same noise."""
+"""The factor graph against sparse least squares over its factors, and against a filter with the
+same noise.
+"""
 
 from dataclasses import replace
 
@@ -8,6 +10,7 @@ from refusals import refusal
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
+from every_estimator import online_rows
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
@@ -31,7 +34,9 @@ def drive_with_gaps(seconds=2.0):
 
 
 def least_squares(estimator, drive, first, last, start, deviation):
-    """States first … last by sparse least squares over the equations that factors stand for, (last - first + 1, 2)."""
+    """States first … last by sparse least squares over the equations that factors stand for, (last
+    - first + 1, 2).
+    """
     noise = estimator.settings.noise
     A, B, C, D = estimator.sampled_model(drive["vx"])
     entries = []
@@ -79,7 +84,7 @@ def states_of(estimate):
     return np.stack([estimate["sideslip"], estimate["yaw_rate"]], axis=1)
 
 
-def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_long_one():
+def test_factor_graph_equals_least_squares_and_the_filter_over_a_long_window():
     estimator = factor_graph()
     drive = drive_with_gaps(12.0)
     expected = least_squares(estimator, drive, 0, len(drive) - 1, np.zeros(2), 100.0)
@@ -108,13 +113,7 @@ def test_it_is_least_squares_over_the_drive_or_its_window_and_the_filter_over_a_
 def test_online_skips_gaps_as_batch_does_and_believes_a_state_handed_over():
     estimator = factor_graph(window=0.1)
     drive = drive_with_gaps()
-    stepper = estimator.online()
-    online = np.array(
-        [
-            stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
-            for k in range(len(drive))
-        ]
-    )
+    online = np.array([row["vy"] for row in online_rows(estimator, drive)])
     assert np.abs(online - estimator.estimate([drive])[0]["vy"]).max() < 1e-9
     drive = linear_drive(1.0)[0]
     for window in (None, 0.05):

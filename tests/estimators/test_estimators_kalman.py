@@ -1,4 +1,6 @@
-"""The Kalman filter over the single track: consistent on its own model, honest about where its noise levels come from."""
+"""The Kalman filter over the single track: consistent on its own model, honest about where its
+noise levels come from.
+"""
 
 from dataclasses import replace
 
@@ -6,6 +8,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 
+from every_estimator import online_rows
 from single_track_drive import NOISE, linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import FitData
@@ -13,14 +16,14 @@ from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_levels import high_passed_level
 from vehest.training.context import NoTraining
 
-GIVEN_NOISE = {"noise": {**NOISE, "steer_factor": 1.0}}
+CONFIGURED_NOISE = {"noise": {**NOISE, "steer_factor": 1.0}}
 
 
 def kalman(**config):
     return estimator_class("kalman").from_config(config)
 
 
-def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recording_itself():
+def test_levels_are_those_of_high_passed_training_or_recording_signals():
     drives = [linear_drive(60.0, seed=seed, noise={**NOISE, "steer": 1e-3})[0] for seed in (1, 2)]
     estimator = kalman()
     assert "has not been fitted yet" in refusal(lambda: estimator.online(), ConfigurationError)
@@ -46,12 +49,12 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
     assert "cannot run along with a drive" in refusal(lambda: offline.online(), ConfigurationError)
 
 
-def test_levels_that_are_given_are_not_read_and_need_no_training():
+def test_configured_levels_are_not_read_and_need_no_training():
     estimator = kalman(noise={"ay": 0.7})
     estimator.fit(FitData([linear_drive(60.0)[0]], []), NoTraining())
     assert estimator.values["ay"] == 0.7
     assert estimator.n_parameters == 2
-    estimator = kalman(**GIVEN_NOISE)
+    estimator = kalman(**CONFIGURED_NOISE)
     assert (estimator.learns, estimator.causal, estimator.variant) == (
         False,
         True,
@@ -63,10 +66,12 @@ def test_levels_that_are_given_are_not_read_and_need_no_training():
 
 
 def test_samples_that_are_missing_are_skipped():
-    """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it knows less."""
+    """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it
+    knows less.
+    """
     drive, states = linear_drive(30.0, seed=5)
     gappy = with_gaps(drive, {"ay": slice(1000, 1200), "yaw_rate": slice(1100, 1200)})
-    estimator = kalman(**GIVEN_NOISE)
+    estimator = kalman(**CONFIGURED_NOISE)
     estimate = estimator.estimate([gappy])[0]
     complete = estimator.estimate([drive])[0]
     assert np.array_equal(estimate["vy"][:1000], complete["vy"][:1000])
@@ -84,26 +89,28 @@ def test_samples_that_are_missing_are_skipped():
 
 def test_speed_and_steering_may_not_be_missing():
     with pytest.raises(DataError, match="'vx' is nan, which estimator 'kalman' cannot take"):
-        kalman(**GIVEN_NOISE).online().step(
+        kalman(**CONFIGURED_NOISE).online().step(
             {"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0}
         )
     with pytest.raises(DataError, match="channel 'steer' has gaps"):
-        kalman(**GIVEN_NOISE).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
+        kalman(**CONFIGURED_NOISE).estimate(
+            [with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})]
+        )
     assert "no channel 'steer'" in refusal(
-        lambda: kalman(**GIVEN_NOISE).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
+        lambda: kalman(**CONFIGURED_NOISE).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
     )
 
 
 def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():
     drive = linear_drive(20.0, seed=6)[0]
     slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
-    estimate = kalman(**GIVEN_NOISE).estimate(
+    estimate = kalman(**CONFIGURED_NOISE).estimate(
         [type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)]
     )[0]
     assert np.isfinite(estimate["vy"]).all()
     assert np.isfinite(estimate.covariance).all()
     drive = linear_drive(2.0)[0]
-    estimate = kalman(**GIVEN_NOISE).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
+    estimate = kalman(**CONFIGURED_NOISE).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
     assert estimate["vy"][0] == pytest.approx(2.0, abs=1e-3)
     assert estimate["yaw_rate"][0] == pytest.approx(-0.3, abs=1e-6)
 
@@ -114,16 +121,18 @@ def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed()
         (
             "steer",
             np.zeros(3000),
-            "'linear': channel 'steer' has no noise that could be read off it; give estimator.noise.steer",
+            "'linear': channel 'steer' has no noise that could be read off it; give "
+            "estimator.noise.steer",
         ),
         (
             "ay",
             np.full(3000, np.nan),
-            "channel 'ay': 75 samples without a gap are needed to read a noise level; give estimator.noise.ay",
+            "channel 'ay': 75 samples without a gap are needed to read a noise level; give "
+            "estimator.noise.ay",
         ),
     ],
 )
-def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
+def test_unreadable_levels_are_a_clear_error(name, samples, message):
     drive = linear_drive(30.0)[0]
     wrong = type(drive)(
         "linear",
@@ -152,8 +161,10 @@ def with_planted_offsets(seed, ay, steer):
 
 
 def augmented(drive, ay, steer, seconds):
-    """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
-    A, B, C, D = kalman(**GIVEN_NOISE).sampled_model(drive["vx"])
+    """β, r and two offsets filtered by the textbook's equations, all matrices written out: means
+    (T, 4), covariances (T, 4, 4).
+    """
+    A, B, C, D = kalman(**CONFIGURED_NOISE).sampled_model(drive["vx"])
     decay = np.exp(-0.01 / seconds)
     mean = np.zeros(4)
     covariance = np.diag([1e4, 1e4, ay**2, steer**2])
@@ -192,19 +203,15 @@ OFFSETS = {"ay": 0.6, "steer": 0.01, "seconds": 100.0}
 def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     drive, _ = with_planted_offsets(3, 0.6, 0.01)
     means, covariances = augmented(drive, **OFFSETS)
-    estimator = kalman(**GIVEN_NOISE, offsets=OFFSETS)
+    estimator = kalman(**CONFIGURED_NOISE, offsets=OFFSETS)
     samples = drive.stack(estimator.channels)
     filtered = estimator.filter_samples(samples, estimator.first_gaussian(samples[0], {}))
     assert filtered.mean == pytest.approx(means, abs=1e-8)
     assert filtered.covariance == pytest.approx(covariances[:, :2, :2], abs=1e-8)
     assert estimator.estimate([drive])[0]["yaw_rate"] == pytest.approx(means[:, 1], abs=1e-8)
-    estimator = kalman(**GIVEN_NOISE, offsets=OFFSETS, gate=5.0)
+    estimator = kalman(**CONFIGURED_NOISE, offsets=OFFSETS, gate=5.0)
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
     drive, _ = with_planted_offsets(1, 0.6, 0.01)
-    stepper = estimator.online()
     batch = estimator.estimate([drive])[0]
-    online = [
-        stepper.step({name: drive[name][k] for name in estimator.channels})["vy"]
-        for k in range(len(drive))
-    ]
+    online = [row["vy"] for row in online_rows(estimator, drive)]
     assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9

@@ -1,4 +1,6 @@
-"""Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again, bad input survived."""
+"""Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again,
+bad input survived.
+"""
 
 import importlib.util
 
@@ -42,7 +44,9 @@ def drive():
 
 
 def readable(estimator, samples):
-    """The extended filter of the same model, with Jacobians from automatic differentiation, step by step."""
+    """The extended filter of the same model, with Jacobians from automatic differentiation, step by
+    step.
+    """
     first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
     return extended_filter(
         rational_model(estimator),
@@ -52,7 +56,7 @@ def readable(estimator, samples):
     )
 
 
-def test_slopes_and_peak_of_the_rational_tyre_are_those_of_differentiation_and_closed_form():
+def test_rational_tyre_slopes_and_peak_match_differentiation_and_closed_form():
     values = torch.tensor([0.06, np.log(0.008), np.log(7e4), np.log(0.7)], dtype=torch.float64)
     axle_force = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
     slopes = torch.func.jacrev(
@@ -103,19 +107,27 @@ def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
         )
 
 
+def filtered_as_readable(estimator, samples):
+    """The compiled filter's result, whose means and last covariance are the readable filter's."""
+    ours = estimator.filter_samples(samples)
+    theirs = readable(estimator, samples).filtered
+    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
+    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    return ours
+
+
 @pytest.mark.parametrize("unstable", [False, True])
 def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
-    """A bend of 15 s without measurements: with too soft a rear axle the model spins, of which no filter may be sure."""
+    """A bend of 15 s without measurements: with too soft a rear axle the model spins, of which no
+    filter may be sure.
+    """
     curves = {**CURVES, "c2_rear": (0.5 if unstable else 1.0) * CURVES["c2_rear"]}
     estimator = rational("rational", curves=curves)
     count = round(15.0 * estimator.settings.rate_hz)
     samples = np.full((count, 4), np.nan)
     samples[:, 1] = 25.0
     samples[:, 3] = 0.02
-    ours = estimator.filter_samples(samples)
-    theirs = readable(estimator, samples).filtered
-    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
-    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    ours = filtered_as_readable(estimator, samples)
     unscented = rational("rational", curves=curves, filter="unscented").filter_samples(samples)
     for filtered in (ours, unscented):
         begun_anew = np.isclose(filtered.deviation[1:, 0], 0.05) & (filtered.mean[1:, 2] == 0.0)
@@ -124,15 +136,14 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
 
 
 @pytest.mark.parametrize("tyres", KINDS)
-def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_forms(tyres, drive):
-    """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
+def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres, drive):
+    """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what
+    they were.
+    """
     estimator = rational(tyres, largest_sideslip=np.radians(1.5))
     short = drive.cut(0.0, 8.0)
     samples = short.stack(estimator.channels)
-    ours = estimator.filter_samples(samples)
-    theirs = readable(estimator, samples).filtered
-    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
-    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    ours = filtered_as_readable(estimator, samples)
     free = rational(tyres).filter_samples(samples).mean
     assert np.abs(free[:, 0]).max() > np.radians(1.5)
     assert np.mean(np.abs(ours.mean[:, 0]) > np.radians(1.5)) < np.mean(
@@ -169,8 +180,10 @@ def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncerta
     assert (extended["nis_dof"] == 2).all()
 
 
-def test_changed_tyres_and_friction_are_found_and_help():
-    """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and half the error of fixed tyres."""
+def test_changed_tyres_and_friction_are_identified_and_reduce_the_error():
+    """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and
+    half the error of fixed tyres.
+    """
     worn = rational_drive(120.0, seed=2, stiffness=0.85)
     adaptive = rational().estimate([worn])[0]
     fixed = rational("rational").estimate([worn])[0]
@@ -192,8 +205,10 @@ def test_changed_tyres_and_friction_are_found_and_help():
     )
 
 
-def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(drive):
-    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
+def test_tyre_states_are_constant_straight_ahead_and_adapt_in_bends(drive):
+    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no
+    longer moves them.
+    """
     estimator = rational(adapt_above=2.0)
     filtered = estimator.filter_samples(drive.stack(estimator.channels))
     before = filtered.mean[:-1, 4:]
@@ -218,14 +233,15 @@ def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(d
     )
 
 
-def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_the_start(drive):
+def test_tyre_parameters_stay_inside_bounds_wider_than_the_initial_uncertainty(drive):
     absurd = changed(drive, {"ay": -3.0 * drive["ay"], "yaw_rate": 2.0 * drive["yaw_rate"]})
     for tyres in ("linear", "rational_adaptive", "rational_friction"):
         estimator = rational(tyres, bound=1.5, noise={**LEVEL, "tyres": 0.5})
         states = estimator.filter_samples(absurd.stack(estimator.channels)).mean[:, 4:]
         assert np.abs(states).max() == pytest.approx(np.log(1.5)), "the bound is reached"
         assert (np.abs(states) <= np.log(1.5)).all()
-    # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations.
+    # With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard
+    # deviations.
     wide = rational(curves={**CURVES, "deviation": 0.5})
     narrow = rational()
     assert wide.model().bounds[4:] == pytest.approx([1.5] * 4)
@@ -233,7 +249,7 @@ def test_tyre_parameters_stay_inside_bounds_that_lie_outside_what_is_known_at_th
 
 
 @pytest.mark.parametrize("kind", ["extended", "unscented"])
-def test_a_car_that_stands_or_reverses_rolls_without_slip_and_its_tyres_are_held(kind, drive):
+def test_standing_and_reversing_cars_roll_without_slip_and_adapt_no_tyres(kind, drive):
     vx = np.interp(drive.time[:200], [0, 3, 5, 7, 10], [20.0, 0.0, 0.0, -2.0, 20.0])
     slow = changed(drive.cut(0.0, 10.0), {"vx": vx, "steer": np.full(200, 0.1)})
     estimator = rational(filter=kind)
@@ -280,8 +296,10 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
 
 
 @pytest.mark.parametrize("fault", ["slip", "force"])
-def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerometer_is_off(fault):
-    """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals show neither."""
+def test_stiffness_intervals_cover_the_truth_with_offset_sensors(fault):
+    """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals
+    show neither.
+    """
     drive = rational_drive(60.0, seed=4)
     wrong = {
         "slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)},
@@ -293,7 +311,7 @@ def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerom
         assert abs(record.metrics[name] - CURVES[name]) < record.metrics[f"{name}_interval"]
 
 
-def test_levels_of_the_unscented_filter_are_found_through_the_extended_one_within_limits():
+def test_unscented_levels_are_searched_through_the_extended_filter_within_limits():
     train = rational_drive(30.0, seed=9)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert estimator.fit(FitData([train], []), QUICK).metrics["levels_at_limits"] == 0
@@ -334,7 +352,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
     )
 
 
-def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
+def test_levels_of_the_data_need_no_search_and_full_settings_no_fit():
     train = rational_drive(30.0, seed=6)
     estimator = estimator_class("rational_ekf").from_config({"noise": {"tyres": 0.02}})
     record = estimator.fit(FitData([train], []), NoiseTuningSettings(method="data"))
@@ -352,7 +370,7 @@ def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():
 @pytest.mark.skipif(
     importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'"
 )
-def test_optuna_finds_the_minimum_for_its_seed_and_levels_in_their_box_that_get_better():
+def test_optuna_reaches_the_minimum_and_improves_levels_within_their_box():
     train = rational_drive(30.0, seed=9)
     few_trials, many_trials = (
         estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2)

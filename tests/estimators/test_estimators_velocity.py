@@ -1,4 +1,6 @@
-"""Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting states, long drives."""
+"""Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting
+states, long drives.
+"""
 
 import numpy as np
 import pytest
@@ -52,10 +54,12 @@ def _phase(estimator, training, train, validation):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(
+def test_validation_loss_is_the_weighted_squared_error_without_dropped_samples(
     name,
 ):
-    """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
+    """Sequences of 100 samples from the start of the drive on, each estimated by itself through the
+    public interface.
+    """
     estimator = _estimator(name)
     record = estimator.fit(DATA, QUICK)
     errors = []
@@ -71,7 +75,9 @@ def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_d
 
 @pytest.mark.parametrize("name", NAMES)
 def test_error_in_dropped_samples_teaches_nothing(name):
-    """References that differ only where every possible sequence drops its samples lead to the same weights."""
+    """References that differ only where every possible sequence drops its samples lead to the same
+    weights.
+    """
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
     complete = _drive(seed=1)
     spoilt = {
@@ -116,7 +122,7 @@ def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(t
     assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
-def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropout_keeps_the_mean():
+def test_sequences_start_at_random_within_recordings_and_dropout_keeps_the_mean():
     estimator = _estimator("velocity_gru")
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, QUICK, recordings, recordings[:1])
@@ -145,7 +151,9 @@ def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropou
 
 
 def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
-    """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
+    """Pieces of both drives, padded, their stretches in order: rows that count are the drives'
+    rows, each once, in whatever order.
+    """
     training = SequenceSettings(
         PhaseSettings(max_epochs=1),
         60,
@@ -172,7 +180,10 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
-    """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
+    """Losses of stretches are those of the sequence as a whole.
+
+    The second stretch's gradient is that of a start that is a constant.
+    """
     training = SequenceSettings(
         PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1
     )
@@ -201,7 +212,7 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
         assert torch.allclose(first, second, rtol=1e-3, atol=1e-6)
 
 
-def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
+def test_mirrored_sequences_change_the_sign_of_lateral_quantities():
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
     estimator = _estimator("velocity_lstm")
     drives = _drives(estimator, DATA.train[:1])
@@ -248,7 +259,10 @@ def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name, monk
 
 
 def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
-    """h, c by the gates written out; then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64."""
+    """h, c by the gates written out.
+
+    Then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64.
+    """
     estimator = _estimator("velocity_lstm", n_dense=5)
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     w = estimator.weights()
@@ -291,15 +305,17 @@ def test_lstm_follows_its_equations_and_networks_have_the_papers_sizes():
     )
 
 
-def test_recordings_too_short_or_with_gaps_are_one_clear_error():
+def test_recordings_too_short_or_with_gaps_are_a_clear_error():
     with pytest.raises(
         DataError,
-        match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it",
+        match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, "
+        r"'drive 2' 50; lower it",
     ):
         _estimator("velocity_gru").fit(DATA, SequenceSettings())
     with pytest.raises(
         DataError,
-        match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60",
+        match=r"'drive 2' is 50 samples long: too short to validate on with "
+        r"training\.dropped_steps 60",
     ):
         _estimator("velocity_gru").fit(
             FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60)

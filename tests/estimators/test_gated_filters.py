@@ -1,4 +1,7 @@
-"""Filters with a gate: a spike does no harm, a jump is followed, online is batch; a step that raises leaves any stepper as it was."""
+"""Filters with a gate: a spike does no harm, a jump is followed, online is batch.
+
+A step that raises leaves any stepper as it was.
+"""
 
 import math
 from dataclasses import replace
@@ -49,7 +52,10 @@ EVERY_FILTER = pytest.mark.parametrize("name", CONFIGS)
 
 
 def estimator(name, gate=None):
-    """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
+    """As it starts to learn, which is enough for filtering.
+
+    Weights are the same with a gate and without.
+    """
     gated = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
     gated.seed(0)
     if name in ("ensemble_ukf", "cnn_ukf"):
@@ -64,7 +70,7 @@ def estimator(name, gate=None):
 
 @cache
 def drive(name):
-    """Two drives one after the other, as if the car had jumped from the one motion into the other."""
+    """Two drives one after the other, as if the car had jumped from one motion to another."""
     first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
     return replace(
         first,
@@ -107,7 +113,10 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
     gated = estimator("cnn_ukf", 6.0)
     pseudo_of = gated.pseudo_of
     at = round(SPIKE * 100.0)
-    sure = lambda inputs: pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
+
+    def sure(inputs):
+        return pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))
+
     monkeypatch.setattr(gated, "pseudo_of", sure)
     clean = vy(gated, drive("cnn_ukf"))
 
@@ -124,7 +133,7 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
 
 
 @EVERY_FILTER
-def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name):
+def test_gated_estimates_recover_after_a_jump_of_the_truth(name):
     gated = vy(estimator(name, 6.0), drive(name))
     free = vy(estimator(name), drive(name))
     back = round((JUMP + 3.0) * drive(name).rate_hz)
@@ -133,7 +142,7 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
 
 
 @EVERY_FILTER
-def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(
+def test_gate_that_refuses_nothing_changes_only_the_name_of_the_variant(
     name,
 ):
     assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
@@ -166,7 +175,7 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
         assert n_accepted[round(SPIKE * recording.rate_hz)] < n_accepted.max()
 
 
-def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
+def test_gates_share_trainings_of_learned_filters_and_need_none_otherwise():
     with pytest.raises(
         ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"
     ):
@@ -230,7 +239,7 @@ def motion(steps):
         *product(FILTERS, (infinite,)),
     ],  # others take an infinite value
 )
-def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
+def test_steps_after_a_refused_step_are_unaffected_by_it(name, wrong):
     stepper = ready(name)
     samples = rows(name)
     calm = stepper.online()

@@ -30,7 +30,10 @@ STRUCTURES = [
 
 
 def _problem(estimator, dtype, members=3, batch=70):
-    """Parameters of several members, windows of each, and the series; batch is no multiple of the lanes."""
+    """Parameters of several members, windows of each, and the series.
+
+    Batch is no multiple of the lanes.
+    """
     drive = planar_drive()
     network = estimator.network_for([drive]).to(dtype)
     windows = windows_of([drive], estimator.channels, "vy_ref", 30)
@@ -58,7 +61,7 @@ def _problem(estimator, dtype, members=3, batch=70):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2e-5)])
 @pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
-def test_compiled_recursion_equals_plain_one(estimator, dtype, tolerance):
+def test_compiled_recursion_equals_the_plain_recursion(estimator, dtype, tolerance):
     value_and_gradient = _problem(estimator, dtype)
     (value, gradient) = value_and_gradient(True)
     (plain_value, plain_gradient) = value_and_gradient(False)
@@ -109,8 +112,11 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
         torch.set_num_threads(before)
 
 
-def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
-    """Yaw rates at centres, between them and beyond the last one; the lanes of a block are in different local models."""
+def test_compiled_ksnn_matches_at_and_beyond_its_centres():
+    """Yaw rates at centres, between them and beyond the last one.
+
+    The lanes of a block are in different local models.
+    """
     estimator = Ksnn(Ksnn.settings_type(n_local=4, n_hidden=2, bias=True))
     drive = planar_drive()
     network = estimator.network_for([drive]).double()
@@ -191,7 +197,7 @@ def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones()
     assert np.allclose(angle, np.arctan(exact), rtol=3e-7, atol=0)
 
 
-def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshold():
+def test_compiled_observer_matches_and_resets_below_the_threshold():
     drive = planar_drive(20.0, 100.0, noise=0.02)
     measurements = drive.stack(("yaw_rate", "vx", "ay", "ax"))
     vy = np.empty(len(drive))
@@ -206,7 +212,7 @@ def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshol
     assert (vx == 20.0).all()
 
 
-def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch, tmp_path):
+def test_group_of_jobs_keeps_matrix_products_on_a_single_thread(monkeypatch, tmp_path):
     n_threads = []
 
     def threads():

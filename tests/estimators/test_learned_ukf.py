@@ -1,4 +1,4 @@
-"""The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
+"""The learned filter as an estimator: candidates, starts, dropouts, members, and refusals."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
-from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
+from vehest.estimators.filtering.car_filter import MIN_ENTROPY
 from vehest.estimators.learned_ukf import SHORT, LearnedUkf
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
@@ -25,10 +25,13 @@ SENSORS = ("ax", "ay", "yaw_rate", "motor_speed", "steer", "motor_current")
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 
 
-def quick(epochs=1, one_step=40, dtype="float64", **changes):
+def quick(epochs=1, single_step=40, dtype="float64", **changes):
     phases = {
         "one_step": PhaseSettings(
-            learning_rate=1e-2, max_epochs=one_step, validate_every=one_step, schedule="cosine"
+            learning_rate=1e-2,
+            max_epochs=single_step,
+            validate_every=single_step,
+            schedule="cosine",
         ),
         "through": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
         "noise": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
@@ -48,28 +51,28 @@ def data():
 
 
 def estimator(family=LearnedUkf, **config):
-    made = family.from_config({"width": 16} | config)
-    made.seed(0)
-    return made
+    created = family.from_config({"width": 16} | config)
+    created.seed(0)
+    return created
 
 
 @cache
 def trained(dtype="float64"):
     """NNTF_UH, trained for a moment; tests leave it as it is."""
-    made = estimator()
+    ukf = estimator()
     drives = FitData(
         [small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)]
     )
-    made.fit(drives, quick(3, 200, dtype=dtype, one_step_batch=256))
-    return made
+    ukf.fit(drives, quick(3, 200, dtype=dtype, one_step_batch=256))
+    return ukf
 
 
 def drive(seed=3, seconds=6.0):
     return small_car_drive(seconds, seed).without_references()
 
 
-def online(made, recording):
-    stepper = made.online()
+def online(ukf, recording):
+    stepper = ukf.online()
     names = (*SENSORS, "vx")
     rows = [
         stepper.step({name: float(recording[name][k]) for name in names})
@@ -92,24 +95,25 @@ def test_variants_are_called_and_parameters_counted_as_in_the_paper():
     assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {
         name: name for name in cases
     }
-    # A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state.
-    made = estimator_class("learned_ukf").from_config({})
-    assert made.settings == LearnedUkf.settings_type()
+    # A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of
+    # its dependence on the state.
+    ukf = estimator_class("learned_ukf").from_config({})
+    assert ukf.settings == LearnedUkf.settings_type()
     network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
-    assert made.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
+    assert ukf.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
     assert torch.get_default_dtype() == torch.float32
 
 
 @pytest.mark.parametrize("dynamics", SHORT)
 def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
-    made = estimator(
+    ukf = estimator(
         dynamics=dynamics,
         noise="constant" if dynamics == "pacejka" else "state_dependent",
         through_filter=dynamics != "residual",
     )
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
-    record = made.fit(
-        short, quick(one_step=2, steps=40, validation_steps=60, validation_drop_steps=10)
+    record = ukf.fit(
+        short, quick(single_step=2, steps=40, validation_steps=60, validation_drop_steps=10)
     )
     assert record.metrics["epochs"] == 3
     assert record.history["epoch"] == [1, 2, 3], (
@@ -118,7 +122,7 @@ def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
     assert record.history["phase"] == [0, 0, 1]
     assert record.metrics["skipped_steps"] == 0
     assert record.metrics["best_validation_loss"] <= record.metrics["start_validation_loss"] < 10.0
-    estimate = made.estimate([small_car_drive(1.0, 3).without_references()])[0]
+    estimate = ukf.estimate([small_car_drive(1.0, 3).without_references()])[0]
     assert estimate.covariance_of == ("vx", "vy", "yaw_rate", "rim_speed", "friction")
     assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
     assert all(
@@ -128,7 +132,9 @@ def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
 
 
 def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training():
-    """A sliding car's lateral velocity to less than half of its deviation, which a filter that calls it zero does not reach."""
+    """A sliding car's lateral velocity to less than half of its deviation, which a filter that
+    calls it zero does not reach.
+    """
     recording = small_car_drive(6.0, 3)
     start = {name: float(recording[reference][0]) for name, reference in REFERENCES.items()}
     estimate = trained().estimate([recording.without_references()], start)[0]
@@ -138,13 +144,13 @@ def test_it_estimates_an_unseen_drive_from_any_start_after_a_moment_of_training(
             0.5 * recording["vy_ref"].std() if name == "vy" else 0.3
         ), name
     recording = drive()
-    free, given = (
+    free, started = (
         trained().estimate([recording], state)[0]
         for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5})
     )
-    assert abs(given["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
-    assert given.covariance[0, 1, 1] < free.covariance[0, 1, 1]
-    assert abs(given["vy"][-1] - free["vy"][-1]) < 0.02
+    assert abs(started["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
+    assert started.covariance[0, 1, 1] < free.covariance[0, 1, 1]
+    assert abs(started["vy"][-1] - free["vy"][-1]) < 0.02
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
@@ -160,34 +166,39 @@ def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
 
 
 def test_members_that_differ_in_the_start_of_friction_share_their_training():
-    one = estimator()
-    other = estimator(start_friction=0.4)
+    first_ukf = estimator()
+    second_ukf = estimator(start_friction=0.4)
     third = estimator(repair=False)
     assert (
-        one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
+        first_ukf.batch_key
+        == second_ukf.batch_key
+        == third.batch_key
+        != estimator(noise="constant").batch_key
     )
-    told = []
+    messages = []
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
     LearnedUkf.fit_members(
-        [one, other, third],
+        [first_ukf, second_ukf, third],
         short,
-        quick(one_step=2, steps=40, validation_steps=60),
-        FitContext(on_progress=told.append),
+        quick(single_step=2, steps=40, validation_steps=60),
+        FitContext(on_progress=messages.append),
     )
-    assert len(told) == 3, "the epochs of one training"
-    for name, values in one.weights().items():
-        assert np.array_equal(values, other.weights()[name]), name
-    first = [made.estimate([drive(seconds=1.0)])[0]["friction"][0] for made in (one, other)]
+    assert len(messages) == 3, "the epochs of one training"
+    for name, values in first_ukf.weights().items():
+        assert np.array_equal(values, second_ukf.weights()[name]), name
+    first = [
+        ukf.estimate([drive(seconds=1.0)])[0]["friction"][0] for ukf in (first_ukf, second_ukf)
+    ]
     assert first == pytest.approx([0.6, 0.4], abs=0.03)
-    assert (one.filter.repair, third.filter.repair) == (True, False)
+    assert (first_ukf.filter.repair, third.filter.repair) == (True, False)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
-    whole = drive()
+    complete = drive()
     estimate, undisturbed = (
         trained().estimate([recording])[0]
-        for recording in (with_gaps(whole, {sensor: slice(200, 250)}), whole)
+        for recording in (with_gaps(complete, {sensor: slice(200, 250)}), complete)
     )
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip"):
         assert np.isfinite(estimate[name]).all(), name
@@ -199,7 +210,7 @@ def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
+def test_estimates_from_pure_noise_stay_finite_and_bounded(dtype):
     """20 s of nothing but noise, with the deviations and worse of a wild drive."""
     generator = np.random.default_rng(0)
     scales = {
@@ -223,13 +234,13 @@ def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
     assert min(estimate["vx"].min(), estimate["friction"].min()) >= 0.05 - 1e-6
 
 
-def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
+def test_weights_and_drives_that_do_not_fit_are_a_clear_error():
     assert "do not fit its settings: 'dynamics.network.0.bias'" in refusal(
         lambda: estimator(width=8).load_weights(trained().weights())
     )
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(
-        DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"
+        DataError, match="has no channel 'vx_ref', on which estimator 'learned_ukf' is trained"
     ):
         estimator().fit(FitData([missing], [missing]), quick())
     gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})
@@ -247,42 +258,44 @@ def test_curvature_is_of_pacejkas_tyres_alone():
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])
 def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
     full = estimator(noise=noise)
-    made = estimator(noise=noise, correlated_noise=False)
-    for own in (full, made):
-        own.fit(data(), quick(3, one_step=3))
-    assert made.variant == f"{full.variant}_diagonal"
+    diagonal = estimator(noise=noise, correlated_noise=False)
+    for ukf in (full, diagonal):
+        ukf.fit(data(), quick(3, single_step=3))
+    assert diagonal.variant == f"{full.variant}_diagonal"
     state = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]], dtype=torch.float64)
     inputs = torch.zeros(1, 2, dtype=torch.float64)
-    for own, is_diagonal in ((made, True), (full, False)):
-        for part in (own.filter.process_noise, own.filter.observation_noise):
+    for ukf, is_diagonal in ((diagonal, True), (full, False)):
+        for part in (ukf.filter.process_noise, ukf.filter.observation_noise):
             with torch.no_grad():
                 covariance = part(state, inputs)[0]
             assert bool((covariance == covariance.diagonal().diag()).all()) == is_diagonal
             assert (torch.linalg.eigvalsh(covariance) > 0).all()
     start = estimator(noise=noise, correlated_noise=False)
     start.filter.to(torch.float64).begin_noise(
-        [made.drive(own, torch.float64) for own in data().train], 0.2
+        [diagonal.drive(ukf, torch.float64) for ukf in data().train], 0.2
     )
     with torch.no_grad():
-        moved = made.filter.process_noise(state, inputs) - start.filter.process_noise(state, inputs)
+        moved = diagonal.filter.process_noise(state, inputs) - start.filter.process_noise(
+            state, inputs
+        )
     assert (moved[0].diagonal().abs() > 0).all(), "the diagonal has learnt"
-    each = (1 + 5 + 1) if noise == "state_dependent" else 1
-    assert full.n_parameters - made.n_parameters == each * (10 + 6), (
+    n_outputs = (1 + 5 + 1) if noise == "state_dependent" else 1
+    assert full.n_parameters - diagonal.n_parameters == n_outputs * (10 + 6), (
         "entries off the diagonals of 5 and 4 rows"
     )
 
 
 def test_diagonal_noise_in_use_is_that_of_its_training():
     """The compiled noise of filters at work against the module's own."""
-    made = estimator(correlated_noise=False)
-    made.fit(data(), quick(2, one_step=3))
+    ukf = estimator(correlated_noise=False)
+    ukf.fit(data(), quick(2, single_step=3))
     states = np.random.default_rng(0).normal(size=(4, 5))
-    process, observation = made.filter.noise_at()
+    process, observation = ukf.filter.noise_at()
     nothing = torch.zeros(4, 2, dtype=torch.float64)
     with torch.no_grad():
-        expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
+        expected = ukf.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
         of_process = with_entropy(
-            made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY
+            ukf.filter.process_noise(torch.from_numpy(states), nothing), MIN_ENTROPY
         ).numpy()
     np.testing.assert_allclose(
         covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0
@@ -294,20 +307,23 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
 
 def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
     plain = {"dynamics": "pacejka", "noise": "constant", "through_filter": False}
-    one = estimator(**plain)
-    other = estimator(curvature=True, **plain)
-    assert other.n_parameters == one.n_parameters + 3
+    plain_ukf = estimator(**plain)
+    curved_ukf = estimator(curvature=True, **plain)
+    assert curved_ukf.n_parameters == plain_ukf.n_parameters + 3
     state = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]])
     inputs = torch.tensor([[0.1, 8.0]])
     with torch.no_grad():
         torch.testing.assert_close(
-            other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6
+            curved_ukf.filter.moved(state, inputs),
+            plain_ukf.filter.moved(state, inputs),
+            rtol=0,
+            atol=1e-6,
         )
     with pytest.raises(ConfigurationError, match="cannot be exported to C"):
-        other.c_values()
-    other.fit(
+        curved_ukf.c_values()
+    curved_ukf.fit(
         FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)]),
-        quick(one_step=5, steps=40, validation_steps=60),
+        quick(single_step=5, steps=40, validation_steps=60),
     )
-    assert other.variant == "pc_curved"
-    assert (other.filter.dynamics.tyres.curvature.detach().abs() > 0).all()
+    assert curved_ukf.variant == "pc_curved"
+    assert (curved_ukf.filter.dynamics.tyres.curvature.detach().abs() > 0).all()

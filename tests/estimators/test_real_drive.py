@@ -1,4 +1,7 @@
-"""What has to come out on the real recording of the Ferrari 250 LM; skipped where it is not at hand."""
+"""What has to come out on the real recording of the Ferrari 250 LM.
+
+Skipped where it is not at hand.
+"""
 
 import numpy as np
 import pytest
@@ -50,7 +53,10 @@ def test_short_training_of_the_linear_ksnn_beats_the_luenberger_observer(ferrari
 
 
 def _estimate_of_drive(name, recording, **config):
-    """Figures over the whole recording by the common protocol; nothing of it was learnt from or tuned on."""
+    """Figures over the whole recording by the common protocol.
+
+    Nothing of it was learnt from or tuned on.
+    """
     estimator = estimator_class(name).from_config(config)
     assert not estimator.learns
     span = Span(SPAN.dataset, SPAN.recording)
@@ -58,14 +64,15 @@ def _estimate_of_drive(name, recording, **config):
     return accuracy([score(estimate, Resample(20.0)(recording), span, Protocol(20.0))])
 
 
-def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(
+def test_kalman_filter_and_factor_graph_reproduce_the_published_ferrari_drive(
     ferrari,
 ):
     """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""
     assert _estimate_of_drive("kalman", ferrari, noise={"read_from": "recording"})[
         "rmse_sideslip"
     ] == pytest.approx(0.87, abs=0.05)
-    # Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter.
+    # Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than
+    # the Kalman filter.
     batch = _estimate_of_drive("factor_graph", ferrari)["rmse_sideslip"]
     window = _estimate_of_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
     assert batch == pytest.approx(0.57, abs=0.02)

@@ -1,4 +1,6 @@
-"""Networks over single samples: compiled layers, masks of dropout, members that do not touch each other, and the feed-forward network."""
+"""Networks over single samples: compiled layers, masks of dropout, members that do not touch each
+other, and the feed-forward network.
+"""
 
 from dataclasses import replace
 
@@ -149,7 +151,7 @@ def test_a_member_learns_the_same_alone():
         assert torch.equal(joint.grad[1:2], single.grad)
 
 
-def test_masks_hide_their_share_and_follow_from_the_seed_and_what_is_missing_is_said():
+def test_masks_hide_their_share_by_the_seed_and_missing_samples_are_marked():
     mask = active_mask(1, 0, (400, 250), 0.2)
     assert abs(mask.mean() - 205 / 256) < 3 * np.sqrt(0.2 * 0.8 / mask.size)
     assert np.array_equal(mask, active_mask(1, 0, (400, 250), 0.2))
@@ -161,7 +163,7 @@ def test_masks_hide_their_share_and_follow_from_the_seed_and_what_is_missing_is_
     drive = dugoff_drive(2.0)
     with pytest.raises(
         DataError,
-        match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu",
+        match=r"'fx_fl', on which estimator 'sideslip_ffnn' is trained; set estimator.inputs=imu",
     ):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
 

@@ -1,4 +1,6 @@
-"""Every numeric setting at its extremes: refused in one line, or the estimator runs to finite numbers within the guard's bound."""
+"""Every numeric setting at its extremes: refused in one line, or the estimator runs to finite
+numbers within the guard's bound.
+"""
 
 import math
 from contextlib import suppress
@@ -86,14 +88,14 @@ def test_an_extreme_setting_is_refused_or_its_estimate_is_bounded(name):
     assert n_runs or len(settings) < 5
 
 
-def _require_bounded(estimator, drive, what):
+def _require_bounded(estimator, drive, description):
     samples = {channel: drive[channel] for channel in estimator.channels}
     estimate = GuardedRun(estimator)(samples, drive)
     is_valid = estimate["health"] != INVALID
     is_valid[: estimator.warm_up_steps + estimator.horizon_steps + 1] = False
     limits = limits_for(estimator, None)
     bound = limits.largest_tan_sideslip * limits.top_speed
-    assert (np.abs(estimate["vy"][is_valid]) <= bound).all(), what
+    assert (np.abs(estimate["vy"][is_valid]) <= bound).all(), description
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_fit_finds_the_curves_of_a_car_that_has_such_curves(kind):
     assert (fit.interval / CURVES[kind] < 0.1).all()
 
 
-def test_without_noise_the_forces_are_those_of_the_car_and_refusals_say_what_to_do():
+def test_forces_without_noise_are_those_of_the_car_and_refusals_name_the_remedy():
     clean = drive(noise=0.0)
     motion = axle_motion([clean], TRUCK)
     for curve, slip, force in zip(CURVES["rational"], motion.slip, motion.force, strict=True):
@@ -111,8 +111,10 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
     assert 0.7 < np.mean(inside) <= 1.0
 
 
-def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
-    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
+def test_priors_of_road_tyres_remain_where_drives_do_not_reach_the_bend():
+    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the
+    drive says.
+    """
     fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
     assert (
         np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - ROAD_TYRE_LOG_C1[0])

@@ -1,4 +1,6 @@
-"""Scores of bands, covariances, innovations, delays and misses of detections against closed forms and simulations."""
+"""Scores of bands, covariances, innovations, delays and misses of detections against closed forms
+and simulations.
+"""
 
 import math
 from dataclasses import replace
@@ -59,7 +61,10 @@ def part_of(rng, seconds=100.0, deviation=0.1):
 
 
 def test_interval_score_of_a_gaussian_matches_its_closed_form():
-    """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ; each side misses with the same."""
+    """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ.
+
+    Each side misses with the same.
+    """
     errors = np.random.default_rng(0).standard_normal(400_000)
     for level in (0.5, 0.9):
         z = stats.norm.ppf(0.5 + 0.5 * level)
@@ -76,10 +81,14 @@ def test_interval_score_of_a_gaussian_matches_its_closed_form():
     assert scores[1] == min(scores)
 
 
+def crps_of_gaussian(z):
+    """σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) at σ = 1 (Gneiting & Raftery 2007, Eq. 21)."""
+    return z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+
+
 def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
-    """Sample by sample against σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) (Gneiting & Raftery 2007, Eq. 21)."""
     z = np.linspace(-5.0, 5.0, 2001)
-    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    exact = crps_of_gaussian(z)
     scores = crps_of_levels(z, np.tile(GAUSSIAN, (len(z), 1)), LEVELS)
     np.testing.assert_allclose(scores[np.abs(z) < 2.0], exact[np.abs(z) < 2.0], atol=0.045)
     weight = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
@@ -87,7 +96,7 @@ def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
     assert weight @ scores == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
     levels = np.arange(0.002, 0.9999, 0.002)
     z = np.linspace(-2.0, 2.0, 41)
-    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    exact = crps_of_gaussian(z)
     half = np.tile(stats.norm.ppf(0.5 + 0.5 * levels), (len(z), 1))
     np.testing.assert_allclose(crps_of_levels(z, half, levels.tolist()), exact, atol=1e-3)
 
@@ -103,8 +112,11 @@ def test_intraclass_correlation_of_planted_variances():
     assert math.isnan(intraclass_correlation(values, np.zeros(len(values), dtype=int)))
 
 
-def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
-    """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
+def test_coverage_intervals_contain_the_truth_with_correlated_blocks():
+    """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9.
+
+    Three standard errors are 0.015.
+    """
     rng = np.random.default_rng(3)
     n_covered = 0
     for _ in range(2000):
@@ -115,7 +127,7 @@ def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
     assert n_covered / 2000 >= 0.95 - 0.015
 
 
-def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count():
+def test_interval_of_full_coverage_matches_single_sample_blocks_and_counts_edges():
     low, high = proportion_interval(np.full(10, 50.0), np.full(10, 50.0))
     assert low == pytest.approx(0.025 ** (1.0 / 10.0))  # Clopper & Pearson for 10 of 10
     assert high == 1.0
@@ -126,7 +138,7 @@ def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count
     assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75
 
 
-def test_true_bands_cover_what_they_say():
+def test_true_bands_have_their_nominal_coverage():
     rng = np.random.default_rng(4)
     parts = [part_of(rng), part_of(rng)]
     banded_errors = banded(parts, BANDS)
@@ -182,7 +194,7 @@ def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
     }
 
 
-def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
+def test_figures_by_lateral_acceleration_omit_rare_ranges():
     part = part_of(np.random.default_rng(5))
     names = {
         "ay_0_2": (0.0, 2.0),
@@ -215,7 +227,9 @@ DRIVES = [linear_drive(60.0, seed=seed)[0] for seed in range(3)]
 
 
 def figures_of_kalman(factor):
-    """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor`` times what it is."""
+    """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor``
+    times what it is.
+    """
     noise = {name: factor * level for name, level in NOISE.items()} | {"steer_factor": 1.0}
     estimator = estimator_class("kalman").from_config({"noise": noise})
     estimates = estimator.estimate([drive.without_references() for drive in DRIVES])
@@ -227,7 +241,7 @@ def figures_of_kalman(factor):
     return accuracy(parts)
 
 
-def test_a_kalman_filter_is_consistent_on_its_own_model_and_not_with_half_the_noise():
+def test_kalman_filter_is_consistent_with_true_but_not_with_half_the_noise():
     right = figures_of_kalman(1.0)
     sure = figures_of_kalman(0.5)
     assert right["nees"] == pytest.approx(1.0, abs=0.1)

@@ -1,4 +1,6 @@
-"""Floors of a drive against closed forms, the information form of the bound, filters at work, and planted noise."""
+"""Floors of a drive against closed forms, the information form of the bound, filters at work, and
+planted noise.
+"""
 
 import math
 from dataclasses import replace
@@ -44,7 +46,10 @@ def noisy_reference(sigma, seconds=400.0, ay_noise=0.0, seed=3):
 
 
 def single_track_drive(seconds=300.0, seed=0):
-    """A car on its axles: v from yaw rate and the rear axle's slip, with slow errors; ax, ay with offset and noise; steering."""
+    """A car on its axles: v from yaw rate and the rear axle's slip, with slow errors.
+
+    Ax, ay with offset and noise; steering.
+    """
     generator = np.random.default_rng(seed)
     n = round(seconds * RATE)
     time = np.arange(n) / RATE
@@ -103,7 +108,10 @@ def test_white_noise_of_a_reference_is_estimated_within_a_few_per_cent():
 
 
 def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
-    """Swings at 2 Hz have third differences like noise; ay and yaw rate tell that they were driven."""
+    """Swings at 2 Hz have third differences like noise.
+
+    Ay and yaw rate tell that they were driven.
+    """
     time = np.arange(4000) / RATE
     v = 0.2 * np.sin(4 * np.pi * time)
     r = 0.1 * np.cos(4 * np.pi * time)
@@ -154,7 +162,9 @@ def random_model(steps, n=4, m=2, seed=1):
 
 
 def test_bound_is_that_of_tichavsky_and_others():
-    """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
+    """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 =
+    Q⁻¹ + CᵀR⁻¹C.
+    """
     model, prior = random_model(200)
     bound = posterior_bound(model, prior)
     inverse_Q = np.linalg.inv(model.process_noise)
@@ -198,8 +208,10 @@ def test_bound_of_a_long_drive_is_the_same_in_chunks(
     assert 0 < floor.sideslip < 104
 
 
-def test_white_and_slow_noise_are_told_apart_and_their_times_found():
-    """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2 that lasts 8 s."""
+def test_white_and_correlated_noise_are_distinguished():
+    """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2
+    that lasts 8 s.
+    """
     generator = np.random.default_rng(4)
     n = 48_000
     noise = split_noise([markov(generator, n, 0.2, 8.0) + 0.3 * generator.standard_normal(n)], RATE)
@@ -244,7 +256,9 @@ def test_kinematics_tell_v_by_accelerations_in_bends_alone():
 
 
 def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
-    """Drives drawn from v⁺ = φ v + ξ, ay = dv/dt + uω + offset + noise: an optimal filter's error is the bound's, to a few per cent."""
+    """Drives drawn from v⁺ = φ v + ξ, ay = dv/dt + uω + offset + noise: an optimal filter's error
+    is the bound's, to a few per cent.
+    """
     generator = np.random.default_rng(7)
     n = 6000
     step = 1.0 / RATE

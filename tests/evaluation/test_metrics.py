@@ -1,4 +1,6 @@
-"""Metrics, best lever arms and indicators over manoeuvres against their definitions on series whose errors are known."""
+"""Metrics, best lever arms and indicators over manoeuvres against their definitions on series whose
+errors are known.
+"""
 
 import math
 from dataclasses import replace
@@ -74,7 +76,7 @@ def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
     assert figures["rmse_sideslip"] == pytest.approx(math.sqrt((3.0**2 + 20.0**2) / 2))
 
 
-def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
+def test_scoring_starts_after_warm_up_at_speed_without_offset(drive):
     part = Scored(
         drive.time,
         drive["vy_ref"] + 0.5,
@@ -129,7 +131,7 @@ def test_weighted_metrics_match_a_hand_calculation():
     assert "there is none of yaw_rate" in refusal(lambda: weighted_errors(with_vx, np.square))
 
 
-def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
+def test_faster_estimates_use_the_latest_past_sample(drive):
     """A 100 Hz estimate is read at 20 Hz at the same instant; one that starts late is held."""
     times = np.arange(0, 60, 0.01)
     estimate = _estimate(times, times.copy(), 100.0, 0.0)

@@ -1,4 +1,6 @@
-"""Blocks, intervals of single figures, and who may be called best, on errors whose outcome is known."""
+"""Blocks, intervals of single figures, and who may be called best, on errors whose outcome is
+known.
+"""
 
 import numpy as np
 import pytest
@@ -44,7 +46,7 @@ def coloured(generator, n, memory=0.95):
     )[400:]
 
 
-def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
+def test_segments_reproduce_the_metrics(tmp_path):
     generator = np.random.default_rng(0)
     parts = [scored(0.1 * coloured(generator, n), coloured(generator, n)) for n in (330, 95)]
     segments = segments_of(parts, RATE)
@@ -71,7 +73,9 @@ def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
 
 
 def with_stop(part, seconds=12.0):
-    """The same range with a stop at its end, in which sideslip is not scored and its error is 90 degrees."""
+    """The same range with a stop at its end, in which sideslip is not scored and its error is 90
+    degrees.
+    """
     n = round(seconds * RATE)
     columns = {"vy": 0.0, "vy_ref": 0.0, "sideslip": np.pi / 2, "sideslip_ref": 0.0, "ay": 0.0}
     stopped = {
@@ -116,7 +120,9 @@ def test_a_stop_changes_no_ranking_and_no_interval_of_sideslip():
 
 @pytest.mark.parametrize("memory", [0.3, 0.5, 0.9, 0.95])
 def test_block_length_is_that_of_another_library(memory):
-    """Which begins to look for insignificant autocorrelations one lag earlier than the paper says, and so has a window wider by two."""
+    """Which begins to look for insignificant autocorrelations one lag earlier than the paper says,
+    and so has a window wider by two.
+    """
     values = np.square(coloured(np.random.default_rng(7), 900, memory))
     expected = float(optimal_block_length(values)["circular"].iloc[0])
     covariances = _pooled_covariances([values])
@@ -127,7 +133,7 @@ def test_block_length_is_that_of_another_library(memory):
     assert politis_white_length([values]) == _length(covariances, window, 900)
 
 
-def test_many_ranges_are_blocks_few_are_cut_and_equal_values_are_blocks_of_their_own():
+def test_blocks_are_ranges_where_many_and_cuts_where_few():
     generator = np.random.default_rng(1)
     many_ranges = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
     assert list(block_labels(many_ranges, many_ranges.squared_error_vy[None])) == [

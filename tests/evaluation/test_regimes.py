@@ -1,4 +1,6 @@
-"""Regimes of a drive against one whose every sample is known, and their errors against those of all samples."""
+"""Regimes of a drive against one whose every sample is known, and their errors against those of all
+samples.
+"""
 
 import csv
 import json
@@ -18,7 +20,9 @@ ALL = Protocol(RATE, 0.0, 0.0)
 
 
 def stepped_drive():
-    """Ten seconds straight ahead, ten in a circle at 3 m/s², ten at 7 m/s², with steep ramps of 1.2 s and 1.5 s between."""
+    """Ten seconds straight ahead, ten in a circle at 3 m/s², ten at 7 m/s², with steep ramps of 1.2
+    s and 1.5 s between.
+    """
     time = np.arange(600) / RATE
     ay = np.interp(time, [0, 10, 11.2, 20, 21.5, 30], [0, 0, 3, 3, 7, 7])
     vy = 0.1 * np.sin(time)
@@ -39,7 +43,7 @@ def estimate_with(recording, error):
     )
 
 
-def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
+def test_regimes_are_detected_where_the_drive_has_them():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     assert tuple(masks) == REGIMES
     for group in (("straight", "turning"), tuple(AY_BANDS), ("transient", "steady")):
@@ -54,7 +58,7 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     assert masks["steady"][(time < 9.7) | ((time > 11.5) & (time < 19.7)) | (time > 21.8)].all()
 
 
-def test_regimes_of_a_range_are_those_of_the_whole_drive():
+def test_regimes_of_a_range_equal_those_of_the_full_drive():
     regimes = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     cut = regimes_of(stepped_drive(), Span("d", "steps", 5.0, 20.5), Protocol(RATE, 0.0, 1.5))
     for name, mask in cut.items():

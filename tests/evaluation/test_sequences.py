@@ -1,4 +1,6 @@
-"""Ranges cut into sequences, each estimated anew, from the reference state where the protocol says so."""
+"""Ranges cut into sequences, each estimated anew, from the reference state where the protocol says
+so.
+"""
 
 import csv
 from pathlib import Path

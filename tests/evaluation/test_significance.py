@@ -23,7 +23,9 @@ LENGTH = 100
 
 
 def losses(generator, n_seeds, seed_level=0.0, has_seed_noise=False):
-    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own, and a level of each seed."""
+    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own,
+    and a level of each seed.
+    """
     white = generator.standard_normal((n_seeds if has_seed_noise else 1, N_SEQUENCES, LENGTH))
     noise = signal.lfilter([1.0], [1.0, -0.95], white, axis=2)
     return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
@@ -46,7 +48,7 @@ def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_se
     assert 0.91 <= median <= 0.99
 
 
-def test_shift_is_significant_and_one_lucky_training_of_three_is_not():
+def test_shift_is_significant_and_a_single_lucky_training_is_not():
     generator = np.random.default_rng(2)
     hard = np.repeat(20.0 * generator.random(N_SEQUENCES), LENGTH)
     first, second = (hard + losses(generator, 3, 0.1) for _ in range(2))
@@ -64,7 +66,7 @@ def test_shift_is_significant_and_one_lucky_training_of_three_is_not():
     )
 
 
-def test_one_seed_and_white_noise_are_a_paired_t_test():
+def test_single_seed_and_white_noise_give_a_paired_t_test():
     generator = np.random.default_rng(3)
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
@@ -80,7 +82,7 @@ def test_one_seed_and_white_noise_are_a_paired_t_test():
     assert result.mean.p_value == pytest.approx(expected.pvalue, rel=0.1)
 
 
-def test_equal_losses_do_not_differ_and_one_block_is_refused():
+def test_equal_losses_do_not_differ_and_a_single_block_is_refused():
     losses_of_both = np.arange(10.0)[None]
     result = compared(losses_of_both, losses_of_both, [2, 1, 2, 2, 2, 1])
     assert result.mean.dof == 6 - 1
@@ -102,7 +104,10 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch)
 
 
 def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds():
-    """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
+    """Welch-Satterthwaite of one part of the variance: its own degrees of freedom.
+
+    Of two equal ones: their sum.
+    """
     sizes = np.ones(40)
     even = np.full((3, 40), 0.0)
     seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]
@@ -124,7 +129,9 @@ def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds():
 
 
 def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
-    """Expected squared error of the mean, worked out from the variances that the values are drawn with."""
+    """Expected squared error of the mean, worked out from the variances that the values are drawn
+    with.
+    """
     rng = np.random.default_rng(2)
     deviations = {"blocks": 0.5, "seeds": 0.3, "single": 0.8}
     n_seeds = 4
@@ -146,7 +153,7 @@ def test_variance_of_a_mean_over_blocks_and_seeds_is_that_of_crossed_factors():
     assert 0.92 < covered / 2000 < 0.98
 
 
-def test_mean_of_one_seed_has_student_s_interval():
+def test_mean_of_a_single_seed_has_the_student_interval():
     values = np.random.default_rng(3).normal(size=(1, 9))
     contrast = mean_contrast(values)
     test = stats.ttest_1samp(values[0], 0.0)
@@ -157,7 +164,7 @@ def test_mean_of_one_seed_has_student_s_interval():
     assert paired.p_value == pytest.approx(expected.pvalue)
 
 
-def test_paired_seeds_leave_out_what_both_trainings_share():
+def test_paired_seeds_cancel_the_shared_variation():
     rng = np.random.default_rng(4)
     shared = rng.normal(size=(3, 1))
     first = shared + 0.1 * rng.normal(size=(3, 20))

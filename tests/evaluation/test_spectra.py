@@ -1,4 +1,6 @@
-"""Periodograms against signals whose spectra are known, and the process noise against what was planted."""
+"""Periodograms against signals whose spectra are known, and the process noise against what was
+planted.
+"""
 
 from dataclasses import replace
 
@@ -19,7 +21,10 @@ RATE = 20.0
 
 
 def test_density_of_white_noise_is_its_variance_over_the_band():
-    """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
+    """σ² spread evenly over 0 to 10 Hz.
+
+    The mean of 255 lines over n segments scatters by about 1/sqrt(255 n).
+    """
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
     density = periodogram([noise], RATE)
     assert density.density[1:-1].mean() == pytest.approx(
@@ -62,7 +67,8 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
         atol=1e-9,
     )
     assert shrunk == pytest.approx(0.98, abs=0.005)
-    # The central difference of a drive that obeys the kinematics errs by a sixth of the third derivative, 3e-4 m/s² here.
+    # The central difference of a drive that obeys the kinematics errs by a sixth of the third
+    # derivative, 3e-4 m/s² here.
     drive = planar_drive()
     assert np.abs(process_noise(drive)).max() < 1e-3
     tilted = replace(drive, channels={**drive.channels, "ay": drive["ay"] - 0.1})

@@ -50,7 +50,10 @@ class Library:
     precision: str
 
     def __call__(self, rows):
-        """Outputs (T, 4) in the order of `OUTPUTS` and whether each step went well (T,); a lost method starts anew."""
+        """Outputs (T, 4) in the order of `OUTPUTS` and whether each step went well (T,).
+
+        A lost method starts anew.
+        """
         dtype = np.float64 if self.precision == "double" else np.float32
         rows = np.ascontiguousarray(rows, dtype)
         out = np.empty((len(rows), 4), dtype)

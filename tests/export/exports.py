@@ -1,4 +1,6 @@
-"""Exports of every family: fitted for a moment, with limits, health and bands, written, built and run."""
+"""Exports of every family: fitted for a moment, with limits, health and bands, written, built and
+run.
+"""
 
 import shutil
 import subprocess
@@ -39,14 +41,16 @@ SECONDS = 120.0  # after which a program is taken to hang
 
 def tool(name):
     """A compiler or an emulator; the test is skipped without it."""
-    found = shutil.which(name)
-    if found is None:
+    path = shutil.which(name)
+    if path is None:
         pytest.skip(f"{name} is not installed")
-    return found
+    return path
 
 
 WELL_CONDITIONED = {"learned_ukf": {"dynamics": "pacejka", "noise": "constant"}}
-"""Variants that do not amplify rounding: two seconds of training leave the learnt noise ill-conditioned, so that a last digit grows."""
+"""Variants that do not amplify rounding: two seconds of training leave the learnt noise
+ill-conditioned, so that a last digit grows.
+"""
 
 
 @cache
@@ -59,15 +63,17 @@ def drive(estimator, seed, seconds=40.0):
     if "motor_current" in estimator.channels:
         return small_car_drive(seconds, seed)
     if "steer" in estimator.channels:
-        own = linear_drive(seconds, rate, seed, {"yaw_rate": 0.005, "ay": 0.2, "steer": 0.0005})[0]
+        recording = linear_drive(
+            seconds, rate, seed, {"yaw_rate": 0.005, "ay": 0.2, "steer": 0.0005}
+        )[0]
     else:
-        own = planar_drive(seconds, rate, seed=seed, noise=0.02)
+        recording = planar_drive(seconds, rate, seed=seed, noise=0.02)
     generator = np.random.default_rng(seed)
     return replace(
-        own,
+        recording,
         channels={
-            name: values + 1e-3 * generator.standard_normal(len(own))
-            for name, values in own.channels.items()
+            name: values + 1e-3 * generator.standard_normal(len(recording))
+            for name, values in recording.channels.items()
         },
     )
 
@@ -78,10 +84,15 @@ def trust(name):
     estimator = model(name)
     drives = [drive(estimator, seed) for seed in (1, 2)]
     rate = estimator.settings.rate_hz
-    own = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
+    band = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
     about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
     bands = Bands(
-        *about, estimator.channels, estimator.horizon_steps, LARGEST, own, replace(own, floor=0.001)
+        *about,
+        estimator.channels,
+        estimator.horizon_steps,
+        LARGEST,
+        band,
+        replace(band, floor=0.001),
     )
     health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
@@ -174,16 +185,20 @@ class Export:
         return self.compared()
 
     def compared(self):
-        """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
-        own, wanted = (
+        """The largest difference of vy, sideslip and both bands, and how many rows have another
+        health or, in double, reason.
+        """
+        computed, expected = (
             np.genfromtxt(self.folder / name, delimiter=",", skip_header=1)
             for name in ("out.csv", "expected.csv")
         )
         # an offset and a scale of one lone channel are the same to the last digits
         judged = slice(4, None if self.precision == "double" else 5)
-        same = (own[:, judged] == wanted[:, judged]).all(1)
-        assert (np.isnan(own[same]) == np.isnan(wanted[same])).all()
-        return np.nanmax(np.abs(own - wanted)[same][:, :4], axis=0, initial=0.0), int((~same).sum())
+        is_equal = (computed[:, judged] == expected[:, judged]).all(1)
+        assert (np.isnan(computed[is_equal]) == np.isnan(expected[is_equal])).all()
+        return np.nanmax(np.abs(computed - expected)[is_equal][:, :4], axis=0, initial=0.0), int(
+            (~is_equal).sum()
+        )
 
 
 def command(words, folder, seconds=SECONDS):

@@ -1,4 +1,6 @@
-"""What an export takes: bytes of state, code and tables, and the worst case of its stack, as compilers that are there say it."""
+"""What an export takes: bytes of state, code and tables, and the worst case of its stack, as
+compilers that are there say it.
+"""
 
 import re
 import shutil
@@ -55,7 +57,10 @@ class Footprint:
 
 
 def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
-    """What files, name -> text, take on a target, main.c aside; None where there is no compiler for it, or it cannot say."""
+    """What files, name -> text, take on a target, main.c aside.
+
+    None where there is no compiler for it, or it cannot say.
+    """
     if target.compiler is None:
         return None
     with tempfile.TemporaryDirectory() as temporary:
@@ -91,10 +96,10 @@ def _run(command: list[str], folder: Path) -> str:
     ).stdout
 
 
-def _sections(said: str) -> tuple[int, int, int]:
+def _sections(text: str) -> tuple[int, int, int]:
     """Bytes of code, constants and variables, from what ``size -A`` says of objects."""
     code = tables = data = 0
-    for words in (line.split() for line in said.splitlines()):
+    for words in (line.split() for line in text.splitlines()):
         if len(words) < 3 or not words[1].isdigit():
             continue
         name = words[0]
@@ -109,15 +114,18 @@ def _sections(said: str) -> tuple[int, int, int]:
 
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``; functions that are called and absent."""
-    own = {}
+    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``.
+
+    Functions that are called and absent.
+    """
+    stack_of = {}
     calls = {}
-    known = set()
+    functions = set()
     for graph in graphs:
         for title, label in _NODE.findall(graph):
-            known.add(title)
-            if found := _STACK.search(label):
-                own[title] = int(found[1])
+            functions.add(title)
+            if match := _STACK.search(label):
+                stack_of[title] = int(match[1])
         for source, target in _EDGE.findall(graph):
             calls.setdefault(source, set()).add(target)
 
@@ -125,9 +133,9 @@ def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tup
         if function in above:
             raise RecursionError(f"{function} calls itself")
         below = (deepest(inner, (*above, function)) for inner in calls.get(function, ()))
-        return own.get(function, 0) + max(below, default=0)
+        return stack_of.get(function, 0) + max(below, default=0)
 
     stack = max(deepest(entry, ()) for entry in entries)
     return stack, tuple(
-        sorted(name for name in known - own.keys() if not name.startswith("__indirect"))
+        sorted(name for name in functions - stack_of.keys() if not name.startswith("__indirect"))
     )

@@ -1,4 +1,7 @@
-"""Golden files: the C of models with weights set by hand. `python tests/export/golden.py` writes them anew after a wanted change."""
+"""Golden files: the C of models with weights set by hand.
+
+`python tests/export/golden.py` writes them anew after a wanted change.
+"""
 
 import re
 import sys
@@ -67,7 +70,7 @@ def trust_by_hand():
         heaviest=((10.0, 20.0, 30.0),),
         limits=tuple(4.0 + 0.25 * number for number in range(22)),
     )
-    own = {
+    channel_limits = {
         name: ChannelLimits(max(-size, CHANNELS[name].low), size, size / 4.0, 0.5)
         for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)
     }
@@ -78,7 +81,7 @@ def trust_by_hand():
     bands = Bands(
         ("car",), ("set",), ("a",), ("b",), "range", 10, 100.0, channels, 0, LARGEST, v, angle
     )
-    return Trust(About("kinematic"), bands, GuardLimits(own, 120.0, 1.0), health)
+    return Trust(About("kinematic"), bands, GuardLimits(channel_limits, 120.0, 1.0), health)
 
 
 def methods(families):
@@ -106,23 +109,27 @@ def sources():
 
 
 def differences(text, golden):
-    """Where a text is another than the golden one; numbers may differ in their last digits, as they do between machines."""
+    """Where a text is another than the golden one.
+
+    Numbers may differ in their last digits, as they do between machines.
+    """
     ours = text.splitlines()
     theirs = golden.splitlines()
     if len(ours) != len(theirs):
         return [f"{len(ours)} lines instead of {len(theirs)}"]
     return [
-        f"line {at}: {own} instead of {other}"
-        for at, (own, other) in enumerate(zip(ours, theirs, strict=True), 1)
-        if not _alike(own, other)
+        f"line {at}: {ours_line} instead of {golden_line}"
+        for at, (ours_line, golden_line) in enumerate(zip(ours, theirs, strict=True), 1)
+        if not _lines_agree(ours_line, golden_line)
     ]
 
 
-def _alike(own, other):
-    if NUMBER.sub("#", own) != NUMBER.sub("#", other):
+def _lines_agree(ours_line, golden_line):
+    if NUMBER.sub("#", ours_line) != NUMBER.sub("#", golden_line):
         return False
     numbers = [
-        [float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)
+        [float(number.rstrip("f")) for number in NUMBER.findall(line)]
+        for line in (ours_line, golden_line)
     ]
     return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
 

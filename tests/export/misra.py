@@ -1,4 +1,5 @@
-"""Rules of MISRA C:2012 that cppcheck finds broken in the C of all families with weights set by hand, counted.
+"""Rules of MISRA C:2012 that cppcheck finds broken in the C of all families with weights set by
+hand, counted.
 
 `python tests/export/misra.py` prints the counts of docs/export.md.
 """
@@ -30,11 +31,14 @@ def version():
     ).stdout.strip()
 
 
-def found(home):
-    """How often each rule is broken, and what cppcheck finds beside, a line each; the C is written into ``home``."""
+def cppcheck_findings(home):
+    """How often each rule is broken, and what cppcheck finds beside, a line each.
+
+    The C is written into ``home``.
+    """
     write(methods(FAMILIES) | contract(), home)
     rules = Counter()
-    others = []
+    further_findings = []
     for folder in sorted(home.iterdir()):
         words = [
             "cppcheck",
@@ -49,16 +53,16 @@ def found(home):
             f"-I{home / 'kinematic'}",
             *(str(path) for path in sorted(folder.glob("vehest_*.c"))),
         ]
-        said = subprocess.run(
+        report = subprocess.run(
             words, capture_output=True, text=True, check=True, timeout=600.0
         ).stderr
-        for line in said.splitlines():
-            kind, _, rest = line.partition(" ")
+        for line in report.splitlines():
+            kind, _, message = line.partition(" ")
             if kind.startswith("misra-c2012-"):
                 rules[kind.removeprefix("misra-c2012-")] += 1
             else:
-                others.append(f"{kind} {rest}")
-    return rules, others
+                further_findings.append(f"{kind} {message}")
+    return rules, further_findings
 
 
 def documented(text):
@@ -68,10 +72,10 @@ def documented(text):
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as home:
-        rules, others = found(Path(home))
+        rules, further_findings = cppcheck_findings(Path(home))
     for rule, count in sorted(
-        rules.items(), key=lambda own: [int(part) for part in own[0].split(".")]
+        rules.items(), key=lambda rule_count: [int(part) for part in rule_count[0].split(".")]
     ):
         print(f"| {rule} | {count} |")
-    for line in others:
+    for line in further_findings:
         print(line, file=sys.stderr)

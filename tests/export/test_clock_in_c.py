@@ -1,4 +1,6 @@
-"""A clock fault in C has the same consequences as in Python, at the same call, with the same reason."""
+"""A clock fault in C has the same consequences as in Python, at the same call, with the same
+reason.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +21,10 @@ FAULT_SECONDS = 2.0  # after which the clock resumes
 
 
 def stamped(export, kind):
-    """Write in.csv, a drive whose clock fails for a while, and expected.csv; the number of the faulted sample."""
+    """Write in.csv, a drive whose clock fails for a while, and expected.csv.
+
+    The number of the faulted sample.
+    """
     stepper = export.stepper()
     rate = stepper.input_rate_hz
     plain = drive(stepper.estimator, 5, 6.0)
@@ -46,9 +51,9 @@ def test_every_clock_fault_has_the_same_health_and_reason_as_in_python(tmp_path,
     export.build("gcc", "-O1")
     for kind in FAULTS + RATE_FAULTS + HARMLESS:
         first = stamped(export, kind)
-        largest, others = export.differences(["./main"])
+        largest, n_different = export.differences(["./main"])
         assert largest[:2].max() <= TOLERANCES["double"], kind
-        assert others == 0, kind
+        assert n_different == 0, kind
         if kind == "constant":
             out = np.genfromtxt(tmp_path / "out.csv", delimiter=",", skip_header=1)
             calls = round(0.2 * export.stepper().input_rate_hz)
@@ -61,6 +66,6 @@ def test_behind_the_front_end_clock_faults_agree_too(tmp_path, kind):
     export = Export("kinematic", "double", tmp_path, 250.0).write()
     export.build("gcc", "-O1")
     stamped(export, kind)
-    largest, others = export.differences(["./main"])
+    largest, n_different = export.differences(["./main"])
     assert largest.max() <= TOLERANCES["double"]
-    assert others == 0
+    assert n_different == 0

@@ -18,7 +18,7 @@ from vehest.trust.record import write_trust
 pytestmark = pytest.mark.export
 
 
-def test_an_export_builds_and_passes_its_own_vectors(tmp_path):
+def test_export_builds_and_passes_its_test_vectors(tmp_path):
     tool("make")
     tool("gcc")
     export_model(model("dugoff_ukf"), trust("dugoff_ukf"), tmp_path / "c", "float", 200.0)
@@ -31,7 +31,7 @@ def test_an_export_builds_and_passes_its_own_vectors(tmp_path):
     assert "| 2 | CHANNEL is frozen |" in readme
 
 
-def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path):
+def test_export_replaces_only_an_earlier_export(tmp_path):
     out = tmp_path / "c"
     export_model(model("zero"), trust("zero"), out)
     assert (out / "vehest_health.c").exists()
@@ -41,13 +41,13 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
     assert "holds 'mine.c', which is no part of an export" in refusal(
         lambda: export_model(model("zero"), None, out), ConfigurationError
     )
-    other = tmp_path / "project"
-    other.mkdir()
-    (other / "main.c").write_text("int main(void) { return 0; }")
+    foreign = tmp_path / "project"
+    foreign.mkdir()
+    (foreign / "main.c").write_text("int main(void) { return 0; }")
     assert "holds 'main.c'" in refusal(
-        lambda: export_model(model("zero"), None, other), ConfigurationError
+        lambda: export_model(model("zero"), None, foreign), ConfigurationError
     )
-    assert [path.name for path in other.iterdir()] == ["main.c"]
+    assert [path.name for path in foreign.iterdir()] == ["main.c"]
 
 
 @pytest.mark.parametrize(
@@ -58,26 +58,26 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
         ({"bus_rate_hz": float("nan")}, "too slow"),
     ],
 )
-def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, words):
+def test_refused_exports_leave_nothing(tmp_path, options, words):
     with pytest.raises(ConfigurationError, match=words):
         export_model(model("zero"), None, tmp_path / "c", **options)
     assert not list(tmp_path.iterdir())
 
 
 def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(tmp_path):
-    own = trust("kalman")
-    health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
+    kalman_trust = trust("kalman")
+    health = replace(kalman_trust.health, deviation=(*kalman_trust.health.deviation[:-1], 1e-9))
     with pytest.raises(
         ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"
     ):
-        export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
+        export_model(model("kalman"), replace(kalman_trust, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
     assert "cannot be exported" in refusal(
         lambda: export_model(fitted("factor_graph"), None, tmp_path / "c"), ConfigurationError
     )
 
 
-def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path):
+def test_export_command_accepts_a_model_folder_and_states_its_inputs(tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     save_model(model("kinematic"), folder)

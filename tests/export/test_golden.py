@@ -1,10 +1,12 @@
-"""A changed generator shows as a changed golden file, and counts of the rules of MISRA as other counts."""
+"""A changed generator shows as a changed golden file, and counts of the rules of MISRA as other
+counts.
+"""
 
 from pathlib import Path
 
 import pytest
 from exports import tool
-from misra import VERSION, documented, found, version
+from misra import VERSION, cppcheck_findings, documented, version
 
 from golden import FOLDER, differences, sources
 
@@ -12,14 +14,15 @@ pytestmark = pytest.mark.export
 
 
 def test_the_c_of_models_set_by_hand_is_that_of_the_golden_files():
-    found = sources()
-    for name, text in found.items():
+    files = sources()
+    for name, text in files.items():
         changed = differences(text, (FOLDER / name).read_text(encoding="utf-8"))
         assert not changed, (
-            f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look at what git shows"
+            f"{name}: {changed[0]}; if that is wanted, run python tests/export/golden.py and look "
+            f"at what git shows"
         )
-    held = {str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*") if path.is_file()}
-    assert held == set(found)
+    stored = {str(path.relative_to(FOLDER)) for path in FOLDER.rglob("*") if path.is_file()}
+    assert stored == set(files)
 
 
 def test_a_digit_beyond_the_ninth_is_no_change_and_any_other_is():
@@ -33,12 +36,12 @@ def test_each_broken_rule_is_explained_with_its_count(tmp_path):
     tool("cppcheck")
     if version() != VERSION:
         pytest.skip(f"{version()} counts otherwise than {VERSION}, whose counts are documented")
-    rules, others = found(tmp_path)
+    rules, further_findings = cppcheck_findings(tmp_path)
     if "-" in rules or not rules:
         pytest.skip("cppcheck has no MISRA addon")
     assert dict(rules) == documented(
         (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
     )
     assert not [
-        line for line in others if "whitened" not in line
+        line for line in further_findings if "whitened" not in line
     ]  # a triangle that is written before it is read, row by row

@@ -1,4 +1,6 @@
-"""A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
+"""A method in C says what Python's stepper says, sample by sample: gaps, restarts and float
+included.
+"""
 
 import copy
 from collections import namedtuple
@@ -15,6 +17,7 @@ from dugoff_drive import TYRES, driven
 from every_estimator import drive_for, fitted
 from example_package import forget_examples, install_examples
 from real_drives import real_drive
+from slide_drive import slide_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
@@ -73,8 +76,8 @@ pytestmark = [
 each_variant = pytest.mark.parametrize(
     "variant",
     VARIANTS,
-    ids=lambda own: "-".join(
-        [own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)]
+    ids=lambda variant: "-".join(
+        [variant[0], *(f"{key}={value}" for key, value in variant[1].items() if key not in TRACK)]
     ),
 )
 Case = namedtuple(
@@ -89,17 +92,21 @@ def case_of(name, config):
 
 @cache
 def _case(name, config):
-    given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
-    estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
+    settings = next(
+        variant for family, variant in VARIANTS if family == name and repr(variant) == config
+    )
+    estimator = (
+        of_dugoff(name, settings) if name in ON_DUGOFF else fitted(name, "float32", **settings)
+    )
     on_dugoff = name in ON_DUGOFF and np.stack(
-        [dugoff_channels()[own] for own in estimator.channels], axis=1
+        [dugoff_channels()[variant] for variant in estimator.channels], axis=1
     )
     rows = on_dugoff if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
 
 
 def of_dugoff(name, config):
-    """A filter with known tyres; a network with random weights, as sure of itself as a trained one."""
+    """A filter with known tyres, and a network with random weights and trained variances."""
     estimator = estimator_class(name).from_config(config)
     if isinstance(estimator, NetworkUkf):
         inputs = np.stack([dugoff_channels()[name] for name in estimator.network_inputs], 1)
@@ -118,7 +125,9 @@ def of_dugoff(name, config):
 
 @cache
 def dugoff_channels():
-    """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
+    """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with
+    all tyre forces.
+    """
     generator = np.random.default_rng(1)
     time = np.arange(1200) / 100.0
     n = len(time)
@@ -145,25 +154,27 @@ def dugoff_channels():
 
 def widened(estimator):
     """The same weights, computed in float64."""
-    own = copy.deepcopy(estimator)
-    if isinstance(own, Network):
-        own.network = own.network.double()
-    return own
+    double = copy.deepcopy(estimator)
+    if isinstance(double, Network):
+        double.network = double.network.double()
+    return double
 
 
 def disturbed(estimator, rows):
-    """One in twenty samples missing of what may be, and values on which a method without memory of them has to start anew."""
+    """One in twenty samples missing of what may be, and values on which a method without memory of
+    them has to start anew.
+    """
     rows = rows.copy()
     generator = np.random.default_rng(0)
     for name in estimator.skippable:
         if name in estimator.channels:
             rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
-    needed = [
+    required = [
         column for column, name in enumerate(estimator.channels) if name not in estimator.skippable
     ]
     at = 2 * len(rows) // 3
-    if needed and estimator.refuses:
-        rows[at, needed[0]] = np.nan
+    if required and estimator.refuses:
+        rows[at, required[0]] = np.nan
     elif isinstance(estimator, WindowedEstimator):
         rows[at, 0] = np.nan  # it leaves the window again
     if "infinite" in estimator.refuses:
@@ -172,32 +183,35 @@ def disturbed(estimator, rows):
 
 
 def stepped(estimator, rows):
-    """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
+    """What Python's stepper says, (T, 4), and whether it did, (T,).
+
+    After an error it starts anew.
+    """
     out = np.full((len(rows), len(OUTPUTS)), np.nan)
     fine = np.ones(len(rows), bool)
     stepper = estimator.online()
     for k, row in enumerate(rows):
         try:
-            found = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
+            estimate = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
         except DataError:
             fine[k] = False
             stepper = estimator.online()
             continue
-        out[k] = [found.get(name, np.nan) for name in OUTPUTS]
+        out[k] = [estimate.get(name, np.nan) for name in OUTPUTS]
     return out, fine
 
 
 def check(library, estimator, rows, largest):
-    said, fine = library(rows)
-    wanted, stepped_fine = stepped(estimator, rows)
+    outputs, fine = library(rows)
+    expected, stepped_fine = stepped(estimator, rows)
     np.testing.assert_array_equal(fine, stepped_fine)
-    said[~fine] = np.nan
-    np.testing.assert_array_equal(np.isnan(said), np.isnan(wanted))
-    assert np.isfinite(wanted[:, 0]).sum() > 0.4 * len(rows)
-    np.testing.assert_allclose(said[:, :3], wanted[:, :3], rtol=0.0, atol=largest)
+    outputs[~fine] = np.nan
+    np.testing.assert_array_equal(np.isnan(outputs), np.isnan(expected))
+    assert np.isfinite(expected[:, 0]).sum() > 0.4 * len(rows)
+    np.testing.assert_allclose(outputs[:, :3], expected[:, :3], rtol=0.0, atol=largest)
     np.testing.assert_allclose(
-        said[:, 3],
-        wanted[:, 3],
+        outputs[:, 3],
+        expected[:, 3],
         rtol=3e-3 if library.precision == "float" else 1e-7,
         atol=largest * 1e-2,
     )
@@ -211,7 +225,9 @@ each_precision = pytest.mark.parametrize(
 @each_variant
 @each_precision
 def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest, tmp_path):
-    """Filters have no float32 in Python but in networks, so that float in C is held against float64."""
+    """Filters have no float32 in Python but in networks, so that float in C is held against
+    float64.
+    """
     case = case_of(*variant)
     check(
         built(case.estimator, precision, tmp_path),
@@ -222,7 +238,7 @@ def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest
 
 
 def rows_at_low_speed(estimator):
-    """A car that stands, moves off, rolls below the minimum speed, reverses and starts anew there."""
+    """A car that stands, moves off, rolls below the minimum speed, reverses and restarts."""
     generator = np.random.default_rng(2)
     time = np.arange(0.0, 40.0, 1.0 / estimator.rate_hz)
     speed = np.interp(time, [0.0, 3.0, 10.0, 16.0, 24.0, 32.0, 40.0], [0, 0, 9, 2, 2, -4, 12])
@@ -243,8 +259,8 @@ def rows_at_low_speed(estimator):
 
 @pytest.mark.parametrize(
     "config",
-    [own for family, own in VARIANTS if family == "self_calibrating"],
-    ids=lambda own: "-".join(own) or "default",
+    [variant for family, variant in VARIANTS if family == "self_calibrating"],
+    ids=lambda variant: "-".join(variant) or "default",
 )
 @each_precision
 def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
@@ -255,20 +271,26 @@ def test_self_calibrating_filter_agrees_where_a_car_stands_rolls_and_reverses(
     check(built(estimator, precision, tmp_path), estimator, rows, largest)
 
 
+def test_self_calibrating_filter_agrees_in_a_slide(tmp_path):
+    estimator = estimator_class("self_calibrating").from_config({"cg_to_rear_axle": 1.3})
+    rows = slide_after(rows_at_low_speed(estimator))
+    check(built(estimator, "double", tmp_path), estimator, rows, DOUBLE)
+
+
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
 @pytest.mark.parametrize(
     "variant",
-    [own for own in VARIANTS if own[0] not in ("zero", "static_map")][::3],
-    ids=lambda own: own[0],
+    [variant for variant in VARIANTS if variant[0] not in ("zero", "static_map")][::3],
+    ids=lambda variant: variant[0],
 )
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_clang_takes_it_without_a_warning_and_computes_the_same(variant, precision, tmp_path):
     case = case_of(*variant)
-    said = [
+    outputs = [
         built(case.estimator, precision, tmp_path, compiler)(case.rows)[0]
         for compiler in ("clang", COMPILERS[0])
     ]
-    np.testing.assert_allclose(*said, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
+    np.testing.assert_allclose(*outputs, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
 
 
 def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(
@@ -286,7 +308,7 @@ def test_every_family_but_the_factor_graph_can_be_exported():
     assert set(exportable()) == set(estimator_names()) - {"factor_graph"}
 
 
-def test_what_cannot_be_exported_is_said_in_one_line():
+def test_refusals_of_export_are_a_single_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
     assert "cannot run along with a drive" in refusal(
         lambda: method_files(offline, "double"), ConfigurationError
@@ -329,9 +351,11 @@ def test_sources_are_plain_c_and_their_literals_have_the_type(precision):
 
 
 def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp_path):
-    """Sensors far too trusted, and κ = -2: without the mean point's negative weight, or lifted by their eigenvalues.
+    """Sensors far too trusted, and κ = -2: without the mean point's negative weight, or lifted by
+    their eigenvalues.
 
-    A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more than elsewhere.
+    A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more
+    than elsewhere.
     """
     hard = copy.deepcopy(
         case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator
@@ -342,11 +366,11 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
     rows = disturbed(hard, drive_for(hard).stack(hard.channels))[:200].copy()
     rows[:, 1:5] *= 3.0
     stepper = widened(hard).online()
-    wanted = []
+    expected = []
     repaired = 0
     lifted = 0
     for row in rows:
-        wanted.append(
+        expected.append(
             list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3]
         )
         tape = stepper._filter._tape
@@ -354,8 +378,8 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
         lifted = lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
     assert repaired > 20
     assert lifted > 0
-    said, _ = built(hard, "double", tmp_path)(rows)
-    np.testing.assert_allclose(said[:, [1, 0, 2]], wanted, rtol=0.0, atol=1e-6)
+    outputs, _ = built(hard, "double", tmp_path)(rows)
+    np.testing.assert_allclose(outputs[:, [1, 0, 2]], expected, rtol=0.0, atol=1e-6)
 
 
 def ferrari_rows(data_root, estimator, first=550.0, last=700.0):
@@ -443,10 +467,11 @@ def test_learned_filters_agree_over_a_real_drive_of_the_small_car(dynamics, data
 def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(
     dynamics, data_root, tmp_path
 ):
-    """A network that learnt for seconds makes a filter that forgets slowly, and its largest error from rounding is a matter of chance.
+    """A network that learnt for seconds makes a filter that forgets slowly, and its largest error
+    from rounding is a matter of chance.
 
-    Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in Python and in C alike; the median
-    hardly moves. So both are compared over nine such drives.
+    Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in
+    Python and in C alike; the median hardly moves. So both are compared over nine such drives.
     """
     case = small_car(data_root, dynamics)
     generator = np.random.default_rng(0)

@@ -48,7 +48,7 @@ class OnnxStepper:
         self.names = [output.name for output in self.session.get_outputs()]
 
     def step(self, row):
-        said = dict(
+        outputs = dict(
             zip(
                 self.names,
                 self.session.run(None, {"sample": row.astype(self.dtype), **self.state}),
@@ -57,15 +57,15 @@ class OnnxStepper:
         )
         self.state = {
             name.replace("next_", "state_"): values
-            for name, values in said.items()
+            for name, values in outputs.items()
             if name.startswith("next_")
         }
         return {
-            name: float(values) for name, values in said.items() if not name.startswith("next_")
+            name: float(values) for name, values in outputs.items() if not name.startswith("next_")
         }
 
 
-@pytest.mark.parametrize(("name", "config"), VARIANTS, ids=lambda own: str(own))
+@pytest.mark.parametrize(("name", "config"), VARIANTS, ids=lambda estimate: str(estimate))
 @pytest.mark.parametrize(("dtype", "largest"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_a_network_runs_in_onnxruntime_as_in_python(name, config, dtype, largest, tmp_path):
     estimator = fitted(name, "float32", **config)
@@ -73,22 +73,25 @@ def test_a_network_runs_in_onnxruntime_as_in_python(name, config, dtype, largest
     write_onnx(estimator, tmp_path / "model.onnx")
     stepper = OnnxStepper(tmp_path / "model.onnx")
     rows = drive_for(estimator).stack(estimator.channels)[:200]
-    said = [stepper.step(row) for row in rows]
-    wanted = stepped(estimator, rows)[0]
+    estimates = [stepper.step(row) for row in rows]
+    expected = stepped(estimator, rows)[0]
     for column, quantity in ((0, "vy"), (1, "vx")):
-        if quantity in said[0]:
+        if quantity in estimates[0]:
             np.testing.assert_allclose(
-                [own[quantity] for own in said], wanted[:, column], rtol=0.0, atol=largest
+                [estimate[quantity] for estimate in estimates],
+                expected[:, column],
+                rtol=0.0,
+                atol=largest,
             )
-    assert np.isnan([own["vy"] for own in said]).sum() == estimator.warm_up_steps
+    assert np.isnan([estimate["vy"] for estimate in estimates]).sum() == estimator.warm_up_steps
 
 
-def test_a_file_says_what_it_is(tmp_path):
+def test_onnx_file_describes_itself(tmp_path):
     estimator = fitted("ksnn", "float32", window=8)
     write_onnx(estimator, tmp_path / "model.onnx")
     model = onnx.load(tmp_path / "model.onnx")
     about = {entry.key: entry.value for entry in model.metadata_props}
-    assert [own.version for own in model.opset_import] == [OPSET]
+    assert [opset.version for opset in model.opset_import] == [OPSET]
     assert json.loads(about["channels"]) == {
         "yaw_rate": "rad/s",
         "vx": "m/s",
@@ -103,7 +106,7 @@ def test_a_file_says_what_it_is(tmp_path):
     )
 
 
-def test_what_is_no_network_is_refused(tmp_path):
+def test_estimators_without_a_network_are_refused(tmp_path):
     with pytest.raises(
         ConfigurationError,
         match="estimator 'kalman' is no network that ONNX could hold; these are: ksnn, gru",

@@ -1,4 +1,6 @@
-"""Exports under the compilers, analysers and emulators that a control unit's engineer would try them with."""
+"""Exports under the compilers, analysers and emulators that a control unit's engineer would try
+them with.
+"""
 
 import re
 
@@ -89,24 +91,28 @@ def _fuzz(export, place, steps, *options):
 def test_the_stack_is_bounded_and_nothing_is_allocated(tmp_path, family, precision):
     tool("gcc")
     files = program_files(Export(family, precision, tmp_path).stepper(), precision, family)
-    found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
-    assert found
-    for own in found:
-        assert own.data == 0
-        assert own.stack <= MOST_STACK
-        used = {name.removesuffix("f") for name in own.library if not name.startswith("__aeabi_")}
-        assert used <= LIBRARY | {name.removesuffix("f") for name in LIBRARY} | MEMORY | MERGED
+    footprints = [
+        size for size in (footprint(files, target) for target in TARGETS) if size is not None
+    ]
+    assert footprints
+    for size in footprints:
+        assert size.data == 0
+        assert size.stack <= MOST_STACK
+        functions = {
+            name.removesuffix("f") for name in size.library if not name.startswith("__aeabi_")
+        }
+        assert functions <= LIBRARY | {name.removesuffix("f") for name in LIBRARY} | MEMORY | MERGED
 
 
 def test_the_deepest_chain_of_calls_counts_and_recursion_is_refused():
     node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:1\\n{1} bytes (static)" }}'
     edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" }}'
     nodes = [
-        node.format(*own) for own in (("main", 16), ("left", 100), ("right", 40), ("leaf", 70))
+        node.format(*pair) for pair in (("main", 16), ("left", 100), ("right", 40), ("leaf", 70))
     ]
     edges = [
-        edge.format(*own)
-        for own in (("main", "left"), ("main", "right"), ("right", "leaf"), ("leaf", "sqrt"))
+        edge.format(*pair)
+        for pair in (("main", "left"), ("main", "right"), ("right", "leaf"), ("leaf", "sqrt"))
     ]
     graph = "\n".join([*nodes, 'node: { title: "sqrt" label: "sqrt" }', *edges])
     assert worst_stack([graph], ["main"]) == (126, ("sqrt",))
@@ -120,24 +126,26 @@ def test_a_big_endian_machine_of_32_bits_finds_the_same(tmp_path, family):
     emulator = tool("qemu-mips")
     export.build(MIPS, "-O2", "-static", out="main_mips")
     export.vectors()
-    largest, others = export.differences([emulator, "./main_mips"])
+    largest, n_different = export.differences([emulator, "./main_mips"])
     assert largest.max() <= TOLERANCES["double"]
-    assert others == 0
+    assert n_different == 0
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_cortex_m4f_without_an_operating_system_finds_the_same(tmp_path, place, family):
     export = Export(family, "double", tmp_path).write()
     export.vectors()
-    said = run_on_board(export, place / "cortex_m4")
-    largest, others = export.compared()
+    output = run_on_board(export, place / "cortex_m4")
+    largest, n_different = export.compared()
     assert largest.max() <= TOLERANCES["double"]
-    assert others == 0
-    assert int(re.search(r"instructions a step: (\d+)", said)[1]) > 100
+    assert n_different == 0
+    assert int(re.search(r"instructions a step: (\d+)", output)[1]) > 100
 
 
 def run_on_board(export, board):
-    """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was said."""
+    """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was
+    said.
+    """
     compiler = tool("arm-none-eabi-gcc")
     emulator = tool(BOARD[0])
     options = [*STRICT, *ARM, "-I."]
@@ -169,6 +177,6 @@ def run_on_board(export, board):
 def test_sizes_are_those_of_the_linked_objects(tmp_path):
     tool("gcc")
     files = program_files(Export("kinematic", "double", tmp_path).stepper(), "double", "x")
-    own = footprint(files, HOST)
-    assert 4_000 < own.code < 40_000
-    assert 1_000 < own.state < 10_000
+    footprint_of_host = footprint(files, HOST)
+    assert 4_000 < footprint_of_host.code < 40_000
+    assert 1_000 < footprint_of_host.state < 10_000

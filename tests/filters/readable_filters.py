@@ -1,4 +1,6 @@
-"""Filters to compare compiled ones with: unscented and extended as their equations stand, in torch, and a gate around any filter."""
+"""Filters to compare compiled ones with: unscented and extended as their equations stand, in torch,
+and a gate around any filter.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,7 +17,9 @@ from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
 
 
 def sigma_points(rule, mean, factor):
-    """Points of N(mean, L Lᵀ), the mean first, (2n + 1, n), of a mean (n,) and L, lower triangular, (n, n)."""
+    """Points of N(mean, L Lᵀ), the mean first, (2n + 1, n), of a mean (n,) and L, lower triangular,
+    (n, n).
+    """
     offsets = rule.spread * factor.mT
     return torch.cat([mean[None], mean + offsets, mean - offsets])
 
@@ -38,9 +42,11 @@ def symmetric(matrix):
 
 
 def factorised(covariance):
-    """A covariance, its Cholesky factor L, and whether it was lifted first since it was not positive definite.
+    """A covariance, its Cholesky factor L, and whether it was lifted first since it was not
+    positive definite.
 
-    Lifting adds the same to every eigenvalue, as much as a margin of `MARGIN` needs; what is added counts as a constant in gradients.
+    Lifting adds the same to every eigenvalue, as much as a margin of `MARGIN` needs; what is added
+    counts as a constant in gradients.
     """
     factor, lost = torch.linalg.cholesky_ex(covariance)
     if not lost:
@@ -59,8 +65,9 @@ class NonlinearModel:
     x[k+1] = f(x[k], u[k]) + w[k],  w[k] ~ N(0, Q(x[k], u[k]))
     y[k]   = h(x[k], u[k]) + v[k],  v[k] ~ N(0, R(x[k], u[k]))
 
-    ``constrain`` puts a state back into what is possible; ``restart`` says what is known after a prediction that leaves too little known;
-    ``free`` (..., n) is which states a measurement may change: what is held keeps its variance (Schmidt's consider state).
+    ``constrain`` puts a state back into what is possible; ``restart`` says what is known after a
+    prediction that leaves too little known; ``free`` (..., n) is which states a measurement may
+    change: what is held keeps its variance (Schmidt's consider state).
     """
 
     transition: Function
@@ -77,7 +84,9 @@ class NonlinearModel:
 
 
 def log_likelihood(steps):
-    """Of each sample's measurements given those before, (..., T), by innovations and their covariances; 0 where nothing was measured."""
+    """Of each sample's measurements given those before, (..., T), by innovations and their
+    covariances; 0 where nothing was measured.
+    """
     errors, covariances, measured = (
         torch.as_tensor(part)
         for part in (steps.innovation, steps.innovation_covariance, steps.measured)
@@ -91,11 +100,13 @@ def log_likelihood(steps):
 
 
 def unscented_filter(model, measurements, inputs, initial, rule):
-    """The unscented Kalman filter with additive noise of one sequence, (T, m) and (T, p), or of several, each by itself.
+    """The unscented Kalman filter with additive noise of one sequence, (T, m) and (T, p), or of
+    several, each by itself.
 
-    Sigma points are drawn again before each update. Covariances that are not positive definite are repaired. Where a negative weight of the
-    mean point is what takes the definiteness of an update, the update goes without it; everything else is lifted.
-    Measurements that are NaN are skipped, and gradients stay finite; ``initial`` is the state before the first of them.
+    Sigma points are drawn again before each update. Covariances that are not positive definite are
+    repaired. Where a negative weight of the mean point is what takes the definiteness of an update,
+    the update goes without it; everything else is lifted. Measurements that are NaN are skipped,
+    and gradients stay finite; ``initial`` is the state before the first of them.
 
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1 with the points drawn again.
     """
@@ -139,13 +150,18 @@ def unscented_filter(model, measurements, inputs, initial, rule):
 
 
 def filtered_of(rows):
-    """What a filter leaves of rows of predicted and filtered state, innovation, its covariance and what was measured."""
+    """What a filter leaves of rows of predicted and filtered state, innovation, its covariance and
+    what was measured.
+    """
     parts = [torch.stack(part) for part in zip(*rows, strict=True)]
     return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
 
 
 def _updated(model, state, factor, y, u, rule):
-    """The state given a measurement, of which NaN is skipped; innovation, its covariance, what was measured, whether it was repaired."""
+    """The state given a measurement, of which NaN is skipped.
+
+    Innovation, its covariance, what was measured, whether it was repaired.
+    """
     drawn = model.possible(sigma_points(rule, state.mean, factor))
     expected = model.observation(drawn, u[None])
     mean = mean_of(rule, expected)
@@ -174,9 +190,12 @@ def _updated(model, state, factor, y, u, rule):
 
 
 def extended_filter(model, measurements, inputs, initial):
-    """The extended Kalman filter of one sequence, (T, m) and (T, p); Jacobians by automatic differentiation, NaN is skipped.
+    """The extended Kalman filter of one sequence, (T, m) and (T, p).
 
-    Source: Jazwinski 1970, Chapter 8; the update holds for any gain, also that of a consider state (Schmidt).
+    Jacobians by automatic differentiation, NaN is skipped.
+
+    Source: Jazwinski 1970, Chapter 8; the update holds for any gain, also that of a consider state
+    (Schmidt).
     """
     state = initial
     rows = []
@@ -213,7 +232,10 @@ def extended_filter(model, measurements, inputs, initial):
 
 
 def rational_model(estimator):
-    """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
+    """The model of a `RationalFilter`.
+
+    Inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls.
+    """
     track = estimator.track()
     bound = torch.as_tensor(estimator.model().bounds)
     car = estimator.car
@@ -255,7 +277,9 @@ def rational_model(estimator):
 
 
 def gated(run, measurements, gate):
-    """What a filter without a gate, of one sequence (T, m), gives behind one: sample by sample, what is refused becomes NaN."""
+    """What a filter without a gate, of one sequence (T, m), gives behind one: sample by sample,
+    what is refused becomes NaN.
+    """
     y = measurements.clone()
     refused = [0] * measurements.shape[-1]
     steps = run(y)

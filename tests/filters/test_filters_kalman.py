@@ -49,8 +49,10 @@ def tensors(parts):
     return type(parts)(*map(torch.from_numpy, parts))
 
 
-def dense_posterior(model, measurements, initial, n_seen):
-    """Mean and covariance of all states at once, given the measurements of the first samples; and their log-density.
+def dense_posterior(model, measurements, initial, n_measured):
+    """Mean and covariance of all states at once, given the measurements of the first samples.
+
+    And their log-density.
 
     Written down as one normal distribution of x[0], w[0], w[1], … and v[0], v[1], …: no recursion.
     """
@@ -71,7 +73,7 @@ def dense_posterior(model, measurements, initial, n_seen):
     y_mean = H @ f + d.ravel()
     y_cov = H @ prior @ H.T + np.diag(R.ravel())
     is_measured = ~np.isnan(measurements)
-    is_measured[n_seen:] = False
+    is_measured[n_measured:] = False
     rows = np.flatnonzero(is_measured.ravel())
     S = y_cov[np.ix_(rows, rows)]
     cross = (prior @ H.T)[:, rows]
@@ -107,7 +109,7 @@ def test_filter_and_smoother_are_the_posterior_of_all_states_at_once(missing, se
     assert np.abs(smoothed_means(model, result) - mean).max() < 1e-10
 
 
-def test_predictions_stand_where_nothing_is_measured():
+def test_unmeasured_samples_keep_the_prediction():
     model, measurements, initial = example(5, seed=6)
     measurements[2] = np.nan
     result = kalman_scan(model, measurements, initial)
@@ -118,7 +120,10 @@ def test_predictions_stand_where_nothing_is_measured():
 
 
 def test_covariances_stay_symmetric_and_positive():
-    """From a first variance of 1e10 down to 1e-6; the short form of the update, (I - KC)P, turns negative on the way."""
+    """From a first variance of 1e10 down to 1e-6.
+
+    The short form of the update, (I - KC)P, turns negative on the way.
+    """
     model, measurements, _ = example(300, seed=8)
     model = model._replace(
         process_noise=1e-6 * model.process_noise, observation_noise=1e-6 * model.observation_noise

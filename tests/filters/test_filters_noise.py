@@ -1,4 +1,7 @@
-"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for; noise levels read off signals."""
+"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for.
+
+Noise levels read off signals.
+"""
 
 import numpy as np
 import pytest
@@ -36,7 +39,7 @@ def noise(request):
     }[request.param]()
 
 
-def test_every_noise_starts_near_the_variances_it_was_given(noise):
+def test_noise_models_start_near_their_initial_variances(noise):
     covariance = noise(STATE, INPUTS)
     assert covariance.shape == (7, 5, 5)
     assert torch.allclose(covariance, torch.diag(torch.tensor(START)), atol=2e-6)
@@ -55,7 +58,7 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         )
 
 
-def test_state_dependent_noise_is_the_formula_written_out_and_factors_of_zero_leave_the_floor():
+def test_noise_covariances_match_their_formula_and_floor():
     noise = drawn(StateDependentNoise([0.2, 0.3], 5), 0.5, 3)
     a, b, c = (noise.weight @ STATE[2]).tolist()
     lower = torch.tensor([[a, 0.0], [b, c]])
@@ -109,8 +112,11 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     assert float((with_entropy(readable, floor) - readable).abs().max()) > 0.01, "the floor is met"
 
 
-def test_level_of_white_noise_is_its_share_above_the_cutoff_without_slow_signals_offsets_gaps_and_ends():
-    """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency; 2 % leaves room for the filter's slopes."""
+def test_high_passed_level_measures_white_noise_and_ignores_slow_signals():
+    """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency.
+
+    2 % leaves room for the filter's slopes.
+    """
     noise = 0.3 * np.random.default_rng(0).standard_normal(100_000)
     for cutoff in (0.1, 0.2):
         assert high_passed_level([noise], cutoff) == pytest.approx(

@@ -1,4 +1,6 @@
-"""Unscented and extended Kalman filters against the linear one, an independent library, closed forms and finite differences."""
+"""Unscented and extended Kalman filters against the linear one, an independent library, closed
+forms and finite differences.
+"""
 
 import filterpy.kalman as filterpy
 import numpy as np
@@ -50,7 +52,10 @@ def linear_as_nonlinear(model):
 
 
 def pendulum_with_radar():
-    """Angle, rate and an unknown damping; measured are the bob's height and its rate. Inputs push."""
+    """Angle, rate and an unknown damping; measured are the bob's height and its rate.
+
+    Inputs push.
+    """
 
     def transition(x, u):
         angle, rate, damping = x.unbind(-1)
@@ -149,7 +154,10 @@ def unrepaired(*arguments):
     ids=["symmetric", "cubature", "scaled"],
 )
 def test_unscented_filter_is_that_of_an_independent_library(rule, points):
-    """Theirs updates with the propagated points; drawn again after each prediction, its equations are ours."""
+    """Theirs updates with the propagated points.
+
+    Drawn again after each prediction, its equations are ours.
+    """
     model = pendulum_with_radar()
     measurements, inputs, initial = measured_pendulum()
     ours = unscented_filter(model, measurements[0], inputs[0], initial, rule).steps

@@ -1,4 +1,7 @@
-"""The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
+"""The compiled scan is the readable unscented filter, in values and gradients.
+
+That one is filterpy's to 1e-8 (test_filters_nonlinear).
+"""
 
 import dataclasses
 from collections import namedtuple
@@ -38,7 +41,8 @@ def learnt(first):
 
 
 def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
-    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances.
+    """The pendulum by the readable filter and by the scan: what they return, and gradients of a
+    random sum of means and covariances.
 
     Those of the measurements come last.
     """
@@ -118,17 +122,21 @@ def assert_equal(first, second):
     assert torch.equal(first.repaired, second.repaired)
 
 
+def assert_gradients_equal(expected, actual):
+    """Finite and equal to 1e-10 of the largest element, for each field of `Learnt` and the rest."""
+    for field, a, b in zip((*Learnt._fields, "measurements"), expected, actual, strict=True):
+        assert torch.isfinite(b).all(), field
+        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max())), field
+
+
 @pytest.mark.parametrize("name", RULES)
 def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
     (filtered, gradients), (scanned, scan_gradients) = both_ways(
         RULES[name], *measured_pendulum(30, 4)
     )
     assert_equal(filtered, scanned)
-    for field, a, b in zip(
-        (*Learnt._fields, "measurements"), gradients, scan_gradients, strict=True
-    ):
-        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max())), field
-        assert a.abs().sum() > 0, field
+    assert_gradients_equal(gradients, scan_gradients)
+    assert all(gradient.abs().sum() > 0 for gradient in gradients)
 
 
 def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
@@ -138,9 +146,7 @@ def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
         RULES["symmetric"], measurements, inputs, first
     )
     assert_equal(filtered, scanned)
-    for a, b in zip(gradients, scan_gradients, strict=True):
-        assert torch.isfinite(b).all()
-        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
+    assert_gradients_equal(gradients, scan_gradients)
     lower = [-1e9, 0.05, 0.25]
     (filtered, gradients), (scanned, scan_gradients) = both_ways(
         RULES["scaled"], *measured_pendulum(30, 4), lower=lower
@@ -151,21 +157,24 @@ def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     )
     assert (scanned.steps.filtered.mean[..., 2] >= 0.25).all()
     assert_equal(filtered, scanned)
-    for a, b in zip(gradients, scan_gradients, strict=True):
-        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
+    assert_gradients_equal(gradients, scan_gradients)
 
 
 VARIANCES = torch.tensor(
     [[20.0, 20, 20], [1, 20, 20], [2.9, 20, 20], [-2, 20, 20], [20, 0.5, 20], [20, 20, 20]],
     dtype=torch.float64,
 )
-"""Of squares at three samples, by which the negative weight of the mean point costs nothing, the definiteness of the innovation, that of
-the state after it, the innovation's even without that weight, and that of the innovation at the second sample. The last sequence begins
-with a covariance that is not positive definite."""
+"""Of squares at three samples, by which the negative weight of the mean point costs nothing, the
+definiteness of the innovation, that of the state after it, the innovation's even without that
+weight, and that of the innovation at the second sample. The last sequence begins with a
+covariance that is not positive definite.
+"""
 
 
 def squares(way, repair=True):
-    """Sequences with these variances by the readable filter or the scan, and gradients of means in the first mean and covariance."""
+    """Sequences with these variances by the readable filter or the scan, and gradients of means in
+    the first mean and covariance.
+    """
     eye = torch.eye(3, dtype=torch.float64)
     lone = torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag()
     mean = torch.tensor(
@@ -232,7 +241,7 @@ def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
     assert torch.isfinite(slopes[0][0]).all()
 
 
-def test_sequences_shared_out_are_what_they_are_together():
+def test_sequences_filtered_in_shares_equal_those_filtered_together():
     """Each in two pieces, one after the other."""
 
     def halves(work, sequences):
@@ -250,7 +259,7 @@ def test_sequences_shared_out_are_what_they_are_together():
         assert torch.allclose(a, b, rtol=1e-13, atol=0)
 
 
-def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gradients():
+def test_scan_with_noise_functions_matches_the_filter_and_has_no_gradients():
     measurements, inputs, first = measured_pendulum(20, 2)
 
     def noise(base):
@@ -279,7 +288,7 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
         scanned.steps.filtered.mean.sum().backward()
 
 
-def test_one_sample_at_a_time_it_is_the_same_filter():
+def test_stepper_matches_the_scan():
     measurements, inputs, first = measured_pendulum(20, 1)
     measurements[0, 4, 0] = measurements[0, 9] = torch.nan
     model = pendulum_with_radar()
@@ -306,7 +315,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter():
         ), k
 
 
-def test_one_step_alone_is_the_model():
+def test_moved_is_the_transition_with_its_gradient():
     gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
     model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
     states, inputs = (

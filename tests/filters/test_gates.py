@@ -1,4 +1,7 @@
-"""Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
+"""Gates: outliers are refused as if they had not been measured, readable as compiled.
+
+What contradicts for long is believed again.
+"""
 
 import math
 from functools import partial
@@ -123,7 +126,7 @@ def outliers(steps, sequences):
     return y, u, first
 
 
-def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
+def test_scan_and_readable_filter_refuse_the_same_samples_under_every_rule():
     y, u, first = outliers(30, 3)
     model = pendulum_with_radar()
     gate = Gate(4.0, PATIENCE)

@@ -1,4 +1,6 @@
-"""``python -m fuzz``: try malformed inputs, write a row for each, and fail if any of them ends badly."""
+"""``python -m fuzz``: try malformed inputs, write a row for each, and fail if any of them ends
+badly.
+"""
 
 import os
 
@@ -26,9 +28,9 @@ def main():
     from fuzz.runner import Fuzzer, described, summary, write_rows
     from vehest.run.table_records import record_tables
 
-    with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as made:
+    with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as scratch:
         started = time.monotonic()
-        folder = Path(options.folder) if options.folder else Path(made)
+        folder = Path(options.folder) if options.folder else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         fuzzer = Fuzzer(
             folder, options.seed, options.family, keep=bool(options.folder), seconds=options.seconds
@@ -36,7 +38,8 @@ def main():
         fuzzer.prepare()
         indices = options.only or range(options.inputs)
         print(
-            f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after {time.monotonic() - started:.0f} s",
+            f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after "
+            f"{time.monotonic() - started:.0f} s",
             flush=True,
         )
         rows = []
@@ -56,7 +59,8 @@ def main():
             print(f"files: {', '.join(str(folder / f'{index:06d}') for index in indices)}")
         bad = sum(row.verdict != "ok" for row in rows)
         print(
-            f"\n{summary(rows)}\n\n{bad} of {len(rows)} inputs ended badly; {time.monotonic() - started:.0f} s, seed {options.seed}"
+            f"\n{summary(rows)}\n\n{bad} of {len(rows)} inputs ended badly; "
+            f"{time.monotonic() - started:.0f} s, seed {options.seed}"
         )
     return 1 if bad else 0
 

@@ -22,7 +22,9 @@ _DEPTH = ("up", "up", "up", "place")
 
 @dataclass(frozen=True)
 class Command:
-    """A command line to try: words after ``vehest``, and files and folders, beside the output root, that it may write."""
+    """A command line to try: words after ``vehest``, and files and folders, beside the output root,
+    that it may write.
+    """
 
     argv: tuple[str | bytes, ...]
     targets: tuple[str, ...] = ("out.csv",)
@@ -67,7 +69,10 @@ class Case:
         return path
 
     def spoil(self, file, spoil):
-        """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest; returns whether that was done."""
+        """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest.
+
+        Returns whether that was done.
+        """
         if not self.honest:
             file.write_bytes(spoil(file.read_bytes(), self.rng))
         return not self.honest
@@ -78,7 +83,9 @@ class Case:
 
 
 Generator = namedtuple("Generator", "family name build needs weight")
-"""A way to make inputs: a function that writes the files of a case and returns the command, templates, and its turns in a round."""
+"""A way to make inputs: a function that writes the files of a case and returns the command,
+templates, and its turns in a round.
+"""
 GENERATORS = []
 TEMPLATES = {}
 
@@ -105,20 +112,27 @@ def load_families():
     """Import every module of `fuzz.families`, which registers its generators."""
     from fuzz import families
 
-    for module in sorted(pkgutil.iter_modules(families.__path__), key=lambda one: one.name):
+    for module in sorted(
+        pkgutil.iter_modules(families.__path__), key=lambda module_info: module_info.name
+    ):
         importlib.import_module(f"{families.__name__}.{module.name}")
 
 
 def schedule(chosen):
-    """The generators in the order in which they take turns; heavier ones come more than once a round."""
+    """The generators in the order in which they take turns.
+
+    Heavier ones come more than once a round.
+    """
     return [
-        one
-        for turn in range(max(one.weight for one in chosen))
-        for one in chosen
-        if one.weight > turn
+        generator
+        for turn in range(max(generator.weight for generator in chosen))
+        for generator in chosen
+        if generator.weight > turn
     ]
 
 
-def is_honest(one, position, visit):
-    """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
-    return one.family != PLANTED and (visit + position) % 8 == 0
+def is_honest(generator, position, visit):
+    """Whether a visit makes the honest variant: the first visits of an eighth of the generators,
+    then each in its turn.
+    """
+    return generator.family != PLANTED and (visit + position) % 8 == 0

@@ -1,4 +1,7 @@
-"""Imports made beforehand, and honest files made once by vehest's own commands; generators copy and spoil these."""
+"""Imports made beforehand, and honest files made once by vehest's own commands.
+
+Generators copy and spoil these.
+"""
 
 import encodings
 import importlib
@@ -69,7 +72,10 @@ def run(*words):
 
 @template
 def drives(folder):
-    """Three tables of a car, with its data set, split and pipeline; a lap with columns called like channels."""
+    """Three tables of a car, with its data set, split and pipeline.
+
+    A lap with columns called like channels.
+    """
     write_drives(folder)
     lap().to_csv(folder / "lap.csv", index=False)
     write_yaml(folder / "conf" / "dataset" / "mine.yaml", DATASET)
@@ -79,7 +85,10 @@ def drives(folder):
 
 @template
 def steered(folder):
-    """Three tables with a steering angle, for filters that know a car; and the Kalman filter of their split."""
+    """Three tables with a steering angle, for filters that know a car.
+
+    And the Kalman filter of their split.
+    """
     write_steered(folder, {"one": 1, "two": 2, "three": 3})
     write_yaml(
         folder / "conf" / "split" / "steered.yaml",
@@ -95,7 +104,9 @@ def study(folder):
 
 
 def warm_up(folder):
-    """Run what commands have in common once in this process: kernels are loaded, plugins of Hydra found, first imports done."""
+    """Run what commands have in common once in this process: kernels are loaded, plugins of Hydra
+    found, first imports done.
+    """
     drives(folder)
     steered(folder)
     lap().to_parquet(folder / "lap.parquet")
@@ -112,14 +123,17 @@ def warm_up(folder):
 
 # Libraries that are imported piece by piece while they work, and what they import then.
 PIECES = (
-    "asammdf", "asammdf.blocks", "rosbags.rosbag2", "rosbags.typesys", "mlflow", "optuna", "can.interfaces.virtual", "can.io.asc",
-    "can.io.blf", "can.io.canutils", "cantools.database", "torch", "pooch", "requests", "netrc", "pydantic._internal._serializers",
+    "asammdf", "asammdf.blocks", "rosbags.rosbag2", "rosbags.typesys", "mlflow", "optuna",
+    "can.interfaces.virtual", "can.io.asc", "can.io.blf", "can.io.canutils", "cantools.database",
+    "torch", "pooch", "requests", "netrc", "pydantic._internal._serializers",
 )  # fmt: skip
 PACKAGES = ("typer", "rich")
 
 
 def import_everything():
-    """Import all of vehest, the libraries that it loads when it needs them, and every text encoding."""
+    """Import all of vehest, the libraries that it loads when it needs them, and every text
+    encoding.
+    """
     import vehest
     import vehest_papers
 
@@ -148,7 +162,9 @@ def import_everything():
 
 
 def load_kernels():
-    """Load what every estimate runs from the compile cache, which is unpickled: later that means that an input asked for it."""
+    """Load what every estimate runs from the compile cache, which is unpickled: later that means
+    that an input asked for it.
+    """
     import vehest
 
     time = np.arange(1200) / 20.0

@@ -30,13 +30,17 @@ MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
 Row = namedtuple(
     "Row",
-    "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict detail",
+    "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict "
+    "detail",
 )
 """One input and what became of it: a line of the CSV file."""
 
 
 class Fuzzer:
-    """Everything that is imported and made once; all families but the planted ones, if none is named."""
+    """Everything that is imported and made once.
+
+    All families but the planted ones, if none is named.
+    """
 
     def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
         self.folder = folder.resolve()
@@ -45,9 +49,9 @@ class Fuzzer:
         self.seconds = seconds
         load_families()
         chosen = [
-            one
-            for one in GENERATORS
-            if (one.family in families if families else one.family != PLANTED)
+            generator
+            for generator in GENERATORS
+            if (generator.family in families if families else generator.family != PLANTED)
         ]
         if not chosen:
             raise SystemExit("no family has such a name")
@@ -55,15 +59,15 @@ class Fuzzer:
 
     def prepare(self):
         """Import what commands import, and make the templates that generators copy from."""
-        if all(one.family == PLANTED for one in self.turns):
+        if all(generator.family == PLANTED for generator in self.turns):
             return
         from fuzz import honest
 
         honest.import_everything()
-        needed = sorted({name for one in self.turns for name in one.needs})
+        template_names = sorted({name for generator in self.turns for name in generator.needs})
         for name, make in {
             "first": honest.warm_up,
-            **{name: TEMPLATES[name] for name in needed},
+            **{name: TEMPLATES[name] for name in template_names},
         }.items():
             folder = self.folder / "templates" / name
             folder.mkdir(parents=True)
@@ -71,12 +75,18 @@ class Fuzzer:
                 make(folder)
 
     def generator_of(self, index):
-        """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
+        """Generator of an input, how often it has had its turn before, and whether the input is to
+        be honest.
+        """
         position = index % len(self.turns)
         visit = index // len(self.turns)
-        one = self.turns[position]
-        turns_before = self.turns[:position].count(one)
-        return one, visit * one.weight + turns_before, is_honest(one, position, visit)
+        generator = self.turns[position]
+        turns_before = self.turns[:position].count(generator)
+        return (
+            generator,
+            visit * generator.weight + turns_before,
+            is_honest(generator, position, visit),
+        )
 
     def run(self, indices, jobs, report):
         """Try inputs in ``jobs`` workers, and report each as it ends."""
@@ -86,21 +96,21 @@ class Fuzzer:
         with ProcessPoolExecutor(
             jobs, multiprocessing.get_context("fork"), die_with_parent
         ) as workers:
-            for ended in as_completed([workers.submit(self.try_one, index) for index in indices]):
+            for ended in as_completed([workers.submit(self.try_input, index) for index in indices]):
                 report(ended.result())
 
-    def try_one(self, index):
+    def try_input(self, index):
         """Make one input, run its command in a forked child, and judge."""
-        one, visit, honest = self.generator_of(index)
+        generator, visit, honest = self.generator_of(index)
         case = self.case_of(index, visit, honest)
         try:
-            command = one.build(case)
+            command = generator.build(case)
         except Exception:
             detail = printable(" | ".join(traceback.format_exc().splitlines()[-4:]))
             return Row(
                 index,
-                one.family,
-                one.name,
+                generator.family,
+                generator.name,
                 honest,
                 "",
                 0,
@@ -116,20 +126,20 @@ class Fuzzer:
         if not self.keep:
             _remove(case.folder)
         error = last_line("\n".join(refusal_lines(outcome.stderr)))
-        shown = _shown(command, case)
+        command_text = _command_text(command, case)
         took = (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb)
-        said = (
+        texts = (
             printable(text.replace(str(case.folder), "…"))[:200]
             for text in (error, verdict, detail)
         )
         return Row(
             index,
-            one.family,
-            one.name,
+            generator.family,
+            generator.name,
             honest,
-            shown,
+            command_text,
             *(round(number, 3) for number in took),
-            *said,
+            *texts,
         )
 
     def case_of(self, index, visit, honest):
@@ -144,8 +154,8 @@ class Fuzzer:
             visit,
             self.seconds,
         )
-        for made in (case.place, folder / "tmp", folder / "home", folder / "log"):
-            made.mkdir(parents=True)
+        for subfolder in (case.place, folder / "tmp", folder / "home", folder / "log"):
+            subfolder.mkdir(parents=True)
         return case
 
 
@@ -173,20 +183,20 @@ def _watch(case, command):
         os.killpg(
             child, signal.SIGKILL
         )  # whatever it has started; its number is its own until it is waited for
-    _, status, used = os.wait4(child, 0)
+    _, status, resources = os.wait4(child, 0)
     logs = case.folder / "log"
     noted = [json.loads(line) for line in _text(logs / "events").splitlines()]
     with contextlib.suppress(BlockingIOError):
         noted += [json.loads(line) for line in os.read(events, 2**16).splitlines()]
     os.close(events)
-    imports_kb = next((value for key, value in noted if key == "rss"), used.ru_maxrss)
+    imports_kb = next((value for key, value in noted if key == "rss"), resources.ru_maxrss)
     most_kb = (
-        readers.command_kb if readers.peaks_kb else used.ru_maxrss
+        readers.command_kb if readers.peaks_kb else resources.ru_maxrss
     )  # which counts ended children too
     return Outcome(
         exit_code=os.waitstatus_to_exitcode(status),
         seconds=seconds,
-        cpu_seconds=used.ru_utime + used.ru_stime,
+        cpu_seconds=resources.ru_utime + resources.ru_stime,
         peak_mb=(max(0, most_kb - imports_kb) + max(readers.peaks_kb.values(), default=0)) / 1024,
         stdout=_text(logs / "stdout"),
         stderr=_text(logs / "stderr"),
@@ -199,7 +209,9 @@ def _watch(case, command):
 
 
 class _Readers:
-    """What a command and the reading processes that it starts take, as far as repeated looks at them tell."""
+    """What a command and the reading processes that it starts take, as far as repeated looks at
+    them tell.
+    """
 
     def __init__(self, command):
         self._command = command
@@ -246,7 +258,7 @@ def _text(path):
         return ""
 
 
-def _shown(command, case):
+def _command_text(command, case):
     words = [os.fsdecode(word).replace(str(case.place), ".") for word in command.argv]
     cut = [word if len(word) <= 160 else f"{word[:150]}…({len(word)} characters)" for word in words]
     return printable(" ".join(shlex.quote(word) for word in cut))[:600]
@@ -271,7 +283,7 @@ def _quiet(folder):
 def write_rows(rows, path):
     """Rows as CSV, in the order of their index."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(sorted(rows, key=lambda one: one.index)).to_csv(path, index=False)
+    pd.DataFrame(sorted(rows, key=lambda row: row.index)).to_csv(path, index=False)
 
 
 def described(row):
@@ -279,8 +291,10 @@ def described(row):
     kind = " (honest)" if row.honest else ""
     took = f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
     return (
-        f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest {row.command}\n"
-        f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} {row.detail}"
+        f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest "
+        f"{row.command}\n"
+        f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} "
+        f"{row.detail}"
     )
 
 
@@ -288,14 +302,15 @@ def summary(rows):
     """A line a family: how many inputs, how many honest ones, and how they ended."""
     lines = []
     for family in [*sorted({row.family for row in rows}), "all"]:
-        own = [row for row in rows if family in (row.family, "all")]
+        family_rows = [row for row in rows if family in (row.family, "all")]
         ended = ", ".join(
             f"{number} {verdict}"
-            for verdict, number in Counter(row.verdict for row in own).most_common()
+            for verdict, number in Counter(row.verdict for row in family_rows).most_common()
         )
-        honest = sum(row.honest for row in own)
-        done = sum(row.exit_code == 0 for row in own)
+        honest = sum(row.honest for row in family_rows)
+        done = sum(row.exit_code == 0 for row in family_rows)
         lines.append(
-            f"{family:<14} {len(own):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}"
+            f"{family:<14} {len(family_rows):>5} inputs, {honest:>4} honest, {done:>4} done: "
+            f"{ended}"
         )
     return "\n".join(lines)

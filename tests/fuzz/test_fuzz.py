@@ -36,17 +36,20 @@ def rows_of(folder, *options):
         return list(csv.DictReader(stream))
 
 
-def test_two_hundred_malformed_inputs_end_with_a_result_or_one_line(tmp_path):
+def test_two_hundred_malformed_inputs_end_with_a_result_or_a_single_line(tmp_path):
     rows = rows_of(tmp_path, "--inputs", "200", "--jobs", "2")
     assert len(rows) == 200
     honest = [row for row in rows if row["honest"] == "True"]
     assert len(honest) >= 15
     load_families()
     assert {(row["family"], row["generator"]) for row in rows} == {
-        (one.family, one.name) for one in GENERATORS if one.family != PLANTED
+        (generator.family, generator.name)
+        for generator in GENERATORS
+        if generator.family != PLANTED
     }
     bad = [
-        f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest {row['command']}: {row['detail']}"
+        f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest "
+        f"{row['command']}: {row['detail']}"
         for row in rows
     ]
     assert [line for line, row in zip(bad, rows, strict=True) if row["verdict"] != "ok"] == []
@@ -56,8 +59,8 @@ def test_each_misdeed_gets_its_verdict(tmp_path):
     rows = rows_of(
         tmp_path, "--family", "planted", "--inputs", str(len(MISDEEDS)), "--seconds", "6"
     )
-    found = {row["command"].removeprefix("PLANTED:"): row["verdict"] for row in rows}
-    assert found == {name: verdict for name, (verdict, _) in MISDEEDS.items()}
+    verdicts = {row["command"].removeprefix("PLANTED:"): row["verdict"] for row in rows}
+    assert verdicts == {name: verdict for name, (verdict, _) in MISDEEDS.items()}
     assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}
 
 
@@ -86,7 +89,7 @@ def test_an_outcome_is_judged_by_exit_code_lines_and_files(tmp_path, honest, end
     assert judge(case, Command(("ingest",), targets=("out.csv",)), ended)[0] == verdict
 
 
-def test_what_is_written_is_seen_in_the_folders(tmp_path):
+def test_written_files_are_detected_in_the_folders(tmp_path):
     for name in ("same", "longer", "gone"):
         (tmp_path / name).write_text("a")
     before = snapshot(tmp_path)
@@ -99,9 +102,9 @@ def test_what_is_written_is_seen_in_the_folders(tmp_path):
 def test_the_same_seed_and_index_make_the_same_input(tmp_path):
     def files(folder, seed, index):
         fuzzer = Fuzzer(folder, seed, ["tables"])
-        one, visit, honest = fuzzer.generator_of(index)
+        generator, visit, honest = fuzzer.generator_of(index)
         case = fuzzer.case_of(index, visit, honest)
-        command = one.build(case)
+        command = generator.build(case)
         return command, {path.name: path.read_bytes() for path in case.place.iterdir()}
 
     for index in range(10):

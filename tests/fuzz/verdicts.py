@@ -53,8 +53,8 @@ def judge(case, command, outcome):
 
 
 def _findings(case, command, outcome):
-    made = [path for path in outcome.changed if Path(path).name == CANARY]
-    yield from (("executed", f"made {path}") for path in made)
+    canaries = [path for path in outcome.changed if Path(path).name == CANARY]
+    yield from (("executed", f"made {path}") for path in canaries)
     for verdict in ("executed", "outside"):
         yield from (event for event in outcome.events if event[0] == verdict)
     yield from (
@@ -65,7 +65,8 @@ def _findings(case, command, outcome):
     if outcome.seconds > case.seconds:
         yield (
             "slow",
-            f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; {outcome.stack}",
+            f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; "
+            f"{outcome.stack}",
         )
     if outcome.exit_code < 0:
         yield "crash", f"signal {-outcome.exit_code}"
@@ -125,8 +126,11 @@ def _is_allowed(path, case, command):
 
 
 def snapshot(folder):
-    """Everything below a folder, with what would change if it were written to; logs are left out, links not followed."""
-    found = {}
+    """Everything below a folder, with what would change if it were written to.
+
+    Logs are left out, links not followed.
+    """
+    states = {}
     pending = [str(folder)]
     while pending:
         inside = pending.pop()
@@ -140,13 +144,13 @@ def snapshot(folder):
                 continue
             about = entry.stat(follow_symlinks=False)
             is_folder = stat.S_ISDIR(about.st_mode)
-            found[path] = (
+            states[path] = (
                 about.st_mode,
                 None if is_folder else (about.st_size, about.st_mtime_ns, about.st_ino),
             )
             if is_folder:
                 pending.append(entry.path)
-    return found
+    return states
 
 
 def differences(before, after):

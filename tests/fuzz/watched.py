@@ -1,4 +1,7 @@
-"""The forked child: limits, an audit hook, and the command line run as the terminal would run it; the reading processes that it starts."""
+"""The forked child: limits, an audit hook, and the command line run as the terminal would run it.
+
+The reading processes that it starts.
+"""
 
 import faulthandler
 import json
@@ -44,10 +47,11 @@ NO_PLACES = (
     "/proc/",
 )  # where nothing can be made, though a user may ask for it
 
-# Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels, syntax trees; annotations of the commands'
-# own functions, which inspect and typing evaluate for Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates
-# a store; and rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let through. Whatever a payload
-# would do is noticed as well: the file that it makes, or the program.
+# Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels,
+# syntax trees; annotations of the commands' own functions, which inspect and typing evaluate for
+# Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates a store; and
+# rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let
+# through. Whatever a payload would do is noticed as well: the file that it makes, or the program.
 MAKERS = ("dataclasses", "collections", "inspect", "typing", "numba.", "llvmlite.", "ast")
 MAKERS += ("rosbags.typesys.store", "rosbags.serde.", "sqlalchemy.util.langhelpers")
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
@@ -62,7 +66,8 @@ IMPORTERS = (
 
 
 class Watch:
-    """Notes, a line of JSON each, what a command does that no input should make it do: it may write inside the case's folder alone.
+    """Notes, a line of JSON each, what a command does that no input should make it do: it may write
+    inside the case's folder alone.
 
     A reading process imports what it needs and runs nothing but code of installed files.
     """
@@ -118,8 +123,8 @@ class Watch:
             caller, ("multiprocessing.", "concurrent.futures.")
         ):
             return
-        what = arguments[1] if event == "compile" else arguments[0]
-        code = getattr(what, "co_filename", None) or what
+        subject = arguments[1] if event == "compile" else arguments[0]
+        code = getattr(subject, "co_filename", None) or subject
         if (
             self._reads
             and event == "exec"
@@ -172,14 +177,16 @@ class Watch:
             self._note("outside", f"{event} {real[:160]}")
             raise PermissionError(1, "this is outside of the sandbox", real)
 
-    def _note(self, verdict, what):
+    def _note(self, verdict, subject):
         if self._noted < 20:
             self._noted += 1
-            os.write(self._report, (json.dumps([verdict, what]) + "\n").encode())
+            os.write(self._report, (json.dumps([verdict, subject]) + "\n").encode())
 
 
 HARMLESS_IMPORTS = ("pyspark",)
-"""Starts of names of modules that honest commands look for anew each time, since they are not installed."""
+"""Starts of names of modules that honest commands look for anew each time, since they are not
+installed.
+"""
 
 
 def _called_from(frame, modules):
@@ -209,7 +216,10 @@ def become(case, command):
 
 
 def watch_reader():
-    """Watch this reading process as its command is watched; events go through a pipe, since it may write to no file."""
+    """Watch this reading process as its command is watched.
+
+    Events go through a pipe, since it may write to no file.
+    """
     folder = Path(os.environ["FUZZ_CASE"])
     report = os.open(folder / "log" / "reader", os.O_WRONLY | os.O_NONBLOCK)
     Watch(folder, report, reads=True).arm()
@@ -253,7 +263,8 @@ def _prepare(case, command):
     """Streams, folders, environment, limits; returns the descriptor of the report."""
     logs = case.folder / "log"
     report = os.open(logs / "events", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    stack = open(logs / "stack", "w")  # noqa: SIM115 - open as long as the process lives, like the streams below
+    # open as long as the process lives, like the streams below
+    stack = open(logs / "stack", "w")  # noqa: SIM115
     faulthandler.dump_traceback_later(case.seconds, file=stack)
     _redirect(0, "/dev/null", os.O_RDONLY)
     _redirect(1, logs / "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)

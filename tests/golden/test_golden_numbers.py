@@ -32,7 +32,7 @@ def test_numbers_are_those_recorded(name):
 def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
     from vehest.estimators import luenberger
 
-    former = luenberger.Luenberger._estimate_one
+    former = luenberger.Luenberger.estimate_recording
     found = now("luenberger")  # before its estimates are shifted: `now` keeps them
 
     def shifted(self, recording, state):
@@ -40,7 +40,7 @@ def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
         estimate.channels["vy"][:] *= 1.01
         return estimate
 
-    monkeypatch.setattr(luenberger.Luenberger, "_estimate_one", shifted)
+    monkeypatch.setattr(luenberger.Luenberger, "estimate_recording", shifted)
     complaint = moved("luenberger", found, SUBJECTS["luenberger"].record(), tolerance)
     assert complaint.startswith(
         "estimates of luenberger moved: raise Luenberger.version if that is meant"

@@ -26,8 +26,8 @@ from vehest_papers.heavy_ekf.candidates import (
 )
 from vehest_papers.heavy_ekf.twin import (
     CURVES,
-    FINER,
     RATE,
+    SUBSTEPS,
     TRUCK,
     Conditions,
     Plant,
@@ -56,7 +56,7 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
     own = course(conditions, np.random.default_rng(3), 12.0)
     states, steer, lateral = driven(plant, own)
     car = plant.car
-    step = 1.0 / (RATE * FINER)
+    step = 1.0 / (RATE * SUBSTEPS)
     front_load = plant.load_front
     rear_load = plant.load_rear
 

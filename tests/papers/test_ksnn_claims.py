@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import ksnn_tables
 import numpy as np
 import pytest
 from study_parts import metric_rows, part_of
@@ -19,8 +20,8 @@ from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme, with_common_blocks
 
 PUBLISHED = {
-    "scheme_1": (paper.TABLE_IV, "c", "c2", "f2"),
-    "scheme_2": (paper.TABLE_V, "f", "f2", "c2"),
+    "scheme_1": (ksnn_tables.TABLE_IV, "c", "c2", "f2"),
+    "scheme_2": (ksnn_tables.TABLE_V, "f", "f2", "c2"),
 }
 SEGMENTS = 600
 SAMPLES = 20
@@ -38,7 +39,7 @@ NAMES = {
     paper.LINEAR: ("ksnn", "linear_no_bias_p2"),
     paper.NONLINEAR: ("ksnn", "nonlinear_no_bias_p2_q3"),
 }
-N_PARAMETERS = {name: row.n_parameters for name, row in paper.TABLE_IV.items()} | {
+N_PARAMETERS = {name: row.n_parameters for name, row in ksnn_tables.TABLE_IV.items()} | {
     paper.ZERO: 0,
     paper.STATIC_MAP: 2,
 }
@@ -133,7 +134,7 @@ def schemes(folder, fvus=None, **options):
     made = []
     for name, (table, train, own, other) in PUBLISHED.items():
         part = planted_part(folder / name, (fvus or of_the_paper)(table), train=train, **options)
-        made.append(Scheme(name, name.replace("_", " ").capitalize(), part, own, other, table))
+        made.append(Scheme(name, name.replace("_", " ").capitalize(), part, own, other))
     return made
 
 
@@ -143,7 +144,7 @@ def judged(parts):
     parts = with_common_blocks({scheme.name: scheme for scheme in parts})
     without_estimates = [own for own in claimed.claims if not own.metric.startswith("band_power")]
     rows = block_errors.error_rows(replace(claimed, claims=without_estimates), parts, {})
-    of_errors = {"least_other_over_own", "other_over_own_ratios", "parameter_rank_correlations"}
+    of_errors = {"smallest_car_ratio", "relative_car_ratios", "parameter_rank_correlations"}
     of_errors |= {"specialised_over_others", "regularisation_loss_ratios", "operation_ratios"}
     of_errors |= {"stopping_epochs"}
     chosen = [
@@ -205,12 +206,14 @@ def test_regularisation_is_compared_on_the_same_structures_and_blocks(tmp_path):
         paper.LSTM: ("lstm", "states_2"),
         paper.NONLINEAR: ("ksnn", "nonlinear_no_bias_p2_q2"),
     }
-    with_it = planted_part(tmp_path / "with", of_the_paper(paper.TABLE_V), train="f", names=names)
+    with_it = planted_part(
+        tmp_path / "with", of_the_paper(ksnn_tables.TABLE_V), train="f", names=names
+    )
     table = {paper.LSTM: {"c2": 0.84, "f2": 0.042}, paper.NONLINEAR: {"c2": 0.197, "f2": 0.059}}
     without = planted_part(tmp_path / "without", table, train="f", names=names)
     found, rows, _ = judged(
         [
-            Scheme("scheme_2", "With", with_it, "f2", "c2", paper.TABLE_V),
+            Scheme("scheme_2", "With", with_it, "f2", "c2"),
             Scheme("one_vehicle", "Without", without, "f2", "c2"),
         ]
     )
@@ -261,7 +264,7 @@ def test_stretches_of_two_tests_have_the_variance_of_both(tmp_path):
         for own in claims_of("ksnn").claims
         if own.id == "all_structures_above_diagonal_scheme_1"
     )
-    values = measures.least_other_over_own(claim, {"scheme_1": scheme}).values
+    values = measures.smallest_car_ratio(claim, {"scheme_1": scheme}).values
     own, other = (
         scheme.errors(test).block_errors("luenberger/luenberger", "fvu") for test in ("c2", "f2")
     )

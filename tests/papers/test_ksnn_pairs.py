@@ -14,6 +14,7 @@ from vehest.data.recording import Recording
 from vehest_papers.ksnn import pairs, paper
 from vehest_papers.ksnn.candidates import category_of
 from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
+from vehest_papers.ksnn.document import TEMPLATE
 from vehest_papers.ksnn.sub_models import variance_shares
 
 
@@ -92,7 +93,7 @@ def test_pairs_without_all_trainings_and_seeds_of_some_pairs_are_left_out():
 
 def test_ratio_over_pairs_is_the_planted_one_and_its_power_that_of_the_spread():
     errors = errors_of(complete(8))
-    table = pairs.ratios_table(errors).frame.set_index("over")
+    table = pairs.ratios_table(errors).set_index("over")
     assert table.loc[paper.GRU, "other_stop_raw"].startswith("0.5 [") or table.loc[
         paper.GRU, "other_stop_raw"
     ].startswith("0.500 [")
@@ -150,6 +151,14 @@ def test_published_gates_on_the_ratio_are_met():
     )
     assert len(table) == 2
     assert np.all(np.abs(table["ours"] / table["published"] - 1.0) <= 0.05)
+
+
+def test_wins_in_leave_one_out_tests_are_those_of_the_published_study():
+    results = Path(__file__).parents[2] / "results"
+    table = pd.read_csv(results / "leave_one_out" / "tables" / "overview.csv", index_col=0)
+    cells = table.loc[f"{paper.NONLINEAR}, P = 2, Q = 2"].astype(str)
+    stated = f"On {cells.str.endswith('*').sum()} of {(cells != '–').sum()} tests"
+    assert stated in " ".join(TEMPLATE.read_text(encoding="utf-8").split())
 
 
 def test_report_shows_complete_pairs_of_a_study_that_is_not_finished(place):

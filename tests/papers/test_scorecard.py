@@ -33,12 +33,28 @@ def test_every_old_claim_is_mapped_and_every_paper_is_counted(files):
     page = files["scorecard.md"].split("## Verdicts on the papers' claims")[1]
     table = [line.strip("|").split("|") for line in page.splitlines() if line.startswith("|")]
     cells = [row[1:] for row in table[2 : 3 + len(VERDICTS)]]
-    counts = np.array([[int(cell.replace("–", "0")) for cell in row] for row in cells])
+    counts = np.array(
+        [[int(cell.replace("–", "0").split("(")[0]) for cell in row] for row in cells]
+    )
     of_papers = [
         sum(row["paper"] == paper and row["row"] == "claim" for row in rows)
         for paper in scorecard.PAPERS
     ]
     assert counts[-1].tolist() == counts[:-1].sum(axis=0).tolist() == of_papers
+
+
+def test_values_of_tables_are_lower_or_higher_where_ours_differ(files):
+    rows = [
+        row
+        for row in csv.DictReader(files["scorecard.csv"].splitlines())
+        if row["row"] == "table" and row["verdict"] in ("agrees", "lower", "higher")
+    ]
+    assert {"lower", "higher"} <= {row["verdict"] for row in rows}
+    for row in rows:
+        published = float(row["published"].rsplit(" ", 1)[1])
+        ours = float(row["ours"].removesuffix("]").rsplit(" [", 1)[0].rsplit(" ", 1)[1])
+        sides = {"lower": ours < published, "higher": ours > published, "agrees": True}
+        assert sides[row["verdict"]], row
 
 
 def test_readme_names_and_links_the_four_papers(files):
@@ -75,7 +91,7 @@ def test_a_study_with_errors_is_judged_and_a_stale_page_is_noticed(tmp_path, cap
     assert "100 + 100 / 1000 + 1000, insufficient" in row
     assert re.search(r"ratio 0\.[45]\d+ \[0\.", row)
     table = next(line for line in page.splitlines() if line.startswith("| NNTF\\_UH | `mse_"))
-    assert "*inconclusive*" in table or "*contradicted*" in table
+    assert "*inconclusive*" in table or "*lower*" in table
     scorecard.main(["--results", str(results), "--check"])
     (results / "scorecard.md").write_text(page.replace("direction only", "reproduced"))
     with pytest.raises(SystemExit) as caught:

@@ -20,7 +20,8 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import write_estimate
 from vehest.data.transforms import transform_from_config
 from vehest.estimators.base import FitData
-from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings

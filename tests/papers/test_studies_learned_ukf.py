@@ -502,7 +502,7 @@ def test_tables_show_means_with_intervals_and_the_papers_figures():
     generator = np.random.default_rng(0)
     values = generator.uniform(1.0, 3.0, 12) * generator.uniform(0.9, 1.1, (3, 12))
     blocks = planted_blocks("tyre_a", NNTF_UH=values, zero=[np.full(12, 5.0)])
-    frame = tables.accuracy(blocks, "real", "tyre_a", "t", "c").frame.set_index("candidate")
+    frame = tables.accuracy(blocks, "real", "tyre_a").set_index("candidate")
     row = frame.loc["NNTF_UH"]
     assert (row["paper_mse"], row["n_seeds"]) == (0.0063, 3)
     assert row["mse_low"] < row["mse"] < row["mse_high"]

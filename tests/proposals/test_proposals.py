@@ -18,7 +18,7 @@ from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
-from vehest.run.own_car.inspect import inspect
+from vehest.run.own_car.inspect import _busiest, inspect
 from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
@@ -898,6 +898,40 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
     )
 
 
+def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offered(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "t [s]": d["t"],
+            "vx [m/s]": d["vx"],
+            "yaw_rate [rad/s]": 100.0 * d["r"],
+            "ay [m/s²]": d["ay"],
+        }
+    )
+    channels, open_questions = left_out(tmp_path, table)
+    assert channels == {"vx": "vx [m/s]", "ay": "ay [m/s²]"}
+    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[1].split()
+    assert (name, unit, sign) == ("yaw_rate", "rad/s", "+1")
+    assert float(factor) == pytest.approx(0.01, rel=0.05)
+
+
+def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_read_twice(
+    monkeypatch,
+):
+    rows = np.random.default_rng(0).standard_normal((2, 40_000))
+    rows[:, 20_000:26_000] *= 5.0
+    lengths = []
+    nanstd = np.nanstd
+    monkeypatch.setattr(
+        np,
+        "nanstd",
+        lambda values, **options: (lengths.append(values.size), nanstd(values, **options))[1],
+    )
+    chosen = _busiest(rows, 6_000, 1_000)
+    np.testing.assert_array_equal(chosen, rows[:, 20_000:26_000])
+    assert sum(lengths) <= 2 * rows.size
+
+
 def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
     table = usual(drive())
     table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
@@ -1246,6 +1280,9 @@ def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_on
             "heading_error": d["r"] / 3.0,
         }
     )
+    without_units = table.rename(columns={"r [rad/s]": "r", "dpsi [rad]": "dpsi"})
+    with pytest.raises(VehestError, match='--answer "r=yaw_rate rad/s"'):
+        left_out(tmp_path, without_units)
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "r [rad/s]"}
     assert '--answer "Uy=vy_ref m/s"' in open_questions["Uy"].text

@@ -93,6 +93,30 @@ def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
     assert_yaw_rate_is(recording, table)
 
 
+@pytest.mark.parametrize("below", [["End of measurement", "# EOF"], ["Mean" + ",1.0" * 6, "Max,9"]])
+def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
+    table = usual(drive())
+    lines = lines_of(table)
+    file = tmp_path / "lap.csv"
+    below = [line + ",9" * (6 - line.count(",")) if "," in line else line for line in below]
+    text = [*lines[:500], "# marker: lap 2", *lines[500:], *below, ""]
+    file.write_text("\n".join(text), encoding="utf-8")
+    made, recording = read_back(file)
+    assert "not read: line '# marker: lap 2'" in made.notes
+    assert made.dataset.get("drop_rows", {}) == ({"lap": [6001, 6002]} if "," in below[0] else {})
+    assert len(recording) == 6000
+    assert_yaw_rate_is(recording, table)
+
+
+def test_a_row_of_numbers_that_is_cut_off_is_an_error(tmp_path):
+    lines = lines_of(usual(drive()))
+    file = tmp_path / "lap.csv"
+    for text in ("\n".join(lines)[:-30], "\n".join([*lines[:500], "bad,1.0,2.0", *lines[500:]])):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(DataError, match="Expected 7 columns"):
+            inspect("my_car", [file])
+
+
 def test_a_unit_of_time_that_the_steps_contradict_is_asked_with_the_one_that_fits(tmp_path):
     table = usual(drive()).rename(columns={"Time [s]": "tow(msec)"})
     clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
@@ -127,11 +151,40 @@ def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, secon
     assert (clock.asked, read_back(file)[1].rate_hz) == (False, 50.0)
 
 
+def test_a_row_of_units_in_brackets_has_the_unit_of_time(tmp_path):
+    lines = lines_of(usual(drive()).rename(columns={"Time [s]": "Time"}))
+    file = tmp_path / "lap.csv"
+    units = "[s],[km/h],[°/s],[g],[g],[°],[°]"
+    file.write_text("\n".join([lines[0], units, *lines[1:]]), encoding="utf-8")
+    clock = inspect("my_car", [file]).log.clock
+    assert (clock.unit, clock.asked) == ("s", False)
+
+
 def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path):
     table = usual(drive()).rename(columns={"Time [s]": "time [ticks]"})
     table["time [ticks]"] *= 100.0
     clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
     assert (clock.unit, clock.asked) == ("ms", True)
+
+
+DURATIONS = {
+    "ISO 8601": lambda seconds: f"PT{seconds:.2f}S",
+    "ISO 8601 with minutes": lambda s: (
+        f"PT{s // 60:.0f}M{s % 60:.2f}S" if s % 60 else f"PT{s / 60:.0f}M"
+    ),
+    "unit in each cell": lambda seconds: f"{seconds:.2f} s",
+}
+
+
+@pytest.mark.parametrize("name", DURATIONS)
+def test_durations_are_times(tmp_path, name):
+    table = usual(drive())
+    table["Time [s]"] = table["Time [s]"].map(DURATIONS[name])
+    _, recording = read_back(
+        write(tmp_path / "lap.csv", table.rename(columns={"Time [s]": "Elapsed"}))
+    )
+    assert (recording.rate_hz, recording.start_time) == (50.0, 0.0)
+    assert_yaw_rate_is(recording, table)
 
 
 @pytest.mark.parametrize("name", TIMES)

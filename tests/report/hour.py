@@ -1,4 +1,4 @@
-"""An hour of made-up driving at 20 Hz with eight estimators, for what a page of it weighs and does."""
+"""An hour of synthetic driving at 20 Hz with eight estimators, for tests of its page."""
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,10 @@ COLOURS = ("#4aa5e0", "#0b4f9c", "#f59a23", "#b8480b", "#8e24aa", "#00876c", "#d
 
 
 def hour_of_driving():
-    """Laps of 90 s, every signal with sensor noise; band and health with each estimator; sixteen channels."""
+    """Laps of 90 s, every signal with sensor noise.
+
+    Band and health with each estimator; sixteen channels.
+    """
     rng = np.random.default_rng(0)
     time = np.arange(int(RATE * SECONDS)) / RATE
 
@@ -50,8 +53,8 @@ def hour_of_driving():
         )
     columns["x"], columns["y"] = reckoned_course(vx, vy, yaw_rate, 1.0 / RATE)
     looks = [
-        {"label": title, "colour": own, "dark": on_dark(own), "dash": "solid"}
-        for title, own in zip(titles, COLOURS, strict=True)
+        {"label": title, "colour": colour, "dark": on_dark(colour), "dash": "solid"}
+        for title, colour in zip(titles, COLOURS, strict=True)
     ]
     content = {
         "start": 0.0,
@@ -67,7 +70,7 @@ def hour_of_driving():
     errors = [float(np.sqrt(np.mean((columns[f"vy{i}"] - vy) ** 2))) for i in range(len(COLOURS))]
     frame = pd.DataFrame({"title": titles, "error": errors})
     frame = frame.assign(low=0.8 * frame["error"], high=1.3 * frame["error"], interval="as drawn")
-    shown = {
+    panels = {
         "title": Column("estimator"),
         "error": Column("RMSE(v) [m/s]"),
         "interval": Column("interval", bar=("error", "low", "high")),
@@ -79,7 +82,7 @@ def hour_of_driving():
     return Document(
         "An hour",
         [
-            Table("board", "Board.", frame, shown, links),
+            Table("board", "Board.", frame, panels, links),
             Figure("traces", "Traces.", static, explorer),
         ],
     )

@@ -18,6 +18,10 @@ def unpacked(content):
     )
     codes = np.cumsum(raw[:, 0] + (raw[:, 1] << 8), axis=1, dtype=np.uint16)
     return {
-        name: np.where(own == GAP, np.nan, low + scale * own.astype(np.float64))
-        for own, (name, (low, scale)) in zip(codes, content["columns"].items(), strict=True)
+        name: np.where(
+            codes_of_column == GAP, np.nan, low + scale * codes_of_column.astype(np.float64)
+        )
+        for codes_of_column, (name, (low, scale)) in zip(
+            codes, content["columns"].items(), strict=True
+        )
     }

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
+from vehest.estimators.registry import estimator_names
 from vehest.report.comparison_figures import (
     Cloud,
     ForestRow,
@@ -12,7 +13,7 @@ from vehest.report.comparison_figures import (
     forest_figure,
 )
 from vehest.report.figures import Band, Traces, traces_figure, zoom_figure
-from vehest.report.style import REFERENCE, REFERENCE_GREY, Line
+from vehest.report.style import REFERENCE, REFERENCE_GREY, Line, line_of
 
 TIME = np.arange(200) / 20.0
 GRU = Line("#7b1fa2", "solid", "D")
@@ -41,8 +42,25 @@ def test_forest_plot_has_its_first_row_on_top_with_its_interval_and_figures():
     assert (axes.get_xscale(), axes.get_xlim()[0]) == ("linear", 0.0)
 
 
-def test_forest_plot_of_errors_that_differ_much_is_logarithmic():
-    assert forest_figure(rows(18.0)).axes[0].get_xscale() == "log"
+def test_forest_plot_of_errors_that_differ_much_is_logarithmic_and_says_so():
+    (axes,) = forest_figure(rows(18.0)).axes
+    assert axes.get_xscale() == "log"
+    assert axes.get_xlabel() == "RMSE(β) [deg], logarithmic scale"
+    assert forest_figure(rows(0.67)).axes[0].get_xlabel() == "RMSE(β) [deg]"
+
+
+def test_points_of_the_cloud_below_are_larger_than_those_above():
+    clouds = [Cloud(name, "#111111", TIME, TIME) for name in ("measured", "GRU", "LSTM")]
+    (axes,) = clouds_figure([(clouds, "x", "y", False)]).axes
+    first, *others = (line.get_markersize() for line in axes.lines)
+    assert all(first > size for size in others)
+
+
+@pytest.mark.parametrize("name", estimator_names())
+def test_no_estimator_is_drawn_in_a_grey_like_the_reference(name):
+    colour = line_of(name).colour if name != "ksnn" else line_of(name, "linear_bias_p2").colour
+    parts = [int(colour[start : start + 2], 16) for start in (1, 3, 5)]
+    assert max(parts) - min(parts) > 40
 
 
 def test_reference_lies_below_the_estimates_and_is_wider():
@@ -68,7 +86,9 @@ def test_band_covers_its_half_width_about_the_estimate_and_is_in_the_legend():
         (figure.axes[0], estimate.sideslip, 0.5),
         (figure.axes[2], estimate.vy, 0.25),
     ):
-        (area,) = [own for own in axes.collections if isinstance(own, PolyCollection)]
+        (area,) = [
+            collection for collection in axes.collections if isinstance(collection, PolyCollection)
+        ]
         corners = area.get_paths()[0].vertices
         at_start = corners[corners[:, 0] == TIME[50], 1]
         assert (at_start.min(), at_start.max()) == pytest.approx(
@@ -78,7 +98,7 @@ def test_band_covers_its_half_width_about_the_estimate_and_is_in_the_legend():
     assert set(labels) == {"measured", "GRU", "90 % band of GRU"}
 
 
-def test_agreement_has_one_panel_an_estimator_with_equal_limits():
+def test_agreement_has_a_panel_per_estimator_with_equal_limits():
     reference = 3.0 * np.sin(TIME)
     clouds = [Cloud(f"estimator {i}", GRU.colour, reference, 0.9 * reference) for i in range(5)]
     figure = agreement_figure(reference, clouds)

@@ -22,7 +22,7 @@ def drive():
 
 
 def estimate_of(drive, error=0.1, rate_hz=RATE):
-    """The reference with a constant error of v [m/s], a band of 0.2 m/s, invalid in the last 3 s."""
+    """The reference with a constant error of v [m/s] and a band of 0.2 m/s, invalid for 3 s."""
     step = round(drive.rate_hz / rate_hz)
     vx = drive["vx"][::step]
     vy = drive["vy_ref"][::step] + error
@@ -109,14 +109,14 @@ def test_course_follows_a_circle():
     assert np.hypot(points[:, 0], points[:, 1] - 20.0) == pytest.approx(20.0, abs=0.01)
 
 
-def test_two_estimates_by_one_estimator_differ_in_name_and_dash(drive):
+def test_two_estimates_by_the_same_estimator_differ_in_name_and_dash(drive):
     figure = drive_figure(drive, [estimate_of(drive), estimate_of(drive, error=0.3)])
     lines = {line.get_label(): line for line in axes_of(figure, "v [m/s]").get_lines()}
     assert {"mine", "mine (2)"} <= lines.keys()
     assert lines["mine"].get_linestyle() != lines["mine (2)"].get_linestyle()
 
 
-def test_what_is_not_there_is_left_out(drive):
+def test_missing_channels_have_no_panel(drive):
     bare = drive.without_references().select(["vx", "ay"])
     assert labels(drive_figure(bare)) == ["speed u [m/s]", "$a_y$ [m/s²]"]
     estimate = estimate_of(drive)
@@ -127,7 +127,7 @@ def test_what_is_not_there_is_left_out(drive):
     assert "there is nothing to draw" in refusal(lambda: drive_figure(alone), DataError)
 
 
-def test_a_range_is_drawn_alone_and_one_without_samples_is_refused(drive):
+def test_ranges_are_drawn_alone_and_empty_ranges_are_refused(drive):
     figure = drive_figure(drive, [estimate_of(drive)], 10.0, 12.0)
     assert axes_of(figure, "v [m/s]").get_xlim() == (10.0, pytest.approx(11.99))
     assert "no samples between" in refusal(lambda: drive_figure(drive, start=500.0), DataError)

@@ -41,15 +41,15 @@ def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate():
     assert np.isnan([x[2], y[2]]).all()
 
 
-def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
-    one, two, far, none = bars_of(
+def test_bars_share_an_axis_from_zero_and_outliers_are_cut():
+    unit, two, far, none = bars_of(
         [0.2, 0.4, 50.0, np.nan], [0.1, 0.3, 40.0, np.nan], [0.4, 0.5, 60.0, np.nan]
     )
     assert none is None
-    assert one["at"] > 0
-    assert two["at"] == pytest.approx(2 * one["at"], abs=0.1)
-    assert one["low"] < one["at"] < one["high"]
-    assert (one["cut"], far["cut"], far["at"]) == (False, True, 100.0)
+    assert unit["at"] > 0
+    assert two["at"] == pytest.approx(2 * unit["at"], abs=0.1)
+    assert unit["low"] < unit["at"] < unit["high"]
+    assert (unit["cut"], far["cut"], far["at"]) == (False, True, 100.0)
 
 
 def test_bars_go_with_their_rows_into_the_page_and_into_no_other_file(tmp_path):

@@ -1,4 +1,6 @@
-"""The page of a report in headless Chromium: what it draws, what its filter says, how it reads with dark and light, wide and narrow."""
+"""The page of a report in headless Chromium: what it draws, what its filter says, how it reads with
+dark and light, wide and narrow.
+"""
 
 import json
 import math
@@ -46,7 +48,10 @@ def hour(tmp_path_factory):
 
 def board(driver):
     """What the filter's table says: estimator -> RMSE(β) [deg], RMSE(v) [m/s]."""
-    script = "return [...document.querySelectorAll('.explorer tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
+    script = (
+        "return [...document.querySelectorAll('.explorer tbody tr')].map(row => "
+        "[...row.cells].map(cell => cell.textContent))"
+    )
     return {cells[1]: (float(cells[2]), float(cells[4])) for cells in driver.execute_script(script)}
 
 
@@ -72,9 +77,9 @@ def open_appendices(driver):
 
 def press(driver, text):
     (button,) = [
-        own
-        for own in driver.find_elements("css selector", ".views button, .filters button")
-        if own.text == text
+        toggle
+        for toggle in driver.find_elements("css selector", ".views button, .filters button")
+        if toggle.text == text
     ]
     button.click()
 
@@ -101,26 +106,26 @@ def test_errors_over_filtered_rows_follow_the_signals(chromium, toy):
     )
     assert f"{rows.sum()} of" in chromium.find_element("css selector", ".said").text
     press(chromium, "all rows")
-    shown = board(chromium)
-    assert len(shown) == len(FAMILIES)
+    figures = board(chromium)
+    assert len(figures) == len(FAMILIES)
     for row in ranked.to_dict("records"):
-        assert shown[row["title"]] == pytest.approx(
+        assert figures[row["title"]] == pytest.approx(
             (row["rmse_sideslip_chosen"], row["rmse_vy"]), abs=1e-3
         )
 
 
-def test_browser_unpacks_what_was_packed(chromium, toy):
+def test_browser_unpacks_the_packed_columns(chromium, toy):
     path, _, document = toy
     opened(chromium, path)
     (explorer,) = [
         block.interactive for block in document.blocks if getattr(block, "interactive", "")
     ]
-    known = unpacked(json.loads(explorer))
+    columns = unpacked(json.loads(explorer))
     for name in ("vx", "vy", "vy2", "x"):
         read = chromium.execute_script(
             f"return [...document.querySelector('figure.live').explorer.columns['{name}']]"
         )
-        assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)
+        assert np.array(read, dtype=float) == pytest.approx(columns[name], abs=1e-12, nan_ok=True)
 
 
 def test_all_traces_zoom_together_and_back(chromium, hour):
@@ -129,14 +134,14 @@ def test_all_traces_zoom_together_and_back(chromium, hour):
     for text, view in {
         "": (100.0, 120.0),
         "whole range": (0.0, 3599.95),
-        "busiest 20 s": (100.0, 120.0),
+        "20 s of largest sideslip": (100.0, 120.0),
     }.items():
         if text:
             press(chromium, text)
-        assert all(shown == pytest.approx(view) for shown in views(chromium))
+        assert all(current == pytest.approx(view) for current in views(chromium))
 
 
-def test_dragging_over_one_trace_zooms_all(chromium, hour):
+def test_dragging_over_a_trace_zooms_all(chromium, hour):
     from selenium.webdriver import ActionChains
 
     opened(chromium, hour)
@@ -153,14 +158,14 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
 
 def test_errors_can_be_taken_over_the_segment_in_view(chromium, hour):
     opened(chromium, hour)
-    press(chromium, "busiest 20 s")
+    press(chromium, "20 s of largest sideslip")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
     assert chromium.find_element("css selector", ".said").text.startswith(
         "401 of 72000 samples, 20.1 s"
     )
 
 
-def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium, toy):
+def test_leaderboard_sorts_by_its_bars_and_prints_the_command(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     open_appendices(chromium)
@@ -188,13 +193,13 @@ def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium, to
         return chromium.execute_script("return getComputedStyle(document.body).backgroundColor")
 
     grounds = {"light": "rgb(255, 255, 255)", "dark": "rgb(26, 26, 26)"}
-    other = SCHEMES[scheme == "light"]
+    opposite = SCHEMES[scheme == "light"]
     assert paper() == grounds[scheme]
     chromium.find_element("id", "theme").click()
-    assert paper() == grounds[other]
+    assert paper() == grounds[opposite]
     image = chromium.find_element("css selector", "#figure-forest_test img")
     assert (
-        image.value_of_css_property("color-scheme") == other
+        image.value_of_css_property("color-scheme") == opposite
     )  # by which an SVG image picks its colours
     chromium.execute_script("localStorage.clear()")
 
@@ -213,14 +218,17 @@ def test_page_is_accessible_fits_its_width_and_complains_of_nothing(
 
 
 CUT = """return [...document.querySelectorAll("main *")].filter(
-  (own) => own.clientWidth > 0 && own.scrollWidth > own.clientWidth + 1 && getComputedStyle(own).overflowX !== "visible"
+  (own) => own.clientWidth > 0 && own.scrollWidth > own.clientWidth + 1 &&
+    getComputedStyle(own).overflowX !== "visible"
 ).map((own) => own.ariaLabel ?? own.tagName)"""
 
 
 def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folded(
     chromium, tmp_path
 ):
-    """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
+    """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways
+    at 390, traces break between ranges.
+    """
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
     part = study(tmp_path / "study", tests)
     write_document(
@@ -234,18 +242,21 @@ def test_page_of_a_users_car_opens_with_verdict_forest_and_traces_the_rest_folde
     opened(chromium, tmp_path / "report.html", width=390)
     assert chromium.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     opened(chromium, tmp_path / "report.html", width=1280)
-    shown = chromium.execute_script("return document.querySelector('main').innerText")
+    text = chromium.execute_script("return document.querySelector('main').innerText")
     assert all(
-        words in shown
+        words in text
         for words in ("Verdict", "Recommended: KS-NN", "95 % interval", "vehest export")
     )
-    assert "FVU" not in shown
-    assert len(shown.split()) <= 1500
+    assert "FVU" not in text
+    assert len(text.split()) <= 1500
     assert chromium.execute_script(CUT) == []
-    gaps = "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) => line.includes(null))"
+    gaps = (
+        "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) "
+        "=> line.includes(null))"
+    )
     assert all(chromium.execute_script(gaps))
     first = "return document.querySelector('figure.live').explorer.detail.label"
-    assert f"Recommended: {chromium.execute_script(first)}, expected" in shown
+    assert f"Recommended: {chromium.execute_script(first)}, expected" in text
     open_appendices(chromium)
     assert "FVU" in chromium.execute_script("return document.querySelector('main').innerText")
     assert chromium.execute_script(CUT) == []
@@ -257,7 +268,7 @@ SERIES = (
 )
 
 
-def test_legend_names_what_is_drawn_and_the_reference_lies_below_the_estimates(chromium, hour):
+def test_legend_names_the_lines_and_the_reference_lies_below_the_estimates(chromium, hour):
     opened(chromium, hour)
     drawn = [f"Estimator {i}" for i in range(1, 5)]
     assert chromium.execute_script(LEGEND) == ["reference", *drawn, "90 % band of Estimator 1"]
@@ -271,22 +282,48 @@ def test_legend_names_what_is_drawn_and_the_reference_lies_below_the_estimates(c
 
 def test_strip_of_sensor_health_has_a_legend(chromium, hour):
     opened(chromium, hour)
-    heads = [own.text for own in chromium.find_elements("css selector", ".panel .head")]
+    heads = [head.text for head in chromium.find_elements("css selector", ".panel .head")]
     (strip,) = [text for text in heads if text.startswith("sensor health")]
     words = ("valid", "degraded", "invalid", *(f"Estimator {i}" for i in range(1, 5)))
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
 
 
-def test_appendices_are_one_folded_list_at_the_end(chromium, toy):
+def test_appendices_are_a_folded_list_at_the_end(chromium, toy):
     opened(chromium, toy[0])
-    after = "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, own.open])"
-    found = chromium.execute_script(after)
-    assert len(found) >= 5
-    assert all(section == ["DETAILS", False] for section in found)
-    contents = [own.text for own in chromium.find_elements("css selector", "nav a")]
+    after = (
+        "return [...document.querySelectorAll('#appendices ~ *')].map((own) => [own.tagName, "
+        "own.open])"
+    )
+    position = chromium.execute_script(after)
+    assert len(position) >= 5
+    assert all(section == ["DETAILS", False] for section in position)
+    contents = [link.text for link in chromium.find_elements("css selector", "nav a")]
     assert contents == ["Verdict", "Minutes of reference", "Appendices"]
     last = "return document.querySelector('#appendices ~ details:last-of-type h2').textContent"
     assert chromium.execute_script(last) == "Note"
+
+
+def test_a_figure_that_scrolls_on_a_phone_says_so(chromium, toy):
+    opened(chromium, toy[0], width=390)
+    places = chromium.execute_script(
+        "return [...document.querySelectorAll('.static')].filter((place) => place.clientWidth)"
+        ".map((place) => [place.scrollWidth > place.clientWidth,"
+        " getComputedStyle(place, '::before').content.includes('scroll sideways')])"
+    )
+    assert {True, False} == {scrolls for scrolls, _ in places}
+    assert all(scrolls == says_so for scrolls, says_so in places)
+
+
+def test_forest_plot_is_beside_the_verdict_on_a_wide_screen(chromium, toy):
+    opened(chromium, toy[0], width=1280)
+    text, figure = chromium.execute_script(
+        "return ['.text', '.text + figure'].map((selector) => {"
+        " const box = document.querySelector(selector).getBoundingClientRect();"
+        " return [box.left, box.right, box.top, box.bottom] })"
+    )
+    assert text[1] <= figure[0]
+    assert text[2] < figure[3]
+    assert figure[2] < text[3]
 
 
 def test_page_shows_the_figure_where_scripts_may_not_run(chromium, toy):

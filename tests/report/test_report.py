@@ -39,7 +39,8 @@ from vehest.studies.kit.warnings import warnings_of
 RATE = 20.0
 PROTOCOL = Protocol(rate_hz=RATE, warm_up_seconds=2.0, skip_seconds=1.5)
 
-# (estimator, variant, title) -> for each seed, the size of its error on the validation and on the test range
+# (estimator, variant, title) -> for each seed, the size of its error on the validation and on the
+# test range
 FAMILIES = {
     ("luenberger", "luenberger", "Luenberger"): [(0.30, 0.30)],
     ("ksnn", "linear_bias_p2", "KS-NN linear + bias, P = 2"): [
@@ -159,10 +160,13 @@ def history(epochs):
     return pd.DataFrame({"epoch": epoch, "train_loss": 1.0 / epoch, "validation_loss": 1.5 / epoch})
 
 
-def with_value(artefacts, value, **where):
+def with_value(artefacts, value, **conditions):
     metrics = artefacts.metrics.copy()
     hit = np.logical_and.reduce(
-        [(metrics[name] == wanted).to_numpy() for name, wanted in where.items()]
+        [
+            (metrics[name] == value_to_match).to_numpy()
+            for name, value_to_match in conditions.items()
+        ]
     )
     assert hit.any()
     metrics.loc[hit, "value"] = value
@@ -187,7 +191,7 @@ def written(artefacts, tmp_path_factory):
     return folder
 
 
-def test_seed_is_chosen_on_validation_and_the_lower_one_in_a_tie(
+def test_seed_is_chosen_on_validation_and_the_lower_seed_in_a_tie(
     artefacts,
 ):
     row = row_of(leaderboard(artefacts), "ksnn")
@@ -199,8 +203,8 @@ def test_seed_is_chosen_on_validation_and_the_lower_one_in_a_tie(
         > row["rmse_sideslip_min"]
     )
     tied = with_value(artefacts, 0.05, estimator="ksnn", test_set="validation", metric="rmse_vy")
-    for own in (tied, replace(tied, models=list(reversed(tied.models)))):
-        assert row_of(leaderboard(own), "ksnn")["seed"] == 0
+    for part in (tied, replace(tied, models=list(reversed(tied.models)))):
+        assert row_of(leaderboard(part), "ksnn")["seed"] == 0
     single = row_of(leaderboard(artefacts), "luenberger")
     assert (
         math.isnan(single["epochs"]),
@@ -268,14 +272,18 @@ def test_leaderboard_is_sorted_by_sideslip_error_within_each_test_set(tmp_path):
 
 
 def test_subsets_and_other_conditions_do_not_enter_the_leaderboard(artefacts, tmp_path):
-    other = artefacts.metrics.assign(value=99.0)
+    with_conditions = artefacts.metrics.assign(value=99.0)
     metrics = pd.concat(
-        [artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")]
+        [
+            artefacts.metrics,
+            with_conditions.assign(subset="nonlinear"),
+            with_conditions.assign(condition="noisy"),
+        ]
     )
     artefacts.metrics.to_csv(tmp_path / "metrics.csv", index=False)
-    for own in (metrics, pd.read_csv(tmp_path / "metrics.csv")):
+    for table in (metrics, pd.read_csv(tmp_path / "metrics.csv")):
         pd.testing.assert_frame_equal(
-            leaderboard(replace(artefacts, metrics=own)), leaderboard(artefacts)
+            leaderboard(replace(artefacts, metrics=table)), leaderboard(artefacts)
         )
 
 
@@ -363,15 +371,15 @@ def test_bound_stands_beside_the_errors_and_floors_are_tabled_from_the_spread_do
 
 def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts):
     assert table_of(artefacts, "regimes_test") is None
-    known = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
-    known = with_value(
-        known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip"
+    table_of_regimes = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
+    table_of_regimes = with_value(
+        table_of_regimes, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip"
     )
-    headers, rows, _ = formatted(table_of(known, "regimes_test"))
+    headers, rows, _ = formatted(table_of(table_of_regimes, "regimes_test"))
     assert headers == ["estimator", "turning (38 %)"]
     assert {row[0]: row[1] for row in rows}["KS-NN linear + bias, P = 2"] == "0.500"
     assert [row[1] for row in rows].count("0.250") == 4
-    pd.testing.assert_frame_equal(leaderboard(known), leaderboard(artefacts))
+    pd.testing.assert_frame_equal(leaderboard(table_of_regimes), leaderboard(artefacts))
 
 
 def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
@@ -394,9 +402,10 @@ def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
 def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(
     artefacts, tmp_path
 ):
-    whole = drive()
+    recording = drive()
     write_recording(
-        whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet"
+        recording.select([name for name in recording.channels if name != "ay"]),
+        tmp_path / "lap.parquet",
     )
     without = replace(artefacts, references={("toy", "lap"): tmp_path / "lap.parquet"})
     assert warnings_of(without) == [
@@ -412,19 +421,21 @@ def words_of(artefacts):
     return "\n\n".join(block for block in comparison(artefacts).blocks if isinstance(block, str))
 
 
-def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(artefacts):
+def test_verdict_names_the_best_and_recommends_only_above_both_baselines(artefacts):
     """KS-NN alone, then with a twin of itself, then without the baselines, then baselines alone."""
     text = words_of(artefacts)
     best = leaderboard(artefacts).iloc[0]
     assert best["estimator"] == "ksnn"
     low, high = best["rmse_sideslip_low"], best["rmse_sideslip_high"]
     assert text.startswith(
-        f"## Verdict\n\n**Best: {best['title']}, {best['rmse_sideslip']:.2f}° [{low:.2f}, {high:.2f}].** "
-        "Every other estimator is significantly worse. **Recommended: KS-NN linear + bias, P = 2**, "
+        f"## Verdict\n\n**Best: {best['title']}, {best['rmse_sideslip']:.2f}° [{low:.2f}, "
+        f"{high:.2f}].** "
+        "Every other estimator is significantly worse. **Recommended: KS-NN linear + bias, P = "
+        "2**, "
     )
     assert (
-        "5 estimators were compared with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 epochs a network"
-        in text
+        "5 estimators were compared with 1 to 3 seeds each, 8 fits in all; training took 10 to 12 "
+        "epochs a network" in text
     )
     twin = [
         replace(model, variant="twin", title="Twin")
@@ -444,15 +455,15 @@ def test_verdict_names_the_best_and_recommends_only_what_beats_both_baselines(ar
     text = words_of(twins)
     assert "Twin and GRU | 5 &lt;states> are not significantly worse. **Recommended: KS-NN" in text
     assert (
-        "of the 3 estimators among these that are significantly better than the zero-sideslip baseline"
-        in text
+        "of the 3 estimators among these that are significantly better than the zero-sideslip "
+        "baseline" in text
     )
     missing = "none was compared with the zero-sideslip baseline and the static map."
     assert f"**No estimator is recommended**: {missing}" in words_of(alone)
     without = replace(
         artefacts, models=[model for model in artefacts.models if model.estimator != "ksnn"]
     )
-    assert ["PCT/IT2023/050058" in words_of(own) for own in (artefacts, without)] == [True, False]
+    assert ["PCT/IT2023/050058" in words_of(part) for part in (artefacts, without)] == [True, False]
 
 
 def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts):
@@ -465,9 +476,7 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
         assert row["rmse_sideslip_low"] < row["rmse_sideslip_median"] < row["rmse_sideslip_high"]
 
 
-def test_report_says_how_it_was_made_and_on_its_first_page_whether_data_are_real(
-    artefacts, written
-):
+def test_report_states_its_provenance_and_the_kind_of_data(artefacts, written):
     for kind, words in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         verdict, forest, _, busiest = comparison(replace(artefacts, kinds={"toy": kind})).blocks[:4]
         assert f"on test set `test` ({kind}; " in forest.caption
@@ -491,8 +500,8 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
     short = [replace(model, training={"max_epochs": 11}) for model in artefacts.models]
     assert (
-        "Training ended at its limit, and longer training may lower the error: KS-NN linear + bias, P = 2 (11 epochs, 2 of 3 seeds)"
-        in words_of(replace(artefacts, models=short))
+        "Training ended at its limit, and longer training may lower the error: KS-NN linear + "
+        "bias, P = 2 (11 epochs, 2 of 3 seeds)" in words_of(replace(artefacts, models=short))
     )
 
 
@@ -553,10 +562,10 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
 ):
     places = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # that of this process is drawn
-    made = tmp_path / artefacts.references["toy", "lap"].parent.name
+    folder = tmp_path / artefacts.references["toy", "lap"].parent.name
     report = tmp_path / written.name
     subprocess.run(
-        [sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places],
+        [sys.executable, "-c", DRAWN_ELSEWHERE, str(folder), str(report), *places],
         env=environment,
         check=True,
     )
@@ -569,7 +578,7 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
         assert (report / file).read_bytes() == (written / file).read_bytes(), file
 
 
-def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path):
+def test_content_of_the_page_is_in_no_other_file(tmp_path):
     frame = pd.DataFrame({"train_seconds": [1.5]})
     document = Document(
         "Words", ["Only words.", Table("first", "First.", pd.DataFrame({"a": [1]}))]
@@ -606,10 +615,10 @@ def test_times_are_medians_over_seeds_by_part_and_estimator():
         rows, columns=["part", "estimator", "variant", "seed", "test_set", "metric", "value"]
     )
     titles = {("gru", "states_5"): "GRU", ("zero", "zero"): "Zero"}
-    heading, shown = timings_of_study(
-        [(part, own, titles) for part, own in table.groupby("part", sort=False)]
+    heading, printed_rows = timings_of_study(
+        [(part, part_table, titles) for part, part_table in table.groupby("part", sort=False)]
     )
-    headers, cells, _ = formatted(shown)
+    headers, cells, _ = formatted(printed_rows)
     assert (heading, headers[:2], headers[-1]) == (
         "## Times",
         ["part", "estimator"],
@@ -623,7 +632,9 @@ def test_times_are_medians_over_seeds_by_part_and_estimator():
 
 
 class Page(HTMLParser):
-    """Tags, attributes and text of a page, everything in it that a browser would load, and the cells of its tables."""
+    """Tags, attributes and text of a page, everything in it that a browser would load, and the
+    cells of its tables.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -741,7 +752,7 @@ def test_table_columns_have_common_decimals_and_dashes_for_missing_values():
     assert (decimals_for([0.31, 0.44, 12.0]), decimals_for([math.nan])) == (3, 0)
 
 
-def test_each_family_has_one_hue_with_contrast_on_dark_and_light_pages():
+def test_each_family_has_a_hue_with_contrast_on_dark_and_light_pages():
     assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
     assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [
@@ -758,8 +769,8 @@ def test_each_family_has_one_hue_with_contrast_on_dark_and_light_pages():
         ]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
-    def contrast(one, other):
-        high, low = sorted((luminance(one), luminance(other)), reverse=True)
+    def contrast(first, second):
+        high, low = sorted((luminance(first), luminance(second)), reverse=True)
         return (high + 0.05) / (low + 0.05)
 
     ksnn = [
@@ -778,14 +789,17 @@ def test_decimation_keeps_peaks_ends_and_gaps():
     values = np.sin(time)
     values[4321] = 7.0
     values[8000:8200] = np.nan
-    at, kept = decimated(time, values, 400)
+    at, values_drawn = decimated(time, values, 400)
     assert len(at) < 650
-    assert (np.nanmax(kept), (at[0], at[-1])) == (7.0, (time[0], time[-1]))
-    assert np.isnan(kept[(at > 80.0) & (at < 82.0)]).all()
+    assert (np.nanmax(values_drawn), (at[0], at[-1])) == (7.0, (time[0], time[-1]))
+    assert np.isnan(values_drawn[(at > 80.0) & (at < 82.0)]).all()
     assert (np.diff(at) > 0).all()
 
 
 def test_importing_the_report_package_loads_no_drawing_library():
-    code = "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', 'jinja2'} & set(sys.modules))"
+    code = (
+        "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', "
+        "'jinja2'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

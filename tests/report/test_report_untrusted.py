@@ -53,18 +53,18 @@ def test_hostile_name_is_plain_text_in_both_forms_of_a_report(tmp_path, name):
     (tmp_path / "hostile").mkdir()
     write_document(_document("plain"), tmp_path / "plain")
     write_document(_document(name), tmp_path / "hostile")
-    for calm, shown in zip(
+    for calm, hostile in zip(
         _rendered(tmp_path / "plain"), _rendered(tmp_path / "hostile"), strict=True
     ):
         expected = Page(calm)
-        seen = Page(shown)
-        assert seen.tags.count("script") == expected.tags.count("script")
-        assert seen.tags.count("img") == expected.tags.count("img") == 0
-        assert seen.tags.count("td") == expected.tags.count("td"), "a cell stays one cell"
-        assert not any(key.startswith("on") for key, _ in seen.attributes)
+        page = Page(hostile)
+        assert page.tags.count("script") == expected.tags.count("script")
+        assert page.tags.count("img") == expected.tags.count("img") == 0
+        assert page.tags.count("td") == expected.tags.count("td"), "a cell stays one cell"
+        assert not any(key.startswith("on") for key, _ in page.attributes)
         assert not any(
             key in ("href", "src") and re.match(r"\s*javascript:", value or "", re.I)
-            for key, value in seen.attributes
+            for key, value in page.attributes
         )
     lenient = MarkdownIt("commonmark", {"html": True})
     line = (
@@ -74,13 +74,16 @@ def test_hostile_name_is_plain_text_in_both_forms_of_a_report(tmp_path, name):
         .replace("\x9b", r"\x9b")
     )
     for form in (as_text, as_code):
-        seen = Page(lenient.render(f"Name: {form(name)}"))
-        assert seen.text.strip() == f"Name: {line}"
-        assert set(seen.tags) <= {"p", "code"}
+        page = Page(lenient.render(f"Name: {form(name)}"))
+        assert page.text.strip() == f"Name: {line}"
+        assert set(page.tags) <= {"p", "code"}
 
 
 def test_honest_markdown_stays_as_it_is(tmp_path):
-    text = "**Bold** with `code <b>`, a [link](tables/names.csv), <https://example.org>, |ω| < 3 rad/s and [deg]."
+    text = (
+        "**Bold** with `code <b>`, a [link](tables/names.csv), <https://example.org>, |ω| < 3 "
+        "rad/s and [deg]."
+    )
     write_document(Document("Honest", [text]), tmp_path)
     assert text in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert as_text("KS-NN (Revs) sim_quickstart, 20 Hz") == "KS-NN (Revs) sim_quickstart, 20 Hz"

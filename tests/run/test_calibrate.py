@@ -1,4 +1,6 @@
-"""Calibration as a stage: between training and evaluation, found by its model, and left out where there is nothing to calibrate by."""
+"""Calibration as a stage: between training and evaluation, found by its model, and left out where
+there is nothing to calibrate by.
+"""
 
 import csv
 import json
@@ -60,10 +62,10 @@ def evaluated(place):
 def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
     place, model, evaluation = evaluated
     outputs = place.folder / "outputs"
-    found = calibration_of(model, outputs)
-    assert [folder.name for folder in (outputs / STAGE).iterdir()] == [found.folder.name]
-    assert found.inputs["model"] == read_artefact(model).digest
-    assert read_artefact(evaluation).inputs["calibration"] == found.digest
+    calibration = calibration_of(model, outputs)
+    assert [folder.name for folder in (outputs / STAGE).iterdir()] == [calibration.folder.name]
+    assert calibration.inputs["model"] == read_artefact(model).digest
+    assert read_artefact(evaluation).inputs["calibration"] == calibration.digest
     trust = trust_of(model, outputs)
     assert (trust.bands.vehicles, trust.bands.calibrated_on) == (("my car",), ("two (all)",))
     assert trust.bands.scaled_on == ("one (all)",)
@@ -79,7 +81,7 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
         ("here", place.folder / model),
         ("away", shutil.copytree(place.folder / model, tmp_path / "away")),
     ):
-        said, _ = place.done(
+        output, _ = place.done(
             "estimate",
             str(folder),
             str(lap),
@@ -90,9 +92,9 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
         )
         with open(out, encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
-        found = any(row.get("band_sideslip") for row in rows)
-        assert found == (name == "here")
-        assert ("this model has no calibration" in json.loads(said)["verdict"]) != found
+        has_band = any(row.get("band_sideslip") for row in rows)
+        assert has_band == (name == "here")
+        assert ("this model has no calibration" in json.loads(output)["verdict"]) != has_band
 
 
 def test_bands_are_twice_as_wide_on_a_test_elsewhere(
@@ -102,16 +104,16 @@ def test_bands_are_twice_as_wide_on_a_test_elsewhere(
     estimate = read_estimate(evaluation / "test" / "0.parquet")
     assert np.array_equal(np.isfinite(estimate["band_vy"]), np.isfinite(estimate["vy"]))
     floors = trust_of(model, place.folder / "outputs").bands
-    which = LEVELS.index(0.9)
-    assert estimate["band_vy"].min() >= floors.vy.factors[which] * floors.vy.floor
+    level = LEVELS.index(0.9)
+    assert estimate["band_vy"].min() >= floors.vy.factors[level] * floors.vy.floor
     assert estimate["band_sideslip"].max() <= math.pi
     place, _, evaluation = evaluated
     out = place("eval", *TRAIN, "evaluation.elsewhere='other, test'", "--json")[1]
-    here, there = (
+    at_home, elsewhere = (
         read_estimate(folder / "test" / "0.parquet")
         for folder in (evaluation, Path(json.loads(out)["folder"]))
     )
-    np.testing.assert_allclose(there["band_vy"], 2.0 * here["band_vy"])
+    np.testing.assert_allclose(elsewhere["band_vy"], 2.0 * at_home["band_vy"])
 
 
 def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleration(evaluated):
@@ -142,10 +144,10 @@ def test_a_run_calibrates_each_model_once_and_shows_it(place):
     assert f" 4 {STAGE}" in line
 
 
-def test_missing_calibration_is_made_again(evaluated, tmp_path):
+def test_missing_calibration_is_recomputed(evaluated, tmp_path):
     place, model, evaluation = evaluated
-    found = calibration_of(model, place.folder / "outputs")
-    (found.folder / "trust.yaml").unlink()
+    calibration = calibration_of(model, place.folder / "outputs")
+    (calibration.folder / "trust.yaml").unlink()
     before = (model / "manifest.json").stat().st_mtime_ns
     outcome = place.told("eval", *TRAIN)
     assert outcome | {"skipped": True} == outcome, (
@@ -192,7 +194,7 @@ def test_a_damaged_calibration_is_an_error_and_not_a_model_without_bands(evaluat
         assert trust_of(model, place.folder / "outputs") is None, "of another model, by its name"
 
 
-def test_a_damaged_model_is_not_taken_for_one_without_a_calibration(evaluated):
+def test_damaged_models_are_distinct_from_uncalibrated_models(evaluated):
     place, model, _ = evaluated
     (model / "manifest.json").write_text("{")
     with pytest.raises(DataError, match=r"manifest\.json"):

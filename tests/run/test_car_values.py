@@ -1,4 +1,6 @@
-"""Values of a car in its data set: every command uses them, and a band does not depend on the data set's name."""
+"""Values of a car in its data set: every command uses them, and a band does not depend on the data
+set's name.
+"""
 
 import json
 from dataclasses import replace
@@ -52,8 +54,8 @@ def self_calibrating():
 
 
 def settings_after(model, car=None, settings=None, record=None):
-    found, _, remarks = adapted(model, None, car or CarValues(), settings or {}, record)
-    return found.settings.wheelbase, found.settings.cg_to_rear_axle, " ".join(remarks)
+    estimator, _, remarks = adapted(model, None, car or CarValues(), settings or {}, record)
+    return estimator.settings.wheelbase, estimator.settings.cg_to_rear_axle, " ".join(remarks)
 
 
 def test_command_line_precedes_record_data_set_and_default(
@@ -70,15 +72,15 @@ def test_command_line_precedes_record_data_set_and_default(
     assert settings_after(self_calibrating, car, record=of_the_same_car)[:2] == (2.4, 1.07)
 
 
-def test_the_default_wheelbase_is_remarked_only_where_none_is_known(self_calibrating):
+def test_default_wheelbase_is_remarked_only_without_a_configured_wheelbase(self_calibrating):
     assumed = "the wheelbase is assumed to be 2.7 m"
     assert assumed in settings_after(self_calibrating)[2]
-    for known in (
+    for arguments in (
         {"car": CarValues(wheelbase=2.4)},
         {"settings": {"wheelbase": 2.7}},
         {"record": RECORD},
     ):
-        assert assumed not in settings_after(self_calibrating, **known)[2]
+        assert assumed not in settings_after(self_calibrating, **arguments)[2]
     assert (
         "wheelbase 2.4 m: of the data set"
         in settings_after(self_calibrating, CarValues(wheelbase=2.4))[2]
@@ -95,13 +97,13 @@ def test_estimate_compare_and_identify_use_the_wheelbase_of_the_data_set(place):
     write_dataset("small", car={"wheelbase": 0.33})
     write_dataset("unknown_car")
     place.done("estimate", "lap.csv", "dataset=small", "-o", "small.parquet")
-    said = place.done("estimate", "lap.csv", "estimator.wheelbase=0.33", "-o", "given.parquet")[1]
-    assert "assumed" not in said
+    output = place.done("estimate", "lap.csv", "estimator.wheelbase=0.33", "-o", "given.parquet")[1]
+    assert "assumed" not in output
     place.done("estimate", "lap.csv", "dataset=unknown_car", "-o", "default.parquet")
-    small, given, default = (
+    small, configured, default = (
         read_estimate(Path(f"{name}.parquet"))["vy"] for name in ("small", "given", "default")
     )
-    np.testing.assert_array_equal(small, given)
+    np.testing.assert_array_equal(small, configured)
     assert np.abs(small - default).max() > 0.05
 
     def compared(*words):
@@ -115,9 +117,9 @@ def test_estimate_compare_and_identify_use_the_wheelbase_of_the_data_set(place):
     assert yaml.safe_load(Path("car.yaml").read_text(encoding="utf-8"))["wheelbase"] == 0.33
 
 
-def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
+def test_null_wheelbase_in_a_training_is_that_of_its_only_car():
     config = {"estimator": {"name": "data_sheet", "wheelbase": None, "cg_to_rear_axle": None}}
-    first, second, other = (
+    first, second, third = (
         TABLE | {"name": "one", "car": {"wheelbase": wheelbase, "cg_to_rear_axle": rear}}
         for wheelbase, rear in ((2.4, 1.1), (2.4, 1.2), (2.6, 1.2))
     )
@@ -128,12 +130,12 @@ def test_a_wheelbase_of_null_in_a_training_is_that_of_its_one_car():
 
     assert values(config, first) == (2.4, 1.1)
     assert values(config, first, second) == (2.4, None)
-    assert values(config, first, other) == (None, None)
-    given = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
-    assert with_car_values(given, [car_of(first)]) is given
+    assert values(config, first, third) == (None, None)
+    configured = {"estimator": {"name": "data_sheet", "wheelbase": 3.0, "cg_to_rear_axle": None}}
+    assert with_car_values(configured, [car_of(first)]) is configured
     filter_of = {"name": "self_calibrating", "wheelbase": 2.7, "cg_to_rear_axle": None}
     assert values({"estimator": filter_of}, first) == (2.4, 1.1)  # 2.7 m is its default
-    assert values({"estimator": filter_of}, first, other) == (2.7, None)
+    assert values({"estimator": filter_of}, first, third) == (2.7, None)
     assert values({"estimator": filter_of}, TABLE | {"name": "one"}) == (2.7, None)
     assert values({"estimator": filter_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     without = {"estimator": {"name": "zero"}}
@@ -170,11 +172,11 @@ def test_band_depends_on_the_car_and_not_on_the_name_of_a_data_set(place, model)
 
     def band(*words):
         out, _ = place.done("estimate", "own", "lap.csv", *words, "--json")
-        said = json.loads(out)
+        result = json.loads(out)
         metadata = json.loads(pq.read_schema("estimate.parquet").metadata[b"vehest"])
-        assert metadata["band"] == said["band"]
+        assert metadata["band"] == result["band"]
         read_estimate(Path("estimate.parquet"))
-        return said["band_sideslip_deg"]["median"], said["band"]
+        return result["band_sideslip_deg"]["median"], result["band"]
 
     alone, basis = band()
     assert basis.startswith("calibrated on recordings of 'planar'")
@@ -282,13 +284,13 @@ def test_an_export_is_of_the_car_of_its_data_set(place):
         vectors = Path("c/expected.csv").read_text(encoding="utf-8")
         return source + vectors, err
 
-    of_dataset, said = exported("dataset=f1")
-    assert "wheelbase 0.33 m: of the data set" in said
+    of_dataset, output = exported("dataset=f1")
+    assert "wheelbase 0.33 m: of the data set" in output
     assert of_dataset == exported("dataset.car.wheelbase=0.33")[0]
     assert of_dataset == exported("estimator.wheelbase=0.33")[0]
-    default, said = exported()
+    default, output = exported()
     assert of_dataset != default
-    assert "the wheelbase is assumed to be 2.7 m" in said
+    assert "the wheelbase is assumed to be 2.7 m" in output
 
 
 def test_a_band_is_doubled_on_a_car_whose_values_are_others(place):
@@ -310,8 +312,8 @@ def test_a_band_is_doubled_on_a_car_whose_values_are_others(place):
     write_dataset("named", car={"wheelbase": 0.33}, vehicle="my_f1")
 
     def band(*words):
-        said = json.loads(place.done("estimate", "own", "lap.csv", *words, "--json")[0])
-        return said["band_sideslip_deg"]["median"], said["band"]
+        result = json.loads(place.done("estimate", "own", "lap.csv", *words, "--json")[0])
+        return result["band_sideslip_deg"]["median"], result["band"]
 
     alone, basis = band("dataset=same")
     assert "assumed to be of the same car, as neither names nor values of car differ" in basis
@@ -361,7 +363,7 @@ def test_calibrations_keep_the_cars_of_their_data_sets(model, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("car", "other", "difference"),
+    ("car", "second_car", "difference"),
     [
         (CarValues(2.55), CarValues(2.647), ""),  # two sources on one Volvo V40
         (CarValues(2.7), CarValues(2.9), "wheelbase 2.7 m, not 2.9 m"),
@@ -370,21 +372,19 @@ def test_calibrations_keep_the_cars_of_their_data_sets(model, tmp_path):
         (CarValues(), CarValues(2.7, 1500.0), ""),
     ],
 )
-def test_cars_differ_by_wheelbase_and_mass_beyond_what_sources_and_load_explain(
-    car, other, difference
-):
-    assert car.difference_to(other) == difference
+def test_cars_differ_by_wheelbase_and_mass_beyond_sources_and_load(car, second_car, difference):
+    assert car.difference_to(second_car) == difference
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [
         ({"cg_to_rear_axle": 2.6}, "cg_to_rear_axle must be below the wheelbase (2.6 m), not 2.6"),
         ({"imu_to_rear_axle": -2.7}, r"imu_to_rear_axle .* (-2.6 to 5.2 m), not at -2.7"),
         ({"imu_to_rear_axle": 5.3}, r"imu_to_rear_axle .* (-2.6 to 5.2 m), not at 5.3"),
     ],
 )
-def test_places_that_no_car_of_this_wheelbase_has_are_refused(values, said):
-    with pytest.raises(ValueError, match=said.replace("(", r"\(").replace(")", r"\)")):
+def test_places_that_no_car_of_this_wheelbase_has_are_refused(values, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(").replace(")", r"\)")):
         CarValues(wheelbase=2.6, **values)
     CarValues(**values)

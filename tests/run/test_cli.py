@@ -1,4 +1,6 @@
-"""The command line from end to end, on a small data set of its own: what runs, what is skipped, what is refused."""
+"""The command line from end to end, on a small data set of its own: what runs, what is skipped,
+what is refused.
+"""
 
 import importlib.util
 import json
@@ -37,17 +39,17 @@ def _statuses(err):
     ]
 
 
-def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
+def test_pipeline_reuses_artefacts_and_reruns_only_changed_stages(place):
     out, err = place.once("run", "small", "tracking=none")
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
-    made = place.files()
+    files = place.files()
 
     again, err = place.done("run", "small", "tracking=none")
     assert ({status for status, _ in _statuses(err)}, again, place.files()) == (
         {"reused"},
         out,
-        made,
+        files,
     )
 
     (place.folder / "README.md").write_text("changed")
@@ -62,20 +64,20 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     assert not any(" ingest " in line or " downsample " in line for line in done)
 
 
-def test_two_processes_give_the_same_numbers_as_one_and_a_dry_run_makes_nothing(place):
+def test_two_processes_give_the_same_numbers_and_a_dry_run_writes_nothing(place):
     place.change("pipelines/small.yaml", sweeps=PIPELINE["sweeps"][1:])
     assert ("would", "ingest") in _statuses(place.done("run", "small", "--dry-run")[1])
     assert place.files() == set()
     place("run", "small", "tracking=none", "output=one")
     place.done("run", "small", "--jobs", "2", "tracking=none", "output=two")
     for model in (place.folder / "one" / "train").iterdir():
-        other = place.folder / "two" / "train" / model.name
+        parallel = place.folder / "two" / "train" / model.name
         assert (model / "model.safetensors").read_bytes() == (
-            other / "model.safetensors"
+            parallel / "model.safetensors"
         ).read_bytes()
 
 
-def test_a_failed_job_is_reported_and_the_others_are_kept(place):
+def test_failed_jobs_are_reported_and_other_results_remain(place):
     sweeps = [
         PIPELINE["sweeps"][0],
         [
@@ -89,14 +91,14 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     code, out, err = place("run", "small", "tracking=none")
     assert code == 5
     assert (
-        "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss"
-        in err
+        "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the "
+        "validation loss" in err
     )
     assert "Traceback" not in err
-    kept = {
+    remaining = {
         folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()
     }
-    assert kept == {"luenberger-luenberger"}
+    assert remaining == {"luenberger-luenberger"}
     assert all(
         words in out
         for words in (
@@ -112,7 +114,7 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     assert not (place.folder / "results").exists()
 
 
-def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
+def test_reports_show_present_results_and_name_missing_ones(place):
     place.once("run", "small", "tracking=none")
     place.refused(
         "report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run"
@@ -142,7 +144,7 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     assert reason == NO_TIME
 
 
-def test_train_eval_estimate_report_one_by_one(place):
+def test_train_eval_estimate_and_report_run_as_separate_commands(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
     trained = place.told("train", *arguments)
     assert (
@@ -231,9 +233,9 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
     assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
-    shown = place.told("data", "show", "mine")
-    assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
-    assert shown["recordings"][0]["rate_hz"] == 100.0
+    description = place.told("data", "show", "mine")
+    assert [recording["id"] for recording in description["recordings"]] == ["one", "three", "two"]
+    assert description["recordings"][0]["rate_hz"] == 100.0
     out, _ = place.done("data", "check", "mine")
     assert "d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation" in out
     assert "yaw_rate" in place("data", "channels")[1]
@@ -248,23 +250,29 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
     )
 
 
-def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
+def test_doctor_names_the_purpose_of_an_absent_extra(place, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
-        lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"),
+        lambda name, *options: None if name == "optuna" else find(name, *options) or find("vehest"),
     )
-    found = {item["name"]: item for item in place.told("doctor")}
-    assert (found["compiled recursions"]["level"], found["extras"]["level"]) == ("ok", "warning")
-    assert "Optuna need 'vehest[tuning]': pip install" in found["extras"]["message"]
+    checks = {item["name"]: item for item in place.told("doctor")}
+    assert (checks["compiled recursions"]["level"], checks["extras"]["level"]) == ("ok", "warning")
+    assert "Optuna need 'vehest[tuning]': pip install" in checks["extras"]["message"]
 
 
 def test_help_shows_choices_and_answers_quickly(place):
     _, out, _ = place("train", "--help")
     assert all(words in out for words in ("luenberger", "ferrari_drive"))
-    code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
-    code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
+    code = (
+        "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\n"
+        "except SystemExit: pass\n"
+    )
+    code += (
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', "
+        "'pandas', 'numba', 'matplotlib'}))"
+    )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
@@ -285,7 +293,7 @@ def test_help_shows_choices_and_answers_quickly(place):
         ),
     ],
 )
-def test_bad_tables_are_one_clear_line_whatever_reads_them(place, change, says):
+def test_bad_tables_are_a_single_clear_line_with_every_command(place, change, says):
     path = place.folder / "raw" / "one.csv"
     change(pd.read_csv(path)).to_csv(path, index=False)
     for command in (
@@ -297,7 +305,7 @@ def test_bad_tables_are_one_clear_line_whatever_reads_them(place, change, says):
     assert place.files() == set()
 
 
-def test_empty_and_truncated_files_and_degrees_taken_as_radians_are_one_clear_line(place):
+def test_empty_and_truncated_files_and_wrong_units_are_a_single_clear_line(place):
     path = place.folder / "raw" / "one.csv"
     channels = DATASET["channels"] | {"yaw_rate": {"column": "Yaw", "unit": "rad/s"}}
     place.change("conf/dataset/mine.yaml", channels=channels)
@@ -307,8 +315,8 @@ def test_empty_and_truncated_files_and_degrees_taken_as_radians_are_one_clear_li
     pd.read_csv(path).to_parquet(place.folder / "raw" / "one.parquet")
     path.write_text("")
     place.refused("ingest", "mine", says="one.csv' is empty")
-    whole = (place.folder / "raw" / "one.parquet").read_bytes()
-    (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
+    content = (place.folder / "raw" / "one.parquet").read_bytes()
+    (place.folder / "raw" / "one.parquet").write_bytes(content[: len(content) // 2])
     place.refused(
         "ingest",
         "mine",
@@ -376,7 +384,7 @@ TESTED = [{"recording": "three"}]
         ({"tests": {"t": []}}, TRAIN, 2, "test set 't' is empty"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(place, changes, command, code, says):
+def test_invalid_input_is_refused_in_a_single_line(place, changes, command, code, says):
     if changes:
         place.change(
             "conf/split/mine.yaml" if "tests" in changes else "pipelines/small.yaml", **changes
@@ -385,7 +393,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(place, changes, command, cod
     assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
 
 
-def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_nothing(
+def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothing(
     place, monkeypatch
 ):
     place.once(
@@ -415,8 +423,8 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
         place.refused("estimate", "luenberger", name, "-o", out, says=says)
         assert not Path("out.parquet").exists()
     slow.to_csv("twenty.csv", index=False)
-    _, said = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
-    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in said
+    _, output = place.done("estimate", "luenberger", "twenty.csv", "-o", "out.csv")
+    assert "sampled at 20 Hz and brought to the 100 Hz of 'luenberger'" in output
     swapped = (
         "split.train=[{recording: three}]",
         "split.tests.test=[{recording: one, start: 5, stop: 20}]",
@@ -435,33 +443,31 @@ def test_estimate_and_evaluation_refuse_what_a_model_cannot_use_and_replace_noth
     place.refused("ingest", "mine", code=4, says="no data root is set")
 
 
-def test_truncated_artefact_is_made_again(place):
+def test_truncated_artefacts_are_recomputed(place):
     arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none")
     weights = Path(place.told(*arguments)["model"]) / "model.safetensors"
-    whole = weights.read_bytes()
-    weights.write_bytes(whole[:50])
-    assert (place.told(*arguments)["skipped"], weights.read_bytes() == whole) == (False, True)
+    content = weights.read_bytes()
+    weights.write_bytes(content[:50])
+    assert (place.told(*arguments)["skipped"], weights.read_bytes() == content) == (False, True)
 
 
-def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(
-    place, monkeypatch
-):
+def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypatch):
     outputs = place.folder / "outputs"
 
-    class OneEvaluation(TimeLimit):
+    class SingleEvaluation(TimeLimit):
         """A time that is up once one evaluation is there."""
 
         def requested(self):
             return any((outputs / "evaluate").glob("*/manifest.json"))
 
     with monkeypatch.context() as patched:
-        patched.setattr(runner, "TimeLimit", OneEvaluation)
+        patched.setattr(runner, "TimeLimit", SingleEvaluation)
         code, out, err = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out
     assert f"left out: gru-states_2-seed0: {NO_TIME}" in out
-    told, err = place.done("report", "small", "tracking=none")
-    assert told == out, "the same report"
+    output, err = place.done("report", "small", "tracking=none")
+    assert output == out, "the same report"
     assert "gru-states_2-seed0; 'vehest run small tracking=none' goes on with them" in err
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
@@ -496,8 +502,8 @@ def test_the_next_command_that_is_printed_finds_data_and_results_elsewhere(place
 def test_the_training_that_an_evaluation_asks_for_can_be_pasted(place):
     words = ["estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=20"]
     words += ["output=my results", "tracking=none"]
-    others = ["evaluation.rate_hz=10", "fault=frozen", "fault.channel=yaw_rate"]
-    _, line = place.refused("eval", *words, *others, code=4)
+    overrides = ["evaluation.rate_hz=10", "fault=frozen", "fault.channel=yaw_rate"]
+    _, line = place.refused("eval", *words, *overrides, code=4)
     command = shlex.split(line[line.index("vehest ") : line.index("' first")])
     assert command == ["vehest", "train", *words]
     place.done(*command[1:])
@@ -550,9 +556,17 @@ SAVES = (supervised, "save_checkpoint")  # once an epoch
 
 
 def _killed(place, module, name, call, *arguments):
-    """Run a command in a process that is killed once a function of a module is through for the n-th time."""
-    program = f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = {['vehest', *arguments]!r}\n"
-    program += f"import {module.__name__} as module; from processes import Striking; from vehest.cli import main\n"
+    """Run a command in a process that is killed once a function of a module is through for the n-th
+    time.
+    """
+    program = (
+        f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = "
+        f"{['vehest', *arguments]!r}\n"
+    )
+    program += (
+        f"import {module.__name__} as module; from processes import Striking; from vehest.cli "
+        f"import main\n"
+    )
     program += f"module.{name} = Striking(module.{name}, {call}, {int(signal.SIGKILL)}); main()"
     assert start([sys.executable, "-c", program], cwd=place.folder).wait(HANGS) == -signal.SIGKILL
 
@@ -596,11 +610,11 @@ def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, m
     assert not list((place.folder / "outputs").glob("train/[!.]*"))
     epochs, resumed = _epochs(place, monkeypatch)
     assert epochs[0] == 4
-    _, whole = _epochs(place, monkeypatch, "output=undisturbed")
-    assert resumed["epochs"] == whole["epochs"] == 8
+    _, uninterrupted = _epochs(place, monkeypatch, "output=undisturbed")
+    assert resumed["epochs"] == uninterrupted["epochs"] == 8
     weights = [
         (Path(model) / "model.safetensors").read_bytes()
-        for model in (resumed["model"], whole["model"])
+        for model in (resumed["model"], uninterrupted["model"])
     ]
     assert weights[0] == weights[1]
     assert not any("checkpoint" in name for name in place.files())

@@ -39,10 +39,10 @@ def written(folder, name, drive, error, **columns):
 
 def test_errors_are_those_that_were_put_in(drive, tmp_path):
     file = written(tmp_path, "mine", drive, 0.2)
-    found = compare_estimates(drive, {"mine": read_estimate_table(file, drive)})
-    row = next(row for row in found["rows"] if row["estimate"] == "mine")
+    comparison = compare_estimates(drive, {"mine": read_estimate_table(file, drive)})
+    row = next(row for row in comparison["rows"] if row["estimate"] == "mine")
     assert row["rmse_vy"] == pytest.approx(0.2 / math.sqrt(2.0), rel=0.05)
-    assert found["stop"] - found["start"] == pytest.approx(120.0, abs=0.2)
+    assert comparison["stop"] - comparison["start"] == pytest.approx(120.0, abs=0.2)
 
 
 def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_path, capsys):
@@ -61,28 +61,33 @@ def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_pat
         tmp_path / "nameless.csv", index=False
     )
     read_estimate_table(tmp_path / "nameless.csv", drive)
-    said = capsys.readouterr().err
-    assert "nameless.csv': column 'beta', read as sideslip_ref: " in said
-    assert said.count("warning: ") == 1
-    assert "outside the possible range" in said
+    message = capsys.readouterr().err
+    assert "nameless.csv': column 'beta', read as sideslip_ref: " in message
+    assert message.count("warning: ") == 1
+    assert "outside the possible range" in message
 
 
 def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, tmp_path):
     """Ten seconds at standstill, at which 0.02 m/s of v are an angle of any size."""
-    standing = drive.time > 110.0
-    stopped = {name: np.where(standing, 0.0, drive[name]) for name in ("vx", "vy_ref", "yaw_rate")}
-    own = replace(drive, channels={**drive.channels, **stopped})
-    estimate = read_estimate_table(written(tmp_path, "mine", own, 0.02), own)
-    found = compare_estimates(own, {"mine": estimate})
-    assert found["rows"][0]["estimate"] == "mine"
-    assert found["rows"][0]["rmse_sideslip"] < 0.1
-    assert found["share_below_min_speed"] == pytest.approx(10.0 / 120.0, abs=0.005)
-    assert found["verdict"].startswith("Best: mine,")
-    assert compare_estimates(own, {"mine": estimate}, 0.3)["min_sideslip_speed"] == pytest.approx(
-        1 / 3
+    is_standing = drive.time > 110.0
+    stopped = {
+        name: np.where(is_standing, 0.0, drive[name]) for name in ("vx", "vy_ref", "yaw_rate")
+    }
+    stopped_drive = replace(drive, channels={**drive.channels, **stopped})
+    estimate = read_estimate_table(written(tmp_path, "mine", stopped_drive, 0.02), stopped_drive)
+    comparison = compare_estimates(stopped_drive, {"mine": estimate})
+    assert comparison["rows"][0]["estimate"] == "mine"
+    assert comparison["rows"][0]["rmse_sideslip"] < 0.1
+    assert comparison["share_below_min_speed"] == pytest.approx(10.0 / 120.0, abs=0.005)
+    assert comparison["verdict"].startswith("Best: mine,")
+    assert compare_estimates(stopped_drive, {"mine": estimate}, 0.3)[
+        "min_sideslip_speed"
+    ] == pytest.approx(1 / 3)
+    standstill = {name: np.zeros(len(stopped_drive)) for name in ("vx", "vy_ref")}
+    parked = compare_estimates(
+        replace(stopped_drive, channels={**stopped_drive.channels, **standstill}),
+        {"mine": estimate},
     )
-    still = {name: np.zeros(len(own)) for name in ("vx", "vy_ref")}
-    parked = compare_estimates(replace(own, channels={**own.channels, **still}), {"mine": estimate})
     assert parked["share_below_min_speed"] == 1.0
     assert parked["verdict"].startswith("Sideslip is not scored: the car is slower than 1 m/s")
     assert parked["rows"][0]["estimate"] == "zero"
@@ -102,7 +107,10 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
 def test_references_and_estimates_in_another_unit_or_sign_are_warned_of(
     drive, tmp_path, monkeypatch, capsys, spoil, warning
 ):
-    """As `vehest data check` warns of the recording; once of the estimate alone, once of the reference alone."""
+    """As `vehest data check` warns of the recording.
+
+    Once of the estimate alone, once of the reference alone.
+    """
     monkeypatch.chdir(tmp_path)
     names = ("vx", "yaw_rate", "ax", "ay")
     table = pd.DataFrame({"time": drive.time} | {name: drive[name] for name in names})
@@ -112,10 +120,10 @@ def test_references_and_estimates_in_another_unit_or_sign_are_warned_of(
     noise = 0.01 * np.convolve(rng.standard_normal(len(drive) + 49), np.ones(50) / 50, "valid")
     for name, vy in (("good", drive["vy_ref"] + noise), ("bad", spoil(drive["vy_ref"]))):
         pd.DataFrame({"time": drive.time, "vy": vy}).to_csv(f"{name}.csv", index=False)
-    said = {}
+    messages = {}
     for recording, estimate in (("spoilt", "good"), ("right", "bad")):
         outcome, _ = compare_files(Path(f"{recording}.csv"), [f"{estimate}.csv"], [])
-        said[recording] = capsys.readouterr().err
+        messages[recording] = capsys.readouterr().err
         if recording == "spoilt":
             rows, _ = check("spoilt.csv", [])
             assert outcome["findings"] == [
@@ -124,12 +132,12 @@ def test_references_and_estimates_in_another_unit_or_sign_are_warned_of(
                 if row["level"] == "warning"
             ]
     if warning:
-        assert warning in said["spoilt"]
-        assert said["spoilt"].startswith("warning: 'spoilt.csv': ")
-        assert warning in said["right"]
-        assert "'bad.csv': column 'vy', read as vy_ref: " in said["right"]
+        assert warning in messages["spoilt"]
+        assert messages["spoilt"].startswith("warning: 'spoilt.csv': ")
+        assert warning in messages["right"]
+        assert "'bad.csv': column 'vy', read as vy_ref: " in messages["right"]
     else:
-        assert said == {"spoilt": "", "right": ""}
+        assert messages == {"spoilt": "", "right": ""}
 
 
 @pytest.mark.parametrize("name", ["vy [dm/s]", "beta [grad]", "v (furlongs)"])
@@ -200,28 +208,28 @@ def test_an_estimate_without_its_description_is_read_with_a_warning(drive, tmp_p
     assert capsys.readouterr().err == ""
 
 
-def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):
+def test_a_winner_is_named_only_above_the_baselines(drive, tmp_path):
     estimates = {
         name: read_estimate_table(written(tmp_path, name, drive, size), drive)
         for name, size in (("good", 0.01), ("bad", 0.6))
     }
-    found = compare_estimates(drive, estimates)
-    assert found["rows"][0]["estimate"] == "good"
-    assert {row["estimate"] for row in found["rows"]} == {"good", "bad", "zero", "static_map"}
-    assert found["verdict"].startswith("Best: good, ")
+    comparison = compare_estimates(drive, estimates)
+    assert comparison["rows"][0]["estimate"] == "good"
+    assert {row["estimate"] for row in comparison["rows"]} == {"good", "bad", "zero", "static_map"}
+    assert comparison["verdict"].startswith("Best: good, ")
     assert (
-        "It is significantly better than the zero-sideslip baseline and the static map."
-        in (found["verdict"])
+        "good is significantly better than the zero-sideslip baseline and the static map."
+        in (comparison["verdict"])
     )
-    alike = compare_estimates(drive, {"one": estimates["good"], "other": estimates["good"]})
-    assert alike["verdict"].startswith("Best: one, ")
-    assert "other is not significantly worse." in alike["verdict"]
+    tied = compare_estimates(drive, {"one": estimates["good"], "other": estimates["good"]})
+    assert tied["verdict"].startswith("Best: one, ")
+    assert "other is not significantly worse." in tied["verdict"]
 
 
 def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
     """With lateral velocity turned in the second half, a map of the other half is wrong in both."""
     turned = np.where(drive.time < drive.start_time + 60.0, drive["vy_ref"], -drive["vy_ref"])
-    other = Recording(
+    foreign = Recording(
         drive.id,
         drive.vehicle,
         drive.rate_hz,
@@ -229,15 +237,15 @@ def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
         {**drive.channels, "vy_ref": turned},
     )
     estimate = Estimate(
-        other.id,
+        foreign.id,
         "true",
-        other.rate_hz,
-        other.start_time,
-        {"vy": turned, "sideslip": np.zeros(len(other))},
+        foreign.rate_hz,
+        foreign.start_time,
+        {"vy": turned, "sideslip": np.zeros(len(foreign))},
     )
     rows = {
         row["estimate"]: row["rmse_vy"]
-        for row in compare_estimates(other, {"true": estimate})["rows"]
+        for row in compare_estimates(foreign, {"true": estimate})["rows"]
     }
     assert rows["static_map"] > rows["zero"] > rows["true"]
 
@@ -256,16 +264,18 @@ def test_a_model_that_was_trained_here_is_listed_last_and_changes_no_verdict(dri
         for name, size in (("good", 0.01), ("other", 0.3), ("trained", 0.001))
     }
     alone = compare_estimates(drive, {name: estimates[name] for name in ("good", "other")})
-    found = compare_estimates(drive, estimates, trained_here=["trained"])
-    assert [row["estimate"] for row in found["rows"]][-1] == "trained"
-    assert found["rows"][-1]["rmse_vy"] < found["rows"][0]["rmse_vy"]
+    comparison = compare_estimates(drive, estimates, trained_here=["trained"])
+    assert [row["estimate"] for row in comparison["rows"]][-1] == "trained"
+    assert comparison["rows"][-1]["rmse_vy"] < comparison["rows"][0]["rmse_vy"]
     excluded = "'trained' was trained on this recording and left out of the verdict. "
-    assert found["verdict"] == excluded + alone["verdict"]
-    assert found["rows"][:-1] == alone["rows"]
+    assert comparison["verdict"] == excluded + alone["verdict"]
+    assert comparison["rows"][:-1] == alone["rows"]
 
 
 def carmaker(folder, drive, shift=0.0):
-    """A table of another tool: semicolons, its own names, the angle in degrees and counted the other way."""
+    """A table of another tool: semicolons, its own names, the angle in degrees and counted the
+    other way.
+    """
     beta = -np.degrees(np.arctan2(drive["vy_ref"] + 0.05, drive["vx"]))
     file = folder / "carmaker.csv"
     pd.DataFrame({"Clock": drive.time - shift, "Beta_CarMaker": beta}).to_csv(
@@ -296,7 +306,7 @@ def test_columns_of_another_tool_are_read_by_their_stated_names_units_and_signs(
 
 
 @pytest.mark.parametrize("shift", [12.345, -3.2, 1.7e9])
-def test_a_shift_by_correlation_is_the_one_that_was_put_in(drive, tmp_path, capsys, shift):
+def test_shift_by_correlation_is_the_simulated_shift(drive, tmp_path, capsys, shift):
     file = carmaker(tmp_path, drive, shift)
     columns = parse_columns(["time=Clock", "sideslip=-Beta_CarMaker:deg"])
     read = read_estimate_table(file, drive, columns, parse_shift("auto"))
@@ -312,8 +322,8 @@ def test_a_shift_between_laps_that_resemble_each_other_is_refused(drive, tmp_pat
     file = tmp_path / "lap.csv"
     part = (drive.time >= drive.time[0] + 30.0) & (drive.time < drive.time[0] + 60.0)
     pd.DataFrame({"time": drive.time[part], "vy": lap[part]}).to_csv(file, index=False)
-    said = refusal(lambda: read_estimate_table(file, repeated, (), None))
-    assert "--shift auto is ambiguous: its correlation with the reference is 1.00 at" in said
+    message = refusal(lambda: read_estimate_table(file, repeated, (), None))
+    assert "--shift auto is ambiguous: its correlation with the reference is 1.00 at" in message
     noise = np.random.default_rng(0).standard_normal(len(drive))
     pd.DataFrame({"time": drive.time, "vy": noise}).to_csv(file, index=False)
     assert "is ambiguous" in refusal(lambda: read_estimate_table(file, drive, (), None))
@@ -337,36 +347,36 @@ def test_a_wrong_shift_is_refused(text):
     assert says in refusal(lambda: parse_shift(text), ConfigurationError)
 
 
-def test_what_is_missing_in_a_table_is_said_with_the_accepted_names(drive, tmp_path, monkeypatch):
+def test_missing_columns_of_a_table_are_named_with_accepted_names(drive, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table = pd.DataFrame({"time": drive.time, "Beta_CarMaker": drive["vy_ref"]})
     table.to_csv("mine.csv", index=False)
-    said = refusal(lambda: read_estimate_table(Path("mine.csv"), drive))
-    assert "accepted names: vy, v, vlat" in said
-    assert "--column sideslip=NAME:deg" in said
-    said = refusal(
+    message = refusal(lambda: read_estimate_table(Path("mine.csv"), drive))
+    assert "accepted names: vy, v, vlat" in message
+    assert "--column sideslip=NAME:deg" in message
+    message = refusal(
         lambda: read_estimate_table(
             Path("mine.csv"), drive, parse_columns(["sideslip=Beta_CarMaker:m/s"])
         )
     )
-    assert "is in 'm/s', which is no unit of sideslip" in said
+    assert "is in 'm/s', which is no unit of sideslip" in message
     names = ("vx", "yaw_rate", "ax", "ay", "vy_ref")
     pd.DataFrame({"time": drive.time} | {name: drive[name] for name in names}).to_csv(
         "lap.csv", index=False
     )
-    said = refusal(
+    message = refusal(
         lambda: compare_files(Path("lap.csv"), ["mine.csv"], [], ["sideslip=BetaCarMaker"]),
         ConfigurationError,
     )
-    assert "no estimate has a column 'BetaCarMaker'; did you mean 'Beta_CarMaker'?" in said
+    assert "no estimate has a column 'BetaCarMaker'; did you mean 'Beta_CarMaker'?" in message
     table.assign(vy=drive["vy_ref"]).to_csv("mine.csv", index=False)
     Path("other").mkdir()
     table.assign(vy=drive["vy_ref"]).to_csv("other/mine.csv", index=False)
-    said = refusal(
+    message = refusal(
         lambda: compare_files(Path("lap.csv"), ["mine.csv", "other/mine.csv"], []),
         ConfigurationError,
     )
-    assert "2 estimates are called 'mine'" in said
+    assert "2 estimates are called 'mine'" in message
 
 
 def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):
@@ -406,13 +416,13 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
         "pretrained",
         "--json",
     )
-    found = json.loads(out)
-    assert found["verdict"].startswith(
+    result = json.loads(out)
+    assert result["verdict"].startswith(
         "'luenberger' was trained on this recording and left out of the verdict. "
     )
-    assert "luenberger" not in found["verdict"].partition("verdict. ")[2]
-    assert found["rows"][-1]["estimate"] == "luenberger"
-    assert found["rows"][-1]["against_best"] == "trained on it"
+    assert "luenberger" not in result["verdict"].partition("verdict. ")[2]
+    assert result["rows"][-1]["estimate"] == "luenberger"
+    assert result["rows"][-1]["against_best"] == "trained on it"
     trained_on = "'luenberger' was trained on this recording"
     for recording, is_named in (("one", True), ("three", False)):
         _, err = place.done(

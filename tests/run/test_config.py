@@ -39,7 +39,7 @@ def test_every_estimator_composes_with_any_split(
     )
 
 
-def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
+def test_local_configuration_precedes_and_extends_the_packaged_configuration(elsewhere):
     (elsewhere / "conf" / "estimator").mkdir(parents=True)
     (elsewhere / "conf" / "estimator" / "gru.yaml").write_text(
         "name: gru\nrate_hz: 20\nwindow: 10\nn_states: 3\n"
@@ -58,13 +58,15 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
     [
         (
             ["estimator=ksn"],
-            r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, ",
+            r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, "
+            r"kinematic, ksnn, ",
         ),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
         (
             ["estimator=self_calibrating", "estimator.nlocal=3"],
-            "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
+            "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of "
+            "ksnn; "
             "'vehest config train estimator=self_calibrating' prints",
         ),
         (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),
@@ -73,11 +75,11 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
         ([], r"dataset is not chosen; dataset=… \(choices: .*tabular"),
     ],
 )
-def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
-    said = refusal(
+def test_wrong_overrides_are_a_single_helpful_line(elsewhere, overrides, message):
+    refused = refusal(
         lambda: compose_config("train" if overrides else "ingest", overrides), ConfigurationError
     )
-    assert re.search(message, said)
+    assert re.search(message, refused)
     assert "did you mean pipelines/quickstart.yaml?" in refusal(
         lambda: read_study("quikstart"), MissingError
     )
@@ -97,12 +99,12 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
         ("estimatr=ksnn", "estimator"),
     ],
 )
-def test_a_misspelt_option_of_any_group_is_answered_with_what_was_meant(elsewhere, override, meant):
-    said = refusal(
+def test_misspelt_options_of_any_group_get_a_suggestion(elsewhere, override, meant):
+    message = refusal(
         lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", override]),
         ConfigurationError,
     )
-    assert f"did you mean '{meant}'?" in said
+    assert f"did you mean '{meant}'?" in message
 
 
 def test_a_misspelt_option_of_a_data_set_a_nested_group_or_a_study_is_answered_too(elsewhere):
@@ -114,14 +116,14 @@ def test_a_misspelt_option_of_a_data_set_a_nested_group_or_a_study_is_answered_t
             "estimator.car.mass",
         ),
     ):
-        said = refusal(
+        message = refusal(
             lambda words=words, command=command: compose_config(command, words), ConfigurationError
         )
-        assert f"did you mean '{meant}'?" in said
-    said = refusal(
+        assert f"did you mean '{meant}'?" in message
+    message = refusal(
         lambda: jobs_of(read_study("quickstart"), ["estimator.nlocal=3"]), ConfigurationError
     )
-    assert "did you mean 'estimator.n_local'?" in said
+    assert "did you mean 'estimator.n_local'?" in message
     assert "did you mean" not in refusal(
         lambda: compose_config("eval", ["estimator=ksnn", "split=ferrari_drive", "zzz=1"]),
         ConfigurationError,
@@ -264,7 +266,7 @@ def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, 
     assert place("data", "show", "mine")[0] == 0
 
 
-def test_jobs_with_the_same_choices_share_what_is_composed_but_no_values(elsewhere, monkeypatch):
+def test_jobs_with_the_same_choices_share_compositions_but_no_values(elsewhere, monkeypatch):
     composed = []
     compose = config.compose
     monkeypatch.setattr(config, "compose", lambda *a, **k: composed.append(a) or compose(*a, **k))
@@ -301,7 +303,7 @@ def test_references_of_an_override_are_bounded_too(elsewhere):
 
 
 @pytest.mark.parametrize("estimator", choices("estimator"))
-def test_config_prints_what_it_composes_with_comments(elsewhere, estimator):
+def test_config_prints_the_composed_configuration_with_comments(elsewhere, estimator):
     config = compose_config("train", [f"estimator={estimator}", "seed=3"])
     assert yaml.safe_load(config_as_commented_yaml(config)) == config
 
@@ -323,10 +325,10 @@ def test_config_prints_settings_with_the_comments_of_their_files(elsewhere, caps
 
 
 def test_an_unknown_option_of_the_shipped_filter_names_the_families_that_have_it():
-    said = refusal(
+    message = refusal(
         lambda: with_settings(SelfCalibrating(SelfCalibrating.settings_type()), {"nlocal": 3}),
         ConfigurationError,
     )
-    assert said.startswith(
+    assert message.startswith(
         "unknown option 'estimator.nlocal' of self_calibrating; 'n_local' is an option of ksnn; "
     )

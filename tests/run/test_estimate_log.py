@@ -36,7 +36,7 @@ def described(place):
     return place, drive
 
 
-def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_own(described):
+def test_measurements_contain_the_estimate_in_a_separate_group(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mf4")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
@@ -56,20 +56,20 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
         )["health_reason"].fillna("").tolist()
 
 
-def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
+def test_mat_files_contain_log_and_estimate_on_the_same_clock(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.parquet")[0] == 0
-    found = loadmat("beta.mat", squeeze_me=True)
+    content = loadmat("beta.mat", squeeze_me=True)
     table = pd.read_parquet("beta.parquet")
-    assert np.allclose(found["ay"], drive["ay"])
-    every = round(100.0 * (table["time"][1] - table["time"][0]))
-    assert np.array_equal(found["vehest_vy"][::every][: len(table)], table["vy"], equal_nan=True)
-    assert len(found["vehest_band_sideslip"]) == len(found["time"]) == len(drive)
+    assert np.allclose(content["ay"], drive["ay"])
+    stride = round(100.0 * (table["time"][1] - table["time"][0]))
+    assert np.array_equal(content["vehest_vy"][::stride][: len(table)], table["vy"], equal_nan=True)
+    assert len(content["vehest_band_sideslip"]) == len(content["time"]) == len(drive)
 
 
-def test_tables_and_older_measurements_do_not_become_one_of_mdf_4(described):
+def test_tables_and_older_measurements_are_not_written_as_mdf_4(described):
     place, drive = described
     place.refused(
         "estimate",

@@ -1,4 +1,6 @@
-"""`vehest estimate` and the Python interface on drives with something wrong, and what goes with a model: bands, health, trust.yaml."""
+"""`vehest estimate` and the Python interface on drives with something wrong, and what goes with a
+model: bands, health, trust.yaml.
+"""
 
 import json
 from pathlib import Path
@@ -94,13 +96,20 @@ def test_the_summary_names_the_point_of_the_self_calibrating_filter(saved):
 
 def test_speed_stuck_at_zero_is_a_warning_and_refused_by_strict(saved):
     lap({"vx": np.zeros(3000)})
-    said = "vx: constant at 0 m/s throughout; check the sensor, or leave the channel out"
+    message = "vx: constant at 0 m/s throughout; check the sensor, or leave the channel out"
     saved.refused(
-        "estimate", "own", "lap.csv", "-o", "out.csv", "--strict", code=3, says=f"'lap.csv': {said}"
+        "estimate",
+        "own",
+        "lap.csv",
+        "-o",
+        "out.csv",
+        "--strict",
+        code=3,
+        says=f"'lap.csv': {message}",
     )
     assert not Path("out.csv").exists()
     out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv", "--json")
-    assert (err, json.loads(out)["findings"]) == (f"warning: {said}\n", [said])
+    assert (err, json.loads(out)["findings"]) == (f"warning: {message}\n", [message])
     table = pd.read_csv("out.csv")
     assert (table["health"] > 0).mean() > 0.9
     assert np.isfinite(table["vy"]).any()
@@ -134,9 +143,7 @@ def in_parts(monkeypatch, seconds=7.0):
 
 
 @pytest.mark.parametrize("name", ["own", "self_calibrating", "pretrained"])
-def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(
-    saved, monkeypatch, name
-):
+def test_estimates_in_parts_have_the_bits_and_figures_of_the_full_drive(saved, monkeypatch, name):
     speed = np.array(drive_of(4)["vx"])
     lost = slice(1200, 1500)
     speed[
@@ -147,7 +154,7 @@ def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_who
         if end == ".parquet":
             pd.read_csv("lap.csv").to_parquet("lap.parquet")
         command = ("estimate", name, f"lap{end}", "dataset.accept=[sign,unit,impossible]", "--json")
-        whole = json.loads(saved.done(*command, "-o", f"whole{end}")[0])
+        complete = json.loads(saved.done(*command, "-o", f"whole{end}")[0])
         with monkeypatch.context() as patch:
             in_parts(patch)
             parts = json.loads(saved.done(*command, "-o", f"parts{end}")[0])
@@ -158,7 +165,7 @@ def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_who
                 pd.read_parquet("parts.parquet"), pd.read_parquet("whole.parquet"), check_exact=True
             )
             assert pq.ParquetFile("parts.parquet").num_row_groups == 5
-        assert {**parts, "out": "", "findings": []} == {**whole, "out": "", "findings": []}
+        assert {**parts, "out": "", "findings": []} == {**complete, "out": "", "findings": []}
 
 
 YESTERDAY = Path(__file__).resolve().parents[1] / "yesterday"
@@ -182,7 +189,7 @@ def calibrated_model(name):
 
 @pytest.mark.parametrize("end", [".parquet", ".csv"])
 @pytest.mark.parametrize("name", estimator_names())
-def test_every_family_estimates_a_file_in_parts_as_the_whole(place, monkeypatch, name, end):
+def test_every_family_estimates_a_file_in_parts_like_the_full_file(place, monkeypatch, name, end):
     folder, drive = calibrated_model(name)
     table = pd.DataFrame({"time": drive.time, **drive.channels})
     if end == ".csv":
@@ -193,10 +200,10 @@ def test_every_family_estimates_a_file_in_parts_as_the_whole(place, monkeypatch,
     estimate_file(command, Path("whole.parquet"))
     in_parts(monkeypatch, 1.3)
     estimate_file(command, Path("parts.parquet"))
-    whole, parts = (pd.read_parquet(file) for file in ("whole.parquet", "parts.parquet"))
+    complete, parts = (pd.read_parquet(file) for file in ("whole.parquet", "parts.parquet"))
     tolerance = 1e-6 if name == "sideslip_ffnn" else 1e-12
-    pd.testing.assert_frame_equal(parts, whole, check_exact=False, rtol=0.0, atol=tolerance)
-    assert {"vy", "sideslip", "health", "health_reason"} <= set(whole)
+    pd.testing.assert_frame_equal(parts, complete, check_exact=False, rtol=0.0, atol=tolerance)
+    assert {"vy", "sideslip", "health", "health_reason"} <= set(complete)
 
 
 @pytest.mark.parametrize(
@@ -217,13 +224,13 @@ def test_bad_rows_have_the_same_line_in_parts_and_nothing_is_written(
     table = pd.read_csv("lap.csv").astype({column: object})
     table.loc[row, column] = cell
     table.to_csv("lap.csv", index=False)
-    whole = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
+    message = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
     in_parts(monkeypatch)
-    assert saved.refused("estimate", "own", "lap.csv", "-o", "out.csv") == whole
+    assert saved.refused("estimate", "own", "lap.csv", "-o", "out.csv") == message
     assert not [*saved.folder.glob("*out*")]
 
 
-def test_online_says_what_estimate_says_of_the_whole_drive(model):
+def test_online_estimates_equal_those_of_the_full_drive(model):
     drive = drive_of(4)
     channels = {name: drive[name].copy() for name in model.channels}
     channels["ay"][1000:1100] = channels["ay"][1000]  # a second that stands still
@@ -231,19 +238,23 @@ def test_online_says_what_estimate_says_of_the_whole_drive(model):
     batch = vehest.estimate(faulty, model)
     stepper = vehest.online(model).stepper
     assert stepper.horizon_steps == 0
-    said = [
+    estimates = [
         stepper.step({name: values[k] for name, values in channels.items()})
         for k in range(len(drive))
     ]
     assert (
         set(batch.channels)
         == {"vx", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"}
-        == set(said[-1])
+        == set(estimates[-1])
     )
     assert (batch["health"] > 0).any()
     for name, values in batch.channels.items():
         np.testing.assert_allclose(
-            [step.get(name, np.nan) for step in said], values, rtol=0.0, atol=1e-9, err_msg=name
+            [step.get(name, np.nan) for step in estimates],
+            values,
+            rtol=0.0,
+            atol=1e-9,
+            err_msg=name,
         )
 
 
@@ -251,7 +262,8 @@ def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
     vehest.save_model(model, tmp_path / "own")
     assert read_trust(tmp_path / "own").bands is not None
     before, after = (
-        vehest.estimate(drive_of(4), own) for own in (model, vehest.load_model(tmp_path / "own"))
+        vehest.estimate(drive_of(4), estimator)
+        for estimator in (model, vehest.load_model(tmp_path / "own"))
     )
     assert {"band_vy", "band_sideslip", "health", "health_reason"} <= set(before.channels)
     for name, values in before.channels.items():
@@ -291,7 +303,7 @@ def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_
         (lambda text: yaml.safe_dump({**yaml.safe_load(text), "bands": {"vy": "wide"}}), "bands"),
     ],
 )
-def test_a_damaged_trust_file_is_one_clear_line(saved, damage, message):
+def test_damaged_trust_files_are_a_single_clear_line(saved, damage, message):
     lap()
     file = saved.folder / "own" / TRUST
     file.write_text(damage(file.read_text(encoding="utf-8")), encoding="utf-8")

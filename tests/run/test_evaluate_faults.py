@@ -1,4 +1,6 @@
-"""Faults as conditions of an evaluation: their rows, their keys, one training for all of them, and errors in one line."""
+"""Faults as conditions of an evaluation: their rows, their keys, one training for all of them, and
+errors in one line.
+"""
 
 import csv
 import json
@@ -90,7 +92,7 @@ def test_fault_start_is_drawn_between_20_and_40_percent_of_each_range():
     assert FaultSettings("bias", "ay", "mild", start=4.0).within(10.0, 100.0, 7).onset == 14.0
 
 
-def test_a_fault_that_makes_no_sense_is_one_line(trained):
+def test_invalid_faults_are_refused_in_a_single_line(trained):
     for overrides, says in (
         (("fault=frozn",), "fault=frozn is not there; did you mean frozen?"),
         (
@@ -101,7 +103,8 @@ def test_a_fault_that_makes_no_sense_is_one_line(trained):
         (("faults=[{channel:ay}]",), "faults must be a list of faults, each with its kind"),
         (
             ("fault=bias", "fault.channel=steer"),
-            "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)",
+            "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, "
+            "yaw_rate)",
         ),
     ):
         trained.refused("eval", *TRAINED, *overrides, code=2, says=says)
@@ -126,11 +129,11 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     assert after[: len(before)] == before, (
         "what is said without the fault is the same, and stands first"
     )
-    shown = {name for name in figures if not is_fault(name)}
-    assert shown == set(nominal)
+    columns = {name for name in figures if not is_fault(name)}
+    assert columns == set(nominal)
     assert all(
         figures[name] == nominal[name]
-        for name in shown - {"folder", "step_seconds.test", "train_seconds.test"}
+        for name in columns - {"folder", "step_seconds.test", "train_seconds.test"}
     )
     added = pd.DataFrame(csv.DictReader([before[0], *after[len(before) :]]))
     assert (set(added["condition"]), set(added["subset"])) == ({CONDITION}, {"faulted", "after"})
@@ -156,7 +159,7 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     assert faulted > unharmed, "what stands still is passed over, and the estimate fades"
 
 
-def test_errors_under_a_fault_are_those_of_an_estimate_made_by_hand(place):
+def test_errors_under_a_fault_equal_those_of_a_direct_estimate(place):
     """v = 0 has the error v; what it is while the fault lasts follows from the reference alone."""
     overrides = ("split=mine", "estimator=zero", "tracking=none")
     assert place("train", *overrides)[0] == 0
@@ -178,15 +181,15 @@ def test_values_that_are_not_finite_leave_finite_errors(trained):
         f"{{kind:{kind},channel:vx,severity:severe}}" for kind in ("nan", "inf", "huge", "dropout")
     )
     figures = evaluated(trained, f"faults=[{listed}]")[1]
-    found = [
+    values = [
         value
         for name, value in figures.items()
         if is_fault(name) and name.startswith(("rmse_", "max_")) and "undetected" not in name
     ]
-    assert len(found) == 4 * 2 * 6, (
+    assert len(values) == 4 * 2 * 6, (
         "four faults, two subsets, six metrics; the validation range is not shown"
     )
-    assert None not in found, "JSON has null for what is not finite"
+    assert None not in values, "JSON has null for what is not finite"
 
 
 def test_key_of_an_evaluation_contains_its_faults_alone(
@@ -238,12 +241,12 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
             / "metrics.csv"
         )
         condition = f"{job['fault']}:{job['fault.channel']}:medium"
-        own = metrics[
+        fault_rows = metrics[
             (metrics["condition"] == condition)
             & (metrics["subset"] == "faulted")
             & (metrics["test_set"] == "test")
         ]
-        assert job["rmse_sideslip.test"] == own.set_index("metric")["value"]["rmse_sideslip"]
+        assert job["rmse_sideslip.test"] == fault_rows.set_index("metric")["value"]["rmse_sideslip"]
     report = (folder / "report.md").read_text()
     assert "faults, which are conditions of the evaluation" in report
     assert (
@@ -301,8 +304,8 @@ def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
             CONDITION,
             "nan:ay:mild",
         }
-    shown = outcome["leaderboard"]
-    assert len(shown) == 2, "the leaderboard is that without faults"
+    leaderboard = outcome["leaderboard"]
+    assert len(leaderboard) == 2, "the leaderboard is that without faults"
 
 
 def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):

@@ -1,4 +1,6 @@
-"""The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like another car's log."""
+"""The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like
+another car's log.
+"""
 
 import re
 from pathlib import Path
@@ -11,7 +13,9 @@ DRIVE = "revs/20140222_01_01_03_250lm"
 
 
 def log_of(data_root):
-    """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed, angles in degrees."""
+    """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed,
+    angles in degrees.
+    """
 
     def column(name):
         return np.loadtxt(data_root / DRIVE / f"{name}.txt")
@@ -42,8 +46,8 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_ro
         (place.folder / name).write_text(content, encoding="utf-8")
     code, out, err = logged("data", "check", "my_log")
     assert (code, err) == (0, "")
-    (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
-    assert said in out.splitlines()
+    (warning,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
+    assert warning in out.splitlines()
     out, _ = logged.done("data", "usable", "my_log")
     for line in (
         "ax: transforms: [{name: acceleration_from_speed}] of vx",

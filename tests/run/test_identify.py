@@ -1,4 +1,6 @@
-"""A car's record: found on drives of a car whose numbers are known, written, read back and started from."""
+"""A car's record: found on drives of a car whose numbers are known, written, read back and started
+from.
+"""
 
 import json
 import math
@@ -72,14 +74,14 @@ def test_identified_values_of_a_car_reduce_the_error(model):
         assert abs(offsets["ay"].value - 0.2) < offsets["ay"].deviation
     channels, vy = lap(2, 20.0)
     errors = [
-        np.mean((one.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2)
-        for one in (model, calibrated(model, record))
+        np.mean((estimator.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2)
+        for estimator in (model, calibrated(model, record))
     ]
     assert errors[1] < 0.7 * errors[0]
 
 
 def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
-    still = recording(
+    standstill = recording(
         "still",
         {
             "yaw_rate": np.zeros(600),
@@ -88,26 +90,26 @@ def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
             "ax": np.zeros(600),
         },
     )
-    found = record_of(model, {"still": posterior_of(model, still)})
-    assert not any(getattr(found, name).identified_on for name in LIMITS)
-    assert calibrated(model, found).settings == model.settings
+    record = record_of(model, {"still": posterior_of(model, standstill)})
+    assert not any(getattr(record, name).identified_on for name in LIMITS)
+    assert calibrated(model, record).settings == model.settings
 
 
 def test_a_drive_that_steady_cornering_explains_better_than_the_bank_tells_nothing(model):
     steady = with_settings(model, {"steady_odds": 1e12})
-    known, found = (
-        record_of(model, {"one": posterior_of(own, recording("one", lap(0)[0]))})
-        for own in (model, steady)
+    calibrated_posterior, posterior = (
+        record_of(model, {"one": posterior_of(estimator, recording("one", lap(0)[0]))})
+        for estimator in (model, steady)
     )
-    assert known.leakage.identified_on
-    assert [getattr(found, name) for name in ("leakage", "rear_axle", "compliance")] == [
+    assert calibrated_posterior.leakage.identified_on
+    assert [getattr(posterior, name) for name in ("leakage", "rear_axle", "compliance")] == [
         Number(*prior_of(model)[name][:2]) for name in ("leakage", "rear_axle", "compliance")
     ]
-    assert found.offsets["one"]["ay"].identified_on
-    assert calibrated(model, found).settings == model.settings
+    assert posterior.offsets["one"]["ay"].identified_on
+    assert calibrated(model, posterior).settings == model.settings
 
 
-def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
+def test_drives_weigh_by_their_information_and_contradictions_widen_intervals():
     prior = Normal(1.0, 2.0)
     likelihoods = {"a": (3.0, 1.0), "b": (3.2, 0.5)}
     posteriors = {}
@@ -117,25 +119,25 @@ def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
             variance * (prior.mean / prior.deviation**2 + mean / deviation**2), math.sqrt(variance)
         )
         assert without_prior(prior, posteriors[name]) == pytest.approx((mean, deviation))
-    both = together(prior, posteriors)
+    combined = together(prior, posteriors)
     precision = 1.0 / 4.0 + 1.0 + 4.0
-    assert (both.value, both.deviation) == pytest.approx(
+    assert (combined.value, combined.deviation) == pytest.approx(
         ((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5)
     )
-    assert both.identified_on == ("a", "b")
+    assert combined.identified_on == ("a", "b")
     contradicted = together(prior, posteriors | {"c": Normal(-1.0, 0.4)})
-    assert contradicted.deviation > 2.0 * both.deviation
+    assert contradicted.deviation > 2.0 * combined.deviation
     assert contradicted.identified_on == ()  # of three that do not agree none is right
     assert together(prior, {"d": prior}) == Number(prior.mean, prior.deviation)
 
 
-def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
+def test_delays_widen_affected_intervals_independent_of_the_number_of_drives():
     prior = Normal(0.0, 1.0)
     sure = Normal(0.2, 1e-3, 0.5)
     for drives in ({"a": sure}, dict.fromkeys("abcd", sure)):
-        found = together(prior, drives)
-        assert (found.value, found.deviation) == pytest.approx((0.2, 0.5), rel=1e-4)
-        assert found.identified_on == tuple(drives)
+        combined = together(prior, drives)
+        assert (combined.value, combined.deviation) == pytest.approx((0.2, 0.5), rel=1e-4)
+        assert combined.identified_on == tuple(drives)
     assert together(prior, {"a": sure._replace(of_lateness=0.8)}).identified_on == ()
 
 
@@ -148,15 +150,17 @@ def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(
             channels["yaw_rate"],
         )
     }
-    on_time, found = (posterior_of(model, recording("lap", own)) for own in (channels, late))
+    on_time, delayed = (
+        posterior_of(model, recording("lap", samples)) for samples in (channels, late)
+    )
     for name in ("compliance", "rear_axle"):
-        moved = found[name].mean - on_time[name].mean
+        moved = delayed[name].mean - on_time[name].mean
         assert moved == pytest.approx(
             0.04 / YAW_RATE_LATENESS_SECONDS * on_time[name].of_lateness, rel=0.4
         )
         assert (
-            abs(getattr(record_of(model, {"lap": found}), name).value - PLANTED[name])
-            < 1.645 * getattr(record_of(model, {"lap": found}), name).deviation
+            abs(getattr(record_of(model, {"lap": delayed}), name).value - PLANTED[name])
+            < 1.645 * getattr(record_of(model, {"lap": delayed}), name).deviation
         )
 
 
@@ -166,14 +170,14 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
         pd.DataFrame({"time": np.arange(len(channels["vx"])) / RATE, **channels}).to_csv(
             f"{name}.csv", index=False
         )
-    known = ("estimator.wheelbase=2.7", "estimator.cg_to_rear_axle=1.25")
-    code, out, err = place("identify", "one.csv", "two.csv", *known, "-o", "car.yaml", "--json")
+    settings = ("estimator.wheelbase=2.7", "estimator.cg_to_rear_axle=1.25")
+    code, out, err = place("identify", "one.csv", "two.csv", *settings, "-o", "car.yaml", "--json")
     assert code == 0, err
-    said = json.loads(out)
-    kept = read_car(place.folder / "car.yaml")
+    result = json.loads(out)
+    record = read_car(place.folder / "car.yaml")
     assert (
-        said["leakage"]["value"]
-        == kept.leakage.value
+        result["leakage"]["value"]
+        == record.leakage.value
         == pytest.approx(PLANTED["leakage"], abs=0.03)
     )
     code, out, err = place("identify", "one.csv", "-o", "again.yaml")
@@ -188,7 +192,7 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
         in place.refused("estimate", "pretrained", "three.csv", "--car", "car.yaml")[1]
     )
     smooth = place.told(
-        "estimate", "three.csv", *known, "estimator.smoothed=true", "-o", "smooth.csv"
+        "estimate", "three.csv", *settings, "estimator.smoothed=true", "-o", "smooth.csv"
     )
     assert smooth["samples"] > 0
     assert np.abs(pd.read_csv("smooth.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
@@ -216,8 +220,10 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert "too short" in place.refused("identify", "short.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()
     assert (
-        prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0]
-        == kept.leakage.value
+        prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), record))["leakage"][
+            0
+        ]
+        == record.leakage.value
     )
 
 
@@ -230,8 +236,10 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
         (1.0, 0.1, "does not reach 25 m/s"),
     ],
 )
-def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
-    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
+def test_wheelbases_excluded_by_the_drive_are_reported(scale, wheelbase, words):
+    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with
+    its root, yaw rates against it.
+    """
     time = np.arange(0.0, 60.0, 1.0 / RATE)
     speed = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0])
     curvature = np.where(time < 20.0, 0.09, 0.01)
@@ -244,13 +252,13 @@ def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
     sized = with_settings(
         load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase}
     )
-    found = [
-        one
-        for one in findings_of(recording("lap", channels), sized, ["sign", "unit"])
-        if one.check == "wheelbase"
+    findings = [
+        finding
+        for finding in findings_of(recording("lap", channels), sized, ["sign", "unit"])
+        if finding.check == "wheelbase"
     ]
-    assert len(found) == (words is not None)
-    assert words is None or re.search(words, found[0].message)
+    assert len(findings) == (words is not None)
+    assert words is None or re.search(words, findings[0].message)
 
 
 @pytest.mark.parametrize(
@@ -265,14 +273,16 @@ def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
         ("av21", 3.0),
     ],
 )
-def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(
+def test_wheelbases_of_real_cars_are_accepted_and_small_cars_are_not_large_ones(
     data_root, dataset, wheelbase
 ):
     config = compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
-    moving = [one for one in open_source(config).recordings() if np.mean(one["vx"] > 1.0) > 0.2]
+    moving = [
+        drive for drive in open_source(config).recordings() if np.mean(drive["vx"] > 1.0) > 0.2
+    ]
     assert moving
-    assert not any(wheelbase_findings(one, wheelbase) for one in moving)
-    assert wheelbase > 1.0 or all(wheelbase_findings(one, 2.7) for one in moving)
+    assert not any(wheelbase_findings(drive, wheelbase) for drive in moving)
+    assert wheelbase > 1.0 or all(wheelbase_findings(drive, 2.7) for drive in moving)
 
 
 @pytest.mark.parametrize(
@@ -288,7 +298,7 @@ def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large
         ("just text", "no record of a car"),
     ],
 )
-def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(elsewhere, change, words):
+def test_damaged_records_of_a_car_are_refused_in_a_single_line(elsewhere, change, words):
     number = {"value": 0.01, "deviation": 0.01}
     numbers = {
         "leakage": number,

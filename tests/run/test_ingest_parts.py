@@ -1,4 +1,7 @@
-"""Recordings that take long to make are kept as soon as they are done; an ingest that was interrupted goes on with the rest."""
+"""Recordings that take long to make are kept as soon as they are done.
+
+An ingest that was interrupted goes on with the rest.
+"""
 
 import os
 import signal
@@ -39,7 +42,7 @@ def failing(monkeypatch, name, error):
     monkeypatch.setattr(TabularSource, "read", fails)
 
 
-def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monkeypatch):
+def test_parts_finished_before_a_failure_are_not_recomputed(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
         code, _, err = place("ingest", "mine")
@@ -95,11 +98,11 @@ def test_killed_workers_are_named_by_their_recordings(place, slow, monkeypatch):
         broken.setattr(ingest, "_make_part", killed)
         code, _, err = place("ingest", "mine", "--jobs", "2")
     assert code == 4
-    first, other = ("one", "three") if "recording 'one'" in err else ("three", "one")
+    first, second = ("one", "three") if "recording 'one'" in err else ("three", "one")
     assert (
         f"error: data set 'mine', recording '{first}': a worker process was ended by SIGKILL" in err
     )
-    assert err.strip().endswith(f"the same command goes on (and 1 more: '{other}')")
+    assert err.strip().endswith(f"the same command goes on (and 1 more: '{second}')")
     assert ingest._make_part is make_part
     folder = Path(place.told("ingest", "mine", "--jobs", "1")["folder"])
     assert len(list(folder.glob("*.parquet"))) == 3

@@ -43,7 +43,10 @@ runpy.run_module("vehest", run_name="__main__")
 """
 IN_FINALISER = "Finaliser()"
 CAUGHT = "try: press_ctrl_c()\n            except BaseException: pass"
-TRANSLATED = "try: press_ctrl_c()\n            except BaseException: raise ImportError('initialisation failed')"
+TRANSLATED = (
+    "try: press_ctrl_c()\n            except BaseException: raise ImportError('initialisation "
+    "failed')"
+)
 AT_TEARDOWN = "sys.finaliser = Finaliser(); press_ctrl_c()"
 AT_EXIT = "atexit.register(press_ctrl_c)"
 TWICE = "atexit.register(press_ctrl_c); press_ctrl_c()"

@@ -32,7 +32,9 @@ class Extended(Gru.settings_type):
 
 @pytest.fixture
 def published(tmp_path, monkeypatch, capsys):
-    """A small study that was trained and published, with a configuration of its estimator and no output root."""
+    """A small study that was trained and published, with a configuration of its estimator and no
+    output root.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
@@ -59,11 +61,11 @@ def test_new_option_removed_default_and_edited_title_retrain_nothing(published, 
     weights = published.folder / "results" / "small" / "weights.safetensors"
     before = weights.read_bytes()
     assert published("report", "--check") == (0, "small: up to date\n", "")
-    _, said = published.done("run", "small", "tracking=none")
-    assert lines_of(said, "note train") == [
+    _, output = published.done("run", "small", "tracking=none")
+    assert lines_of(output, "note train") == [
         "note train 3 of 3 taken from results/small/weights.safetensors; --retrain trains them"
     ]
-    assert not lines_of(said, "done train")
+    assert not lines_of(output, "done train")
     assert weights.read_bytes() == before
     report = (published.folder / "results" / "small" / "report.md").read_text(encoding="utf-8")
     assert report.startswith("# Another title"), "the report itself has the new text"
@@ -100,10 +102,10 @@ def test_option_that_differs_from_its_default_is_in_the_key():
 
 def test_sideslip_is_scored_by_the_wheelbase_of_today(published):
     published.change("conf/dataset/mine.yaml", car={"wheelbase": 0.33})
-    code, said, _ = published("report", "--check")
+    code, output, _ = published("report", "--check")
     assert code == 3
-    assert "evaluate zero, evaluate gru" in said
-    assert "train" not in said
+    assert "evaluate zero, evaluate gru" in output
+    assert "train" not in output
 
 
 def test_rate_that_is_left_out_is_lowered_to_that_of_the_recordings_too():

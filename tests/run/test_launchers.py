@@ -55,7 +55,7 @@ def job(output, seed=0):
     )
 
 
-def made_in(output):
+def artefact_in(output):
     return make(
         job(output).plan,
         lambda folder: (folder / "model.safetensors").write_text("weights") and None,
@@ -69,16 +69,16 @@ def test_progress_has_no_more_bars_than_fit_a_terminal():
         assert len(bars.tasks) == console.MAX_BARS
 
 
-def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
-    made = made_in(tmp_path / "here")
-    there = tmp_path / "there" / "train" / made.folder.name
-    files = pack({made.folder})[made.folder]
-    unpack({there: files})
-    assert read_artefact(there).digest == made.digest
+def test_artefacts_transfer_with_their_digest_and_damaged_ones_are_refused(tmp_path):
+    artefact = artefact_in(tmp_path / "here")
+    target = tmp_path / "there" / "train" / artefact.folder.name
+    files = pack({artefact.folder})[artefact.folder]
+    unpack({target: files})
+    assert read_artefact(target).digest == artefact.digest
     with pytest.raises(DataError, match="gone or truncated"):
         unpack(
             {
-                tmp_path / "other" / "train" / made.folder.name: {
+                tmp_path / "other" / "train" / artefact.folder.name: {
                     **files,
                     "model.safetensors": b"weigh",
                 }
@@ -91,12 +91,18 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
     precious = tmp_path / "home" / "precious.txt"
     precious.parent.mkdir()
     precious.write_text("precious")
-    made = made_in(tmp_path / "here")
-    manifest = json.loads((made.folder / MANIFEST).read_text())
+    artefact = artefact_in(tmp_path / "here")
+    manifest = json.loads((artefact.folder / MANIFEST).read_text())
     manifest["outputs"]["model.safetensors"]["sha256"] = "../home/precious.txt"
-    (made.folder / MANIFEST).write_text(json.dumps(manifest))
+    (artefact.folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(DataError, match=r"outputs\.model\.safetensors\.sha256"):
-        unpack({tmp_path / "there" / "train" / made.folder.name: pack({made.folder})[made.folder]})
+        unpack(
+            {
+                tmp_path / "there" / "train" / artefact.folder.name: pack({artefact.folder})[
+                    artefact.folder
+                ]
+            }
+        )
     assert (find(job(tmp_path / "here").plan), precious.read_text()) == (None, "precious")
 
 
@@ -118,7 +124,7 @@ def test_a_machine_with_other_versions_or_without_the_output_root_does_nothing(t
     assert not list(tmp_path.iterdir())
 
 
-def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch):
+def test_files_of_another_host_are_ignored_for_a_day(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "_host", lambda: "0" * 8)
     growing = aside_of(tmp_path / "model")
     growing.write_text("half")
@@ -132,7 +138,7 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert not old.exists()
 
 
-def test_without_ray_one_line_names_the_extra_to_install(place, monkeypatch):
+def test_without_ray_a_single_line_names_the_extra_to_install(place, monkeypatch):
     place.refused(
         "run",
         "small",
@@ -155,13 +161,13 @@ def test_without_ray_one_line_names_the_extra_to_install(place, monkeypatch):
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
-        lambda name, *rest: None if name == "ray" else real(name, *rest),
+        lambda name, *arguments: None if name == "ray" else real(name, *arguments),
     )
     place.refused("run", "small", "--launcher", "ray", code=4, says="pip install 'vehest[ray]'")
 
 
 @pytest.mark.parametrize(
-    ("where", "says"),
+    ("option", "says"),
     [
         (RunOptions(address="auto"), "--address is for --launcher ray and slurm, not for local"),
         (
@@ -182,16 +188,16 @@ def test_without_ray_one_line_names_the_extra_to_install(place, monkeypatch):
         ),
     ],
 )
-def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path):
-    with pytest.raises(ConfigurationError) as told:
-        chosen_launcher(where, tmp_path, FINE)
-    assert says in str(told.value)
+def test_options_that_a_launcher_does_not_take_are_refused(option, says, tmp_path):
+    with pytest.raises(ConfigurationError) as error:
+        chosen_launcher(option, tmp_path, FINE)
+    assert says in str(error.value)
     assert not list(tmp_path.iterdir())
 
 
 def test_slurm_options_have_the_names_of_submitit(tmp_path, monkeypatch):
-    asked = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
-    assert asked == {
+    parameters = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
+    assert parameters == {
         "slurm_partition": "long",
         "timeout_min": 90,
         "mem_gb": 1.5,

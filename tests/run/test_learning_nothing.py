@@ -7,12 +7,14 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
+NOISE_OF_RECORDING = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
 
 
 @pytest.fixture
 def steered(place):
-    """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
+    """Two drives with a steering angle, a split with a test only, and one that trains on the other
+    drive.
+    """
     place.add_steered()
     tests = {"test": [{"recording": "second"}]}
     place.change(
@@ -38,15 +40,18 @@ def test_model_without_training_is_the_same_for_every_split(
     steered,
 ):
     folders = [
-        steered.told("train", *OWN_NOISE, f"split={split}")["model"] for split in ("whole", "cut")
+        steered.told("train", *NOISE_OF_RECORDING, f"split={split}")["model"]
+        for split in ("whole", "cut")
     ]
     assert (
         folders[0],
         steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0],
     ) == (folders[1], 0)
-    other = steered.told("train", *OWN_NOISE, "split=cut", "downsample.method=decimate")["model"]
-    assert other != folders[0], "how recordings are prepared is part of a model"
-    figures = steered.told("eval", *OWN_NOISE, "split=whole")
+    cut_model = steered.told(
+        "train", *NOISE_OF_RECORDING, "split=cut", "downsample.method=decimate"
+    )["model"]
+    assert cut_model != folders[0], "how recordings are prepared is part of a model"
+    figures = steered.told("eval", *NOISE_OF_RECORDING, "split=whole")
     assert 0 < figures["rmse_sideslip.test"] < 5
     assert figures["n_parameters.test"] == 0
     assert "step_seconds.test" not in figures, "offline: there is no online step to time"
@@ -56,7 +61,7 @@ def test_model_without_training_is_the_same_for_every_split(
     }
 
 
-def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
+def test_filters_with_levels_from_training_are_not_tested_on_that_data(steered):
     arguments = ("estimator=kalman", "tracking=none", "split=cut")
     out, err = steered.done("train", *arguments, "--json")
     assert (json.loads(out)["n_parameters"], "3 parameters" in err) == (3, True)
@@ -69,14 +74,19 @@ def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
         "tracking=none",
         says="shares samples with",
     )
-    said = "split 'whole' has nothing to train on, and estimator 'ksnn' learns"
-    steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none", says=said)
+    message = "split 'whole' has nothing to train on, and estimator 'ksnn' learns"
+    steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none", says=message)
 
 
 def test_study_without_training_reports_and_says_where_estimates_start(steered):
     evaluation = {"initial_state": True, "warm_up_seconds": 0}
-    own = {"study": "given", "report": "drive", "split": "whole", "sweeps": [[*OWN_NOISE[:2]]]}
-    steered.change("pipelines/given.yaml", **own, evaluation=evaluation)
+    study = {
+        "study": "given",
+        "report": "drive",
+        "split": "whole",
+        "sweeps": [[*NOISE_OF_RECORDING[:2]]],
+    }
+    steered.change("pipelines/given.yaml", **study, evaluation=evaluation)
     outcome = steered.told("run", "given", "tracking=none")
     (row,) = outcome["leaderboard"]
     assert (row["estimator"], row["start"]) == ("kalman", "reference")

@@ -1,4 +1,6 @@
-"""Rows of errors with the best lever arm in a study's metrics, where the reference's point is unknown."""
+"""Rows of errors with the best lever arm in a study's metrics, where the reference's point is
+unknown.
+"""
 
 import numpy as np
 import pandas as pd
@@ -7,7 +9,7 @@ import pytest
 from vehest.data.store import read_recording
 
 
-def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):
+def test_errors_at_an_unknown_point_are_listed_with_the_best_lever_arm(place):
     place.change("conf/dataset/mine.yaml", reference_point="unknown")
     place.change(
         "pipelines/levers.yaml",
@@ -16,7 +18,7 @@ def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too
         split="mine",
         sweeps=[["estimator=zero"]],
     )
-    shown = place.told("run", "levers", "tracking=none", "output=out")
+    result = place.told("run", "levers", "tracking=none", "output=out")
     table = pd.read_csv(next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv")
     tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
     levers, nominal = (
@@ -31,8 +33,8 @@ def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too
         next((place.folder / "out" / "downsample").glob("mine-20hz-*")) / "three.parquet"
     )
     late = recording.time >= recording.start_time + 1.5 - 1e-9
-    rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
-    assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
-    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [
+    residual = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
+    assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-9)
+    assert [row["rmse_sideslip"] for row in result["leaderboard"]] == [
         pytest.approx(nominal["rmse_sideslip"])
     ]

@@ -1,4 +1,6 @@
-"""Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone, nobody waits for ever."""
+"""Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone,
+nobody waits for ever.
+"""
 
 import os
 import signal
@@ -28,10 +30,10 @@ sys.stdin.read()
 
 
 @contextmanager
-def held_elsewhere(output, stage, name):
+def locked_by_process(output, stage, name):
     """A process of its own that holds a lock until it is ended."""
-    own = [sys.executable, "-c", HOLDER, str(output), stage, name]
-    process = start(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-c", HOLDER, str(output), stage, name]
+    process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "True\n"
         yield process
@@ -44,15 +46,18 @@ def test_lock_ends_with_its_process_and_waiting_names_the_holder_once(
     tmp_path,
 ):
     lock = Lock(tmp_path, "train", "a model")
-    said = []
-    asked = iter([False, False, True])
-    with held_elsewhere(tmp_path, "train", "a model") as holder:
+    messages = []
+    answers = iter([False, False, True])
+    with locked_by_process(tmp_path, "train", "a model") as holder:
         assert not lock.take()
         assert lock.holder.startswith(f"process {holder.pid} on ")
-        with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
+        with held(
+            Lock(tmp_path, "train", "a model"), lambda: next(answers), messages.append
+        ) as mine:
             assert not mine
         assert [
-            (waiting.stage, waiting.label, str(holder.pid) in waiting.holder) for waiting in said
+            (waiting.stage, waiting.label, str(holder.pid) in waiting.holder)
+            for waiting in messages
         ] == [("train", "a model", True)]
         os.kill(holder.pid, signal.SIGKILL)
         holder.wait()
@@ -60,23 +65,23 @@ def test_lock_ends_with_its_process_and_waiting_names_the_holder_once(
     lock.release()
 
 
-def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, monkeypatch):
+def test_a_single_process_compiles_for_calibration_and_others_wait(tmp_path, monkeypatch):
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: kernel == group.FLOOR_KERNEL)
-    asked = iter([False, False, True])
+    answers = iter([False, False, True])
     with (
-        held_elsewhere(tmp_path, "compile", "health"),
-        group._compile_lock(tmp_path, lambda: next(asked)),
+        locked_by_process(tmp_path, "compile", "health"),
+        group._compile_lock(tmp_path, lambda: next(answers)),
     ):
-        assert next(asked, "all") == "all"
+        assert next(answers, "all") == "all"
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: False)
     with (
-        held_elsewhere(tmp_path, "compile", "health"),
+        locked_by_process(tmp_path, "compile", "health"),
         group._compile_lock(tmp_path, pytest.fail),
     ):
         pass
 
 
-def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
+def test_names_invalid_for_files_are_separate_locks(tmp_path):
     first = Lock(tmp_path, "train", "../a/b")
     second = Lock(tmp_path, "train", ".._a_b")
     assert first.take()
@@ -101,16 +106,16 @@ def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
         assert not second.take()
     assert second.take(), "a group that is done with its members holds none"
 
-    said = []
+    messages = []
 
     def others_end(waiting):
-        said.append(waiting)
+        messages.append(waiting)
         first.release()
 
     with _locked(jobs[:2], lambda: False, others_end) as free:
         assert [job.seed for job in free] == [0]
-    assert [waiting.label for waiting in said] == [jobs[0].plan.folder.name]
-    with _locked(jobs[1:2], lambda: True, said.append) as free:
+    assert [waiting.label for waiting in messages] == [jobs[0].plan.folder.name]
+    with _locked(jobs[1:2], lambda: True, messages.append) as free:
         assert free == [], "who is asked to stop waits no longer"
     second.release()
 
@@ -118,10 +123,10 @@ def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
 COMMAND = [sys.executable, "-m", "vehest"]
 
 
-def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
+def test_runs_wait_for_artefacts_of_another_run_and_continue(place):
     assert place("ingest", "mine")[0] == 0
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
-    with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
+    with locked_by_process(place.folder / "outputs", "ingest", folder.name) as holder:
         waiting = start(
             [*COMMAND, "ingest", "mine", "--force"],
             stderr=subprocess.PIPE,
@@ -147,7 +152,7 @@ def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place, stage, number,
     assert place(*command)[0] == 0
     before = place.files()
     [folder] = (place.folder / "outputs" / stage).iterdir()
-    with held_elsewhere(place.folder / "outputs", stage, folder.name):
+    with locked_by_process(place.folder / "outputs", stage, folder.name):
         waiting = start(
             [*COMMAND, *command, "--force"],
             stderr=subprocess.PIPE,
@@ -204,23 +209,25 @@ def test_three_runs_at_once_make_each_artefact_and_mlflow_run_once(
     done = subprocess.run(
         [sys.executable, "-c", SIDE_BY_SIDE], capture_output=True, text=True, check=False
     )
-    said = {file.name: file.read_text() for file in place.folder.glob("said-*")}
-    assert done.stdout == "[0] [0, 0, 0]\n", (done.stderr, said)
+    outputs = {file.name: file.read_text() for file in place.folder.glob("said-*")}
+    assert done.stdout == "[0] [0, 0, 0]\n", (done.stderr, outputs)
     alone = place.folder / "alone"
     together = place.folder / "together"
     assert _contents(together) == _contents(alone)
     lines = [
         line.split()
-        for text in said.values()
+        for text in outputs.values()
         for line in text.splitlines()
         if line.startswith("done")
     ]
-    made = [tuple(words[1:3]) for words in lines]
-    assert len(made) == 2 * len(set(made)), "each is made once alone and once by one of the three"
+    computed = [tuple(words[1:3]) for words in lines]
+    assert len(computed) == 2 * len(set(computed)), (
+        "each is computed once alone and once by one of the three"
+    )
     client = MlflowClient(f"sqlite:///{together / 'mlflow.db'}")
-    found = client.search_runs([client.get_experiment_by_name("vehest").experiment_id])
-    runs = [run for run in found if run.data.tags["vehest.stage"] != "study"]
-    assert len(found) == len(runs) + 1, "and one above them"
+    all_runs = client.search_runs([client.get_experiment_by_name("vehest").experiment_id])
+    runs = [run for run in all_runs if run.data.tags["vehest.stage"] != "study"]
+    assert len(all_runs) == len(runs) + 1, "and one above them"
     tracked = _artefacts(together, ("train", "calibrate", "evaluate"))
     assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(
         artefact.key for artefact in tracked
@@ -229,7 +236,7 @@ def test_three_runs_at_once_make_each_artefact_and_mlflow_run_once(
     assert not list((together / "checkpoints").rglob("*"))
 
 
-def test_a_training_made_again_leaves_its_evaluation_up_to_date(place):
+def test_recomputed_trainings_leave_their_evaluation_up_to_date(place):
     arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
     place.told("train", *arguments)
     assert [
@@ -249,6 +256,8 @@ def _artefacts(output, stages):
 
 def _contents(output):
     return {
-        own.folder.name: own.digest
-        for own in _artefacts(output, ("ingest", "downsample", "train", "calibrate", "evaluate"))
+        artefact.folder.name: artefact.digest
+        for artefact in _artefacts(
+            output, ("ingest", "downsample", "train", "calibrate", "evaluate")
+        )
     }

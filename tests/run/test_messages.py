@@ -1,4 +1,7 @@
-"""Messages to users: usage errors, hostile names, full disks, broken streams; one line each, without control of the terminal."""
+"""Messages to users: usage errors, hostile names, full disks, broken streams.
+
+One line each, without control of the terminal.
+"""
 
 import errno
 import io
@@ -38,7 +41,8 @@ def _shows_only_text(text):
     [
         (
             ("trian",),
-            "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options",
+            "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and "
+            "options",
         ),
         (("train", "--nope"), "'vehest train --help' lists commands and options"),
         (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
@@ -86,9 +90,9 @@ def _shows_only_text(text):
             )
         ),
     ],
-    ids=lambda own: str(own)[:50],
+    ids=lambda case: str(case)[:50],
 )
-def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
+def test_wrong_usage_is_a_single_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
 
 
@@ -143,9 +147,9 @@ def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_befo
 @pytest.mark.parametrize("terminal", [False, True])
 def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     messages = Messages()
-    seen = io.StringIO()
+    stream = io.StringIO()
     messages.console = type(messages.console)(
-        file=seen,
+        file=stream,
         force_terminal=terminal,
         color_system=None,
         soft_wrap=True,
@@ -156,13 +160,13 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     messages.warn(f"first\n{HOSTILE}")
     with messages.bars() as bars:
         bars.step(HOSTILE, 1, 2, HOSTILE)
-    text = seen.getvalue()
-    shown = printable(HOSTILE)
-    assert text.startswith(f"done    train      {shown}\\ {shown}")
-    assert f"warning first\n{shown}" in text
+    text = stream.getvalue()
+    hostile = printable(HOSTILE)
+    assert text.startswith(f"done    train      {hostile}\\ {hostile}")
+    assert f"warning first\n{hostile}" in text
     assert not {"\x07", "\x9b", "\u202e"} & set(text)
     assert "\x1b]" not in text
-    assert terminal == (f"{shown} " in text.split("warning", 1)[1].split(shown, 1)[1])
+    assert terminal == (f"{hostile} " in text.split("warning", 1)[1].split(hostile, 1)[1])
 
 
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
@@ -196,7 +200,7 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     assert (code, r"'other\udcff.csv' is neither" in line) == (2, True)
 
 
-def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(place):
+def test_recordings_with_names_that_are_not_utf_8_complete_a_study(place):
     name = os.fsdecode(b"one\xff")
     (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{name}.csv")
     place.change(
@@ -259,7 +263,7 @@ def test_limit_of_jobs_counts_expanded_ranges(place):
         expand(["seed=range(4)"])
 
 
-def test_overrides_that_cannot_be_read_are_one_line_and_long_honest_ones_are_read():
+def test_unreadable_overrides_are_a_single_line_and_long_valid_ones_are_read():
     for override, words in (
         ("training.x=" + "[" * 2_000 + "]" * 2_000, "cannot be read"),
         ("output='a\0b'", "output must name a folder"),
@@ -275,7 +279,9 @@ def test_overrides_that_cannot_be_read_are_one_line_and_long_honest_ones_are_rea
 
 @contextmanager
 def _small_disk(size):
-    """Files of this process may not grow beyond a size [bytes]: every larger write fails as on a full disk."""
+    """Files of this process may not grow beyond a size [bytes]: every larger write fails as on a
+    full disk.
+    """
     former = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, former[1]))
     try:
@@ -307,10 +313,10 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     )
     for _, _, command in stages:  # what is compiled is cached in files, too
         assert place(*command)[0] == 0
-    for made in ("outputs", "aligned"):
-        shutil.rmtree(made)
-    for made in ("out.parquet", "out.csv"):
-        Path(made).unlink()
+    for folder in ("outputs", "aligned"):
+        shutil.rmtree(folder)
+    for folder in ("out.parquet", "out.csv"):
+        Path(folder).unlink()
     for size, target, command in stages:
         before = place.files() | set(os.listdir())
         with _small_disk(size):
@@ -327,23 +333,24 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     [
         *(OSError(code, os.strerror(code)) for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)),
         SafetensorError(
-            'Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No space left on device" })'
+            'Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No '
+            'space left on device" })'
         ),
         sqlite3.OperationalError("database or disk is full"),
         RuntimeError("wrapped: No space left on device (os error 28)"),
         ValueError("no space"),
     ],
 )
-def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
+def test_full_disks_are_identified_under_every_library_error(tmp_path, error):
     full = not isinstance(error, ValueError)
-    said = f"no room left to write '{tmp_path / 'target'}'" if full else "no space"
+    message = f"no room left to write '{tmp_path / 'target'}'" if full else "no space"
 
     def break_off():
         with written_aside(tmp_path / "target") as aside:
             aside.write_text("half")
             raise error
 
-    with pytest.raises(MissingError if full else ValueError, match=said):
+    with pytest.raises(MissingError if full else ValueError, match=message):
         break_off()
     assert (
         list(tmp_path.iterdir()),
@@ -372,7 +379,7 @@ def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
         (ValueError("x" * 100_000), 1, "…"),
     ],
 )
-def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, words):
+def test_internal_errors_are_a_single_line(place, monkeypatch, error, code, words):
     def fail():
         raise error
 
@@ -384,12 +391,16 @@ def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, wor
 
 def _shell(place, script, **environment):
     command = f"vehest() {{ '{sys.executable}' -m vehest \"$@\"; }}\n{script}"
-    kept = {
+    inherited = {
         name: value
         for name, value in os.environ.items()
         if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")
     }
-    options = {"cwd": place.folder, "env": {**kept, **environment}, "stdin": subprocess.DEVNULL}
+    options = {
+        "cwd": place.folder,
+        "env": {**inherited, **environment},
+        "stdin": subprocess.DEVNULL,
+    }
     return subprocess.run(
         ["bash", "-c", command], capture_output=True, text=True, timeout=300, **options
     )
@@ -426,7 +437,7 @@ def test_no_home_no_terminal_and_no_utf_8_still_show_everything(place):
     plain, table = (
         _shell(place, f"vehest data channels {words}", **bare) for words in ("--json", "")
     )
-    assert [(own.returncode, own.stderr) for own in (plain, table)] == [(0, "")] * 2
+    assert [(process.returncode, process.stderr) for process in (plain, table)] == [(0, "")] * 2
     assert plain.stdout.isascii()
     assert json.loads(plain.stdout) == place.told("data", "channels")
     assert "m/s²" in table.stdout

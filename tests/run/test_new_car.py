@@ -1,4 +1,6 @@
-"""`vehest new` on the command line: what is asked, answered, written and refused, and that `vehest run` takes it."""
+"""`vehest new` on the command line: what is asked, answered, written and refused, and that `vehest
+run` takes it.
+"""
 
 import io
 import json
@@ -33,8 +35,8 @@ class Log:
 
     def new(self, *words, code=0):
         """Standard output and error."""
-        found, out, err = self("new", "my_car", *words)
-        assert found == code, err
+        exit_code, out, err = self("new", "my_car", *words)
+        assert exit_code == code, err
         return out, err
 
     @staticmethod
@@ -49,31 +51,31 @@ def log(elsewhere, capsys):
     return Log(elsewhere, capsys)
 
 
-def held(position):
+def test_segment_of(position):
     return yaml.safe_load(Path(FILES[position]).read_text(encoding="utf-8"))
 
 
-def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
-    said = log.typed("lap.csv", answers=["", "2.7", "1500", "15", "-0.3", "simulated"])
+def test_enter_accepts_proposals_and_values_of_the_car_are_used(log):
+    output = log.typed("lap.csv", answers=["", "2.7", "1500", "15", "-0.3", "simulated"])
     for words in (
         "yaw_rate: column 'Gyro', deg/s: ay vs. vx·yaw_rate: correlation",
         "is column 'Gyro' positive in a left turn?",
         "vehest run my_car",
     ):
-        assert words in said
-    assert held(0)["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
-    assert held(0)["kind"] == "simulated"
-    assert held(0)["car"] == {
+        assert words in output
+    assert test_segment_of(0)["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
+    assert test_segment_of(0)["kind"] == "simulated"
+    assert test_segment_of(0)["car"] == {
         "wheelbase": 2.7,
         "mass": 1500.0,
         "steering_ratio": 15.0,
         "imu_to_rear_axle": -0.3,
     }
-    assert [entry["name"] for entry in held(0)["transforms"]] == [
+    assert [entry["name"] for entry in test_segment_of(0)["transforms"]] == [
         "velocity_from_sideslip",
         "steering_ratio",
     ]
-    sweeps = [" ".join(sweep) for sweep in held(2)["parts"]["all"]["sweeps"]]
+    sweeps = [" ".join(sweep) for sweep in test_segment_of(2)["parts"]["all"]["sweeps"]]
     assert sweeps[:2] == [
         "estimator=zero,static_map,kinematic",
         "estimator=data_sheet estimator.wheelbase=2.7",
@@ -86,11 +88,11 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
 def test_values_of_the_car_are_in_the_data_set_and_the_printed_command_needs_none(log):
     log.write("lap.csv", usual(drive()).drop(columns="Beta"))
     out, _ = log.new("lap.csv", "--yes", "--wheelbase", "0.33", "--mass", "5.1", "--json")
-    assert held(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
-    assert held(0)["vehicle"] == "unknown"
+    assert test_segment_of(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
+    assert test_segment_of(0)["vehicle"] == "unknown"
     assert not [command for command in json.loads(out)["next"] if "wheelbase" in command]
     log.new("lap.csv", "--yes", "--force")
-    assert "car" not in held(0)
+    assert "car" not in test_segment_of(0)
 
 
 def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, data_root):
@@ -99,18 +101,18 @@ def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, 
     out, _ = log.new(file, "--yes", "--wheelbase", "2.941")
     assert "'steer' is left out: the steering ratio estimated from slow corners is 19.8" in out
     assert "state your car's by --steering-ratio to add it" in out
-    assert "steering_ratio" not in str(held(0).get("transforms", ""))
+    assert "steering_ratio" not in str(test_segment_of(0).get("transforms", ""))
     log.new(file, "--yes", "--wheelbase", "2.941", "--steering-ratio", "16.3", "--force")
-    assert {"name": "steering_ratio", "ratio": 16.3} in held(0)["transforms"]
-    assert held(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
+    assert {"name": "steering_ratio", "ratio": 16.3} in test_segment_of(0)["transforms"]
+    assert test_segment_of(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
 
 
-def test_an_answer_that_is_none_is_asked_again(log):
-    said = log.typed(
+def test_invalid_answers_are_requested_again(log):
+    output = log.typed(
         "lap.csv", answers=["perhaps", "no", "-3", "", "", "", "front", "90", "", "toy", ""]
     )
     assert all(
-        words in said
+        words in output
         for words in (
             "'perhaps' is neither yes nor no",
             "wheelbase must be a positive number, not '-3'",
@@ -119,7 +121,7 @@ def test_an_answer_that_is_none_is_asked_again(log):
             "'toy' is neither real nor simulated",
         )
     )
-    signs = {name: entry.get("sign", 1) for name, entry in held(0)["channels"].items()}
+    signs = {name: entry.get("sign", 1) for name, entry in test_segment_of(0)["channels"].items()}
     assert signs == {"vx": 1, "ax": 1} | dict.fromkeys(
         ("yaw_rate", "ay", "handwheel", "sideslip_ref"), -1
     )
@@ -128,10 +130,10 @@ def test_an_answer_that_is_none_is_asked_again(log):
 def test_a_column_can_be_declared_otherwise_or_left_out(log):
     log.write("two.csv", usual(drive()).assign(Speed2=3.6 * drive()["vx"] + 0.01))
     log.typed("two.csv", answers=["vx_ref km/h", *[""] * 7])
-    first = held(0)["channels"]
+    first = test_segment_of(0)["channels"]
     assert {first["vx"]["column"], first["vx_ref"]["column"]} == {"Speed", "Speed2"}
     log.typed("two.csv", "--force", answers=["-", *[""] * 7])
-    assert len(held(0)["channels"]) == len(first) - 1
+    assert len(test_segment_of(0)["channels"]) == len(first) - 1
 
 
 def test_yes_asks_nothing_and_lists_open_questions(log):
@@ -140,7 +142,7 @@ def test_yes_asks_nothing_and_lists_open_questions(log):
     assert "answered as proposed:\n  left_right: yes (is column 'Gyro' positive in a left" in out
     assert "  imu_to_rear_axle: unknown (how far ahead of the rear axle" in out
     assert "  kind: real (do the logs come from a real car" in out
-    assert "car" not in held(0), "a place that is not known is not written"
+    assert "car" not in test_segment_of(0), "a place that is not known is not written"
     assert all(f"wrote {file}: " in out for file in FILES)
     assert "Open question: is column 'Gyro' positive in a left" in Path(FILES[0]).read_text(
         encoding="utf-8"
@@ -154,7 +156,7 @@ def test_yes_asks_nothing_and_lists_open_questions(log):
     )
     assert (Path(FILES[1]).read_text(), Path(FILES[0]).exists()) == ("mine", False)
     log.new("lap.csv", "--yes", "--force")
-    assert held(1)["dataset"] == "my_car"
+    assert test_segment_of(1)["dataset"] == "my_car"
     log.write("bare.csv", usual(drive()).drop(columns="Beta"))
     log.new("bare.csv", "--yes", "--force")
     assert [Path(file).exists() for file in FILES] == [True, False, False], (
@@ -163,35 +165,37 @@ def test_yes_asks_nothing_and_lists_open_questions(log):
 
 
 def test_json_says_all_of_it_to_a_script(log):
-    said = json.loads(log.new("lap.csv", "--json", "--dry-run")[0])
-    assert {one["channel"]: one["column"] for one in said["channels"]}["ay"] == "LatAcc"
-    assert said["time"] == {
+    result = json.loads(log.new("lap.csv", "--json", "--dry-run")[0])
+    assert {channel["channel"]: channel["column"] for channel in result["channels"]}[
+        "ay"
+    ] == "LatAcc"
+    assert result["time"] == {
         "column": "Time [s]",
         "unit": "s",
         "evidence": "unit in the header, 50 Hz",
         "asked": False,
         "repair": {},
     }
-    assert ([question["key"] for question in said["open"]], said["has_reference"]) == (
+    assert ([question["key"] for question in result["open"]], result["has_reference"]) == (
         ["left_right", "imu_to_rear_axle", "kind"],
         True,
     )
-    assert said["lacking"]["data_sheet"] == "requires the car's wheelbase (--wheelbase)"
+    assert result["lacking"]["data_sheet"] == "requires the car's wheelbase (--wheelbase)"
     assert not any(Path(file).exists() for file in FILES)
     answers = ("left_right=no", "imu_to_rear_axle=-0.3", "kind=simulated")
     answers = [word for answer in answers for word in ("--answer", answer)]
     assert json.loads(log.new("lap.csv", "--json", *answers)[0])["open"] == []
-    assert held(0)["kind"] == "simulated"
-    assert held(0)["car"] == {"imu_to_rear_axle": -0.3}
+    assert test_segment_of(0)["kind"] == "simulated"
+    assert test_segment_of(0)["car"] == {"imu_to_rear_axle": -0.3}
     before = [Path(file).read_text() for file in FILES]
     out, err = log.new("lap.csv", "--json", "--dry-run", "--answer", "gear=3", code=2)
     assert err == f"error: {json.loads(out)['stopped']}\n", "a stop gives what was found"
-    assert "vx" in [one["channel"] for one in json.loads(out)["channels"]]
+    assert "vx" in [channel["channel"] for channel in json.loads(out)["channels"]]
     assert json.loads(log.new("lap.csv", "--json", "--dry-run")[0])["dry_run"], "it needs no force"
     assert [Path(file).read_text() for file in FILES] == before
 
 
-def test_run_takes_what_was_written(log):
+def test_run_accepts_the_written_configuration(log):
     log.new("lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500", "--steering-ratio", "15")
     code, _, err = log("run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
@@ -227,9 +231,9 @@ def test_nothing_half_written_stays(log):
     assert not list(Path().rglob(f"{ASIDE_PREFIX}*"))
 
 
-def test_what_cannot_be_done_is_one_line(log, monkeypatch):
+def test_refusals_of_new_are_a_single_line(log, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
-    for words, code, said in (
+    for words, code, message in (
         (("my_car", "nowhere.csv", "--yes"), 4, "there is no file 'nowhere.csv'"),
         (("tabular", "lap.csv", "--yes"), 2, "is a built-in source"),
         (("my car", "lap.csv", "--yes"), 2, "'my car' must be made of letters"),
@@ -237,16 +241,16 @@ def test_what_cannot_be_done_is_one_line(log, monkeypatch):
         (("my_car", "lap.csv", "--yes", "--answer", "gear=3"), 2, "no question has the key 'gear'"),
         (("my_car", "lap.csv"), 2, "no terminal for questions; add --yes"),
     ):
-        found, _, err = log("new", *words)
-        assert (found, said in err, err.count("error:")) == (code, True, 1), err
+        exit_code, _, err = log("new", *words)
+        assert (exit_code, message in err, err.count("error:")) == (code, True, 1), err
 
 
 def test_files_beside_those_that_are_named_stay_out_of_the_data_set(log):
     for seed, name in enumerate(("run_1", "run_2", "run_other"), start=1):
         log.write(f"{name}.csv", usual(drive(seed=seed)))
     log.new("run_1.csv", "run_2.csv", "--yes")
-    shown = json.loads(log("data", "show", "my_car", "--json")[1])
-    assert [one["id"] for one in shown["recordings"]] == ["run_1", "run_2"]
+    result = json.loads(log("data", "show", "my_car", "--json")[1])
+    assert [recording["id"] for recording in result["recordings"]] == ["run_1", "run_2"]
 
 
 def test_without_a_speed_no_pipeline_is_written(
@@ -268,18 +272,22 @@ def test_without_a_speed_no_pipeline_is_written(
     assert (err, "lacks vx, ay" in out) == ("", True)
 
 
-def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(log):
+def test_short_recordings_stay_undivided_and_too_few_are_refused_with_a_remedy(log):
     names = [f"turn_{number}" for number in range(10)]
     for number, name in enumerate(names):
         log.write(f"{name}.csv", usual(drive(seed=number)).iloc[:400])
     files = [f"{name}.csv" for name in names]
     assert "whole recordings (10, 80 s in all)" in log.new(*files, "--yes")[0]
-    parts = [held(1)["train"], held(1)["validation"], held(1)["tests"]["test"]]
-    assert [len(own) for own in parts] == [5, 2, 3]
+    parts = [
+        test_segment_of(1)["train"],
+        test_segment_of(1)["validation"],
+        test_segment_of(1)["tests"]["test"],
+    ]
+    assert [len(spans) for spans in parts] == [5, 2, 3]
     out, _ = log.new(*files, "--yes", "--force", "--steering-ratio", "15")
     (line,) = [line for line in out.splitlines() if "velocity_gru" in line]
     assert line.endswith("at least 15 s in each range for validation (the shortest has 8 s)")
-    assert sorted(one["recording"] for own in parts for one in own) == names
+    assert sorted(span["recording"] for spans in parts for span in spans) == names
     out, _ = log.new(*files[:2], "--yes", "--force")
     assert (
         "16 s in 2 recordings are too short for training, validation and a test: record two minutes"
@@ -292,8 +300,8 @@ def test_slow_log_and_slightly_wrong_clock_are_accepted_by_run(log):
     table = usual(drive(240.0, rate_hz=10.0))
     log.write("slow.csv", table)
     log.new("slow.csv", "--yes", "--steering-ratio", "15")
-    assert held(2)["evaluation"]["rate_hz"] == 10
-    words = [word for sweep in held(2)["parts"]["all"]["sweeps"] for word in sweep]
+    assert test_segment_of(2)["evaluation"]["rate_hz"] == 10
+    words = [word for sweep in test_segment_of(2)["parts"]["all"]["sweeps"] for word in sweep]
     assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (
         True,
         False,
@@ -303,31 +311,33 @@ def test_slow_log_and_slightly_wrong_clock_are_accepted_by_run(log):
         usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"),
     )
     log.new("off.csv", "--yes", "--force")
-    assert held(0)["clock"] == "interpolate"
+    assert test_segment_of(0)["clock"] == "interpolate"
 
 
 def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothing(log):
     for name, rows in (("long", 2500), ("short", 400), ("piece", 100)):
         log.write(f"{name}.csv", usual(drive()).iloc[:rows])
     log.new("long.csv", "short.csv", "piece.csv", "--yes")
-    assert held(1)["train"] == [
+    assert test_segment_of(1)["train"] == [
         {"recording": "long", "start": "0 %", "stop": "50 %"},
         {"recording": "short"},
     ]
-    assert held(1)["tests"] == {"test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]}
+    assert test_segment_of(1)["tests"] == {
+        "test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]
+    }
     assert log("run", "my_car", "--dry-run")[0] == 0
 
 
-def test_an_estimator_of_ones_own_is_compared_too(log, monkeypatch):
-    own = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
-    _, err = log.new(*own, code=2)
+def test_estimators_of_the_user_are_compared_too(log, monkeypatch):
+    arguments = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
+    _, err = log.new(*arguments, code=2)
     assert (
-        '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip'
-        in err
+        '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then '
+        "install it with pip" in err
     )
     install_examples(log.folder / "installed", monkeypatch)
     try:
-        log.new(*own)
-        assert ["estimator=sliding_mode"] in held(2)["parts"]["all"]["sweeps"]
+        log.new(*arguments)
+        assert ["estimator=sliding_mode"] in test_segment_of(2)["parts"]["all"]["sweeps"]
     finally:
         forget_examples()

@@ -1,8 +1,10 @@
-"""Whatever stands in a file, reading it executes nothing: an audit hook watches while hostile files of each format are read.
+"""Whatever stands in a file, reading it executes nothing: an audit hook watches while hostile files
+of each format are read.
 
-Each format runs in a process of its own, since a hook cannot be taken off again. The process reads an honest file first, so that what
-vehest imports and compiles for a format is there, then watches. A further format is a further entry of `CASES`: how honest and hostile
-files are made, which returns what reads them; the package without which they cannot be written; and those that must be refused.
+Each format runs in a process of its own, since a hook cannot be taken off again. The process reads
+an honest file first, so that what vehest imports and compiles for a format is there, then watches.
+A further format is a further entry of `CASES`: how honest and hostile files are made, which returns
+what reads them; the package without which they cannot be written; and those that must be refused.
 """
 
 import contextlib
@@ -106,20 +108,25 @@ def rosbag(honest, hostile):
         write_bag(honest, values, storage, {}, name=storage) for storage in ("sqlite3", "mcap")
     )
     view = "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, {} AS data"
-    endless = "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+    endless = (
+        "WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS "
+        "topic_id, id AS timestamp, x'00' AS data FROM n"
+    )
     layout = f"float64 data\n{PAYLOAD}\nfloat64 x={PAYLOAD}\n".replace("'", "''")
     for name, *statements in (
         ("view_load", "DROP TABLE messages", view.format(f"load_extension('./{MARK}.so')")),
         ("view_zeros", "DROP TABLE messages", view.format("zeroblob(1000000000)")),
         (
             "trigger",
-            f"CREATE TRIGGER evil AFTER INSERT ON messages BEGIN SELECT load_extension('./{MARK}.so'); END",
+            f"CREATE TRIGGER evil AFTER INSERT ON messages BEGIN SELECT "
+            f"load_extension('./{MARK}.so'); END",
         ),
         ("endless", "DROP TABLE messages", f"CREATE VIEW messages AS {endless}"),
         ("layout", f"UPDATE message_definitions SET encoded_message_definition = '{layout}'"),
         (
             "quality",
-            f"UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [touch {MARK}]'",
+            f"UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [touch "
+            f"{MARK}]'",
         ),
     ):
         shutil.copytree(good, hostile / name)
@@ -262,7 +269,9 @@ def test_hostile_files_execute_nothing(tmp_path, name):
 
 
 def watch(name, folder):
-    """Read honest files of a format, then watch while hostile ones are read: file -> how it ended, and what was seen."""
+    """Read honest files of a format, then watch while hostile ones are read: file -> how it ended,
+    and what was seen.
+    """
     import processes
     from vehest.data.errors import VehestError
     from vehest.sources import limited
@@ -278,7 +287,7 @@ def watch(name, folder):
     with contextlib.suppress(VehestError):  # what the way to an error imports
         read(folder / "nowhere" / min(hostile.iterdir()).name)
     outcome = {}
-    seen = []
+    events = []
     armed = [False]
     temporary = tempfile.gettempdir()
 
@@ -288,13 +297,13 @@ def watch(name, folder):
         if event == "os.fork":
             return  # the reading process, in which the fuzz watches
         if event == "open" and _writes(*arguments) and not str(arguments[0]).startswith(temporary):
-            seen.append(f"open {str(arguments[0])[:80]} {arguments[1]}")
+            events.append(f"open {str(arguments[0])[:80]} {arguments[1]}")
         elif event in WATCHED:
-            seen.append(f"{event} {str(arguments)[:160]}")
+            events.append(f"{event} {str(arguments)[:160]}")
 
     sys.addaudithook(hook)
     for file in sorted(hostile.iterdir()):
-        seen.clear()
+        events.clear()
         armed[0] = True
         try:
             read(file)
@@ -304,7 +313,7 @@ def watch(name, folder):
         except BaseException as error:
             ended = f"{type(error).__name__}: {error}"[:200]
         armed[0] = False
-        outcome[file.name] = ended, list(seen)
+        outcome[file.name] = ended, list(events)
     return outcome
 
 

@@ -1,4 +1,6 @@
-"""A study of several comparisons, each on a split of its own, run from the command line on a small data set."""
+"""A study of several comparisons, each on a split of its own, run from the command line on a small
+data set.
+"""
 
 import dataclasses
 import json
@@ -16,7 +18,7 @@ from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
-BOTH = "pipelines/both.yaml"
+PIPELINE_OF_BOTH = "pipelines/both.yaml"
 CANDIDATES = [
     ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],
     ["estimator=ksnn", "estimator.n_hidden=0,2", "seed=0,1", "training.max_epochs=2"],
@@ -34,13 +36,13 @@ def parts_place(place):
         "f2": [{"recording": "three", "start": 40}],
     }
     for name, train, validation in (("forth", "one", "two"), ("back", "two", "one")):
-        own = {
+        settings = {
             "name": name,
             "train": [{"recording": train}],
             "validation": [{"recording": validation}],
             "tests": tests,
         }
-        place.change(f"conf/split/{name}.yaml", **split | own)
+        place.change(f"conf/split/{name}.yaml", **split | settings)
     place.change("conf/dataset/other.yaml", **DATASET | {"name": "other", "path": "${root}/other"})
     place.change("conf/split/other.yaml", **split | {"name": "other", "dataset": "other"})
     parts = {
@@ -73,11 +75,11 @@ def parts_place(place):
 
 def change_parts(place, change):
     """Write the pipeline anew with what ``change`` makes of its parts."""
-    parts = place.change(BOTH)["parts"]
-    place.change(BOTH, parts=change(parts) or parts)
+    parts = place.change(PIPELINE_OF_BOTH)["parts"]
+    place.change(PIPELINE_OF_BOTH, parts=change(parts) or parts)
 
 
-def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
+def test_parts_run_as_a_single_study_and_the_next_run_skips_all(parts_place):
     place = parts_place
     out, err = place.done("run", "both", "--json", "tracking=none")
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
@@ -104,14 +106,14 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
         assert (results / target).is_file(), target
 
     assert place("report", "both", "tracking=none")[0] == 0
-    made = place.files()
+    files = place.files()
     again, err = place.done("run", "both", "--json", "tracking=none")
     assert json.loads(again)["overview"] == json.loads(out)["overview"]
     warning, line = err.splitlines()
     assert warning.startswith("warning data set 'other'")
     assert line.startswith("reused  ")
     assert {"train", "evaluate", "report"} <= set(line.replace(",", "").split())
-    assert place.files() == made
+    assert place.files() == files
 
     assert not any(
         "seconds" in path.read_text(encoding="utf-8")
@@ -137,12 +139,14 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     )
 
 
-def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
+def test_study_modules_without_an_overview_are_refused(parts_place, monkeypatch):
     monkeypatch.setattr(
         "vehest_papers.ksnn.documents",
         lambda artefacts: {"report": Document(artefacts.title, ["no tables"])},
     )
-    parts_place.change(BOTH, parts={"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}})
+    parts_place.change(
+        PIPELINE_OF_BOTH, parts={"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}}
+    )
     code, _, err = parts_place("run", "both", "tracking=none")
     assert (code, "gives no table 'overview'" in " ".join(err.split())) == (2, True)
     assert not list((parts_place.folder / "outputs" / "report").glob("both-*"))
@@ -174,28 +178,28 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
     for name in ("mine", "other"):
         parts_place.change(f"conf/dataset/{name}.yaml", kind="real")
     quick = [CANDIDATES[0], [*CANDIDATES[1][:2], "training.max_epochs=1"], CANDIDATES[2]]
-    further = {
+    additions = {
         name: {"split": "back", "sweeps": CANDIDATES[::2]}
         for name in ("devbot_ferrari", "minutes_5_a")
     }
     change_parts(
         parts_place,
-        lambda parts: {name: part | {"sweeps": quick} for name, part in parts.items()} | further,
+        lambda parts: {name: part | {"sweeps": quick} for name, part in parts.items()} | additions,
     )
     parts_place.done("run", "both", "tracking=none")
     report = (parts_place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
     assessed = "\n".join(line for line in report.splitlines() if "| not assessed |" not in line)
-    made_here = assessed.replace("on simulated cars", "")  # of the recommendation
-    assert "simulated" not in made_here.lower()
+    remainder = assessed.replace("on simulated cars", "")  # of the recommendation
+    assert "simulated" not in remainder.lower()
 
 
-def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
-    both = read_study("both")
+def test_pipelines_based_on_another_state_only_changes(parts_place):
+    pipeline = read_study("both")
     turned = read_study("turned")
-    assert [part.split for part in both.parts.values()] == ["forth", "back", "other"]
+    assert [part.split for part in pipeline.parts.values()] == ["forth", "back", "other"]
     assert [part.split for part in turned.parts.values()] == ["back", "back", "other"]
     assert [part.sweeps for part in turned.parts.values()] == [
-        part.sweeps for part in both.parts.values()
+        part.sweeps for part in pipeline.parts.values()
     ]
     assert (turned.study, turned.title, turned.publish) == ("turned", "Both ways", False)
 
@@ -212,11 +216,11 @@ def test_the_study_on_the_papers_recordings_trains_as_that_on_simulated_cars():
         options = [
             {
                 option
-                for sweep in own.sweeps
+                for sweep in jobs.sweeps
                 for option in sweep
                 if option.startswith(("training.", "estimator.window"))
             }
-            for own in (part, simulated[name])
+            for jobs in (part, simulated[name])
         ]
         assert options[0] == options[1], name
 
@@ -227,7 +231,7 @@ def test_both_schemes_have_the_39_candidates_of_table_3_ours_and_two_baselines()
     jobs = jobs_of(
         dataclasses.replace(study, parts={name: study.parts[name] for name in schemes}), []
     )
-    configs = {part: [job.config for job in own] for part, own in jobs.items()}
+    configs = {part: [job.config for job in part_jobs] for part, part_jobs in jobs.items()}
     baselines = ("zero", "static_map")
     for scheme in schemes:
         names = [
@@ -254,12 +258,20 @@ def test_both_schemes_have_the_39_candidates_of_table_3_ours_and_two_baselines()
 @pytest.mark.parametrize(
     ("file", "content", "says"),
     [
-        (BOTH, {"split": "forth", "sweeps": CANDIDATES}, "it needs study, report and one of"),
-        (BOTH, {"parts": {}}, "it needs study, report and one of"),
-        (BOTH, {"parts": {"one": {"split": "forth"}}}, "part 'one' needs split and sweeps"),
-        (BOTH, {"parts": {"../one": {"split": "forth", "sweeps": CANDIDATES}}}, "part"),
         (
-            BOTH,
+            PIPELINE_OF_BOTH,
+            {"split": "forth", "sweeps": CANDIDATES},
+            "it needs study, report and one of",
+        ),
+        (PIPELINE_OF_BOTH, {"parts": {}}, "it needs study, report and one of"),
+        (
+            PIPELINE_OF_BOTH,
+            {"parts": {"one": {"split": "forth"}}},
+            "part 'one' needs split and sweeps",
+        ),
+        (PIPELINE_OF_BOTH, {"parts": {"../one": {"split": "forth", "sweeps": CANDIDATES}}}, "part"),
+        (
+            PIPELINE_OF_BOTH,
             {"report": "drive"},
             "the study module 'drive' draws its report from split and sweeps",
         ),

@@ -1,4 +1,6 @@
-"""`vehest plot` and `vehest estimate --plot`: pictures and a page of a drive, complete or not at all."""
+"""`vehest plot` and `vehest estimate --plot`: pictures and a page of a drive, complete or not at
+all.
+"""
 
 import re
 from pathlib import Path
@@ -29,7 +31,7 @@ def test_recording_is_drawn_in_every_format(log, ending):
         assert re.findall(loads, content) == []
 
 
-def test_estimate_is_drawn_as_it_is_made_and_afterwards(log):
+def test_estimates_are_drawn_during_and_after_the_estimation(log):
     words = ["estimate", "drive.parquet", "estimator.wheelbase=2.5", "-o", "beta.parquet"]
     outcome = log.told(*words, "--plot", "drive.svg")
     assert outcome["plot"] == "drive.svg"
@@ -51,7 +53,7 @@ def test_estimate_is_drawn_as_it_is_made_and_afterwards(log):
         (["estimate", "drive.parquet", "-o", "b.parquet", "--plot", "folder.png"], "is a folder"),
     ],
 )
-def test_a_mistake_is_one_error_and_writes_nothing(log, words, says):
+def test_mistakes_are_a_single_error_and_write_nothing(log, words, says):
     Path("folder.png").mkdir()
     before = set(Path().iterdir())
     log.refused(*words, says=[says])

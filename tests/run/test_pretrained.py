@@ -24,19 +24,19 @@ from vehest.trust.record import read_trust
 ROOT = Path(__file__).parents[2]
 
 
-def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place):
+def test_estimate_without_a_model_uses_and_names_the_pretrained_model(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
-    said = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
-    assert said["model"] == said["estimator"] == "self_calibrating"
+    result = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
+    assert result["model"] == result["estimator"] == "self_calibrating"
     for content in (
         "simulated cars, not on yours",
         "docs/estimators/self_calibrating.md",
         "PCT/IT2023/050058",
     ):
-        assert content in said["note"]
-    assert "\n" not in said["note"]
-    assert len(said["note"]) < 200
+        assert content in result["note"]
+    assert "\n" not in result["note"]
+    assert len(result["note"]) < 200
     assert (
         place("estimate", "self_calibrating", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
     )
@@ -48,7 +48,10 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
 
 def test_estimate_of_the_shipped_model_loads_no_torch_pandas_or_scipy_signal(place):
     write_csv(place.folder / "lap.csv", 9)
-    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+    program = (
+        "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, "
+        "file=sys.stderr)\n"
+    )
     for out in ("lap.parquet", "estimate.csv"):
         command = [sys.executable, "-c", program, "estimate", "lap.csv", "dataset=mine", "-o", out]
         result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
@@ -75,16 +78,16 @@ def test_named_model_is_used_and_a_folder_is_no_recording(
     place.refused("estimate", "own", says="comes after the model")
 
 
-def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
+def test_pretrained_model_is_small_and_the_choice_of_the_published_study():
     folder = pretrained_folder()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
     row = make_pretrained.chosen_step()
     about = yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
     assert about["note"] == make_pretrained.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
-    trust = read_trust(
-        folder
-    )  # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real ones
+    # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real
+    # ones
+    trust = read_trust(folder)
     assert (trust.about.note, trust.guard, trust.bands is None, trust.health is None) == (
         "",
         None,
@@ -123,7 +126,9 @@ def test_a_copy_of_a_loaded_model_keeps_its_calibration():
 
 
 def bands_on(name, data_root):
-    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
+    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its
+    median [°], share that is valid.
+    """
     source = open_source(
         compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]
     )
@@ -138,14 +143,15 @@ def bands_on(name, data_root):
     return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
 
 
-def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
+def test_documentation_has_the_coverage_of_pretrained_bands_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
-    told = re.search(
-        r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % of the drive is valid",
+    figures = re.search(
+        r"the coverage is (\d+) % at a nominal 90 %, the median half width ([\d.]+)°, and (\d+) % "
+        r"of the drive is valid",
         text,
     )
     inside, median, valid = bands_on("ferrari_250lm", data_root)
-    assert [told[1], told[2], told[3]] == [
+    assert [figures[1], figures[2], figures[3]] == [
         f"{100 * inside:.0f}",
         f"{median:.1f}",
         f"{100 * valid:.0f}",
@@ -154,7 +160,7 @@ def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_car
     assert bands_on("roboracer", data_root)[2] < 0.01
 
 
-def test_a_step_of_a_window_network_is_the_batch_estimate_one_sample_later():
+def test_step_of_a_window_network_is_the_batch_estimate_of_the_next_sample():
     """The figures of docs/export.md: KS-NN, GRU and LSTM predict t(k+1) from samples up to t(k)."""
     table = pd.read_csv(ROOT / "docs" / "examples" / "lap.csv")
     channels = {

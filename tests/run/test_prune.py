@@ -47,11 +47,11 @@ class Root:
         plan = StagePlan(stage, label, config, inputs, code, self.output)
         return make(plan, lambda folder: (folder / "content").write_text(label) and None)
 
-    def found(self):
+    def listed(self):
         """Path in the root."""
         return {
-            Path(found["path"]).relative_to(self.output).as_posix(): found["reason"]
-            for found in unused_artefacts(self.output)
+            Path(listed["path"]).relative_to(self.output).as_posix(): listed["reason"]
+            for listed in unused_artefacts(self.output)
         }
 
 
@@ -64,8 +64,8 @@ def name_of(artefact):
     return f"{artefact.stage}/{artefact.folder.name}"
 
 
-def test_artefacts_of_present_versions_are_kept(root):
-    assert root.found() == {}
+def test_artefacts_of_present_versions_stay(root):
+    assert root.listed() == {}
     inputs = {
         artefact.folder.name: artefact.digest
         for artefact in (root.model, root.trusted, root.scored)
@@ -79,45 +79,45 @@ def test_artefacts_of_present_versions_are_kept(root):
         {},
         "train=1 somebody_elses=1 training=1",
     )
-    assert root.found() == {}
+    assert root.listed() == {}
 
 
-def test_what_other_code_has_made_is_found(root):
+def test_artefacts_of_other_code_are_listed(root):
     old = root.add(
         "train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16
     )
     older = root.add("ingest", "drives", {"source": "tabular"}, {}, "ingest=0 tabular=1")
-    assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
+    assert root.listed() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
 
 
 def test_artefacts_without_their_model_or_calibration_are_unused(
     root,
 ):
     shutil.rmtree(root.trusted.folder)
-    assert root.found() == {name_of(root.scored): ORPHANED}
+    assert root.listed() == {name_of(root.scored): ORPHANED}
     root.trusted = root.add(
         "calibrate", "one-trust", {}, {"model": root.model.digest}, root.trusted.code
     )
     shutil.rmtree(root.model.folder)
-    assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
+    assert root.listed() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
 
 
 def test_damaged_recordings_are_unused_and_outdated_ones_keep_their_artefacts(root):
     manifest = root.ingested.folder / "manifest.json"
     manifest.write_text(manifest.read_text().replace(root.ingested.code, "0" * 16))
-    assert root.found() == {name_of(root.ingested): OUTDATED}
+    assert root.listed() == {name_of(root.ingested): OUTDATED}
     (root.rated.folder / "content").unlink()
-    assert root.found() == {name_of(root.ingested): OUTDATED, name_of(root.rated): DAMAGED}
+    assert root.listed() == {name_of(root.ingested): OUTDATED, name_of(root.rated): DAMAGED}
 
 
-def test_checkpoints_of_finished_models_are_found_and_others_are_not(root):
+def test_only_checkpoints_of_finished_models_are_listed(root):
     for name in (root.model.folder.name, "another-seed0-0123456789ab"):
         (root.output / "checkpoints" / name).mkdir(parents=True)
         (root.output / "checkpoints" / name / "checkpoint.safetensors").write_text("state")
-    assert root.found() == {f"checkpoints/{root.model.folder.name}": SUPERFLUOUS}
+    assert root.listed() == {f"checkpoints/{root.model.folder.name}": SUPERFLUOUS}
 
 
-def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not(root):
+def test_files_of_killed_processes_are_listed_and_of_living_ones_are_not(root):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     dead = root.output / "train" / f"{ASIDE_PREFIX}{ended.pid}-1-one"
@@ -128,10 +128,10 @@ def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not
     unfinished = parts.with_name(f"{PARTS_PREFIX}other-0123456789ab")
     for folder in (parts, unfinished):
         folder.mkdir()
-    assert root.found() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}
+    assert root.listed() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}
 
 
-def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
+def test_links_and_foreign_files_stay(root, tmp_path):
     elsewhere = Root(tmp_path / "elsewhere")
     old = elsewhere.add("train", "old", {"estimator": {"name": "luenberger"}}, {}, "0" * 16)
     (root.output / "train" / old.folder.name).symlink_to(old.folder)
@@ -144,10 +144,10 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
         root.add("train", "renamed", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder,
         renamed,
     )
-    assert root.found() == {}
+    assert root.listed() == {}
 
 
-def test_yes_removes_what_was_listed_and_a_dry_run_nothing(elsewhere, root, capsys):
+def test_yes_removes_the_listed_artefacts_and_a_dry_run_nothing(elsewhere, root, capsys):
     outdated = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
     assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err

@@ -1,4 +1,6 @@
-"""Published results: a rerun leaves them as they are, and a check says whether they are those of today."""
+"""Published results: a rerun leaves them as they are, and a check says whether they are those of
+today.
+"""
 
 import json
 import shutil
@@ -17,8 +19,10 @@ from safetensors.numpy import load, load_file, save_file
 from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.artefacts.artefact import TIMINGS, read_artefact
 from vehest.run import published as study_keys
+from vehest.run import report as report_stage
 from vehest.run.publishing import PROVENANCE, published_content
 from vehest.run.versions import VERSIONS, code_of
+from vehest.run.weights import uncompressed
 
 QUICK = PIPELINE | {
     "publish": True,
@@ -49,7 +53,9 @@ def published(tmp_path_factory):
 
 @pytest.fixture
 def checked(published, place):
-    """The same study in a folder of its own, without the output root: what is checked needs no models."""
+    """The same study in a folder of its own, without the output root: what is checked needs no
+    models.
+    """
     for name in ("conf", "pipelines", "raw", "results"):
         shutil.rmtree(place.folder / name, ignore_errors=True)
         shutil.copytree(published / name, place.folder / name)
@@ -89,12 +95,12 @@ def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_
     expected = ["0.74599", "-1.23457e-07", *cells[2:]]
     assert published_content(file).decode() == "a,b,c,d,e,f,g,h,i\n" + ",".join(expected) + "\n"
     (report,) = (published / "outputs" / "report").iterdir()
-    own, there = (
+    published_here, published_there = (
         pd.read_csv(folder / "metrics.csv")["value"]
         for folder in (report, published / "results" / "small")
     )
-    np.testing.assert_allclose(there, own, rtol=5e-6)
-    assert (there != own).any()
+    np.testing.assert_allclose(published_there, published_here, rtol=5e-6)
+    assert (published_there != published_here).any()
 
 
 def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published):
@@ -159,7 +165,7 @@ def other_code_of(changed):
     )
 
 
-def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
+def test_equal_results_of_other_code_are_recorded_as_of_that_code(published, place, monkeypatch):
     shutil.rmtree(place.folder)
     shutil.copytree(published, place.folder)
     shutil.rmtree(place.folder / "outputs" / "finished")
@@ -193,14 +199,14 @@ def test_published_results_are_up_to_date_by_study_and_by_file(
     assert verdict(checked) == (3, "small: stale: configuration (split)")
 
 
-def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked):
+def test_changed_settings_of_an_estimator_make_the_study_stale_and_are_named(checked):
     checked.change(
         "pipelines/small.yaml",
         sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]],
     )
     assert verdict(checked) == (3, "small: stale: configuration (train gru)")
     code, out = verdict(checked, "--json")
-    changes = [{"what": what, "cause": "configuration"} for what in ("train gru",)]
+    changes = [{"what": stage, "cause": "configuration"} for stage in ("train gru",)]
     assert (code, json.loads(out)) == (
         3,
         [
@@ -246,7 +252,7 @@ def test_changed_code_and_changed_data_are_distinguished(checked, monkeypatch):
     )
 
 
-def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked):
+def test_state_is_undetermined_without_keys_pipeline_or_results(checked):
     file = checked.folder / "results" / "small" / PROVENANCE
     about = json.loads(file.read_text())
     file.write_text(json.dumps({name: value for name, value in about.items() if name != "keys"}))
@@ -278,22 +284,29 @@ def test_pipeline_that_cannot_be_run_is_stale(
         checked.refused(*words, code=code, says=says)
     checked.change("pipelines/small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
     code, line = verdict(checked)
-    said = "small: stale: configuration (pipeline); today it cannot be run (unknown option 'training.nothing'"
-    assert (code, line.startswith(said)) == (3, True)
+    message = (
+        "small: stale: configuration (pipeline); today it cannot be run (unknown option "
+        "'training.nothing'"
+    )
+    assert (code, line.startswith(message)) == (3, True)
     shutil.rmtree(checked.folder / "results")
     checked.refused(*CHECK, code=4, says="no study is published in 'results'")
 
 
 def models(folder):
     """Files of every model in an output root, but those with times."""
-    found = {
+    weights = {
         model.name: contents(model)
         for model in (folder / "outputs" / "train").iterdir()
         if not model.name.startswith(".")
     }
     return {
-        name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")}
-        for name, files in found.items()
+        name: {
+            file: content
+            for file, content in files.items()
+            if file not in (TIMINGS, "manifest.json")
+        }
+        for name, files in weights.items()
     }
 
 
@@ -301,8 +314,8 @@ def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_resul
     published, checked
 ):
     before = contents(checked.folder / "results")
-    _, said = checked.done(*RUN)
-    assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(said.split())
+    _, output = checked.done(*RUN)
+    assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(output.split())
     assert models(checked.folder) == models(published)
     assert contents(checked.folder / "results") == before
 
@@ -315,11 +328,11 @@ def test_published_weights_are_used_for_their_key_alone(
         "pipelines/small.yaml",
         sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]],
     )
-    _, said = checked.done(*RUN)
-    assert ("1 of 3 taken from" in " ".join(said.split()), said.count("1 epochs")) == (True, 2)
+    _, output = checked.done(*RUN)
+    assert ("1 of 3 taken from" in " ".join(output.split()), output.count("1 epochs")) == (True, 2)
     checked.change("pipelines/small.yaml", **pipeline)
-    _, said = checked.done(*RUN, "--retrain", "output=again")
-    assert ("taken from" in said, said.count("2 epochs")) == (False, 2)
+    _, output = checked.done(*RUN, "--retrain", "output=again")
+    assert ("taken from" in output, output.count("2 epochs")) == (False, 2)
     file = checked.folder / "results" / "small" / "weights.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     code, _, err = checked(*RUN, "output=damaged")
@@ -338,19 +351,23 @@ def test_weights_that_were_changed_after_they_were_published_are_refused_by_name
     larger = {n: np.asarray(1.2 * v, v.dtype) for n, v in load_file(file).items()}
     save_file(larger, file, metadata=metadata)
     code, _, err = checked(*RUN)
-    said = " ".join(err.split())
+    message = " ".join(err.split())
     assert code == 3
-    assert "weights.safetensors' was changed after it was published: luenberger" in said
-    assert "git checkout results/small" in said
+    assert "weights.safetensors' was changed after it was published: luenberger" in message
+    assert "git checkout results/small" in message
     assert not list((checked.folder / "outputs").glob("train/*"))
-    texts = {"models": metadata["models"].replace("train_loss", "loss")}
-    assert texts != metadata
+    models = json.loads(metadata["models"])
+    for model in models.values():
+        plain = uncompressed(model["files"]["history.csv"]).decode()
+        assert "train_loss" in plain
+        model["files"]["history.csv"] = plain.replace("train_loss", "loss")
+    texts = {"models": json.dumps(models)}
     save_file(load(before["small/weights.safetensors"]), file, metadata=texts)
     code, _, err = checked(*RUN)
     assert (code, "was changed after it was published" in " ".join(err.split())) == (3, True)
 
 
-def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
+def test_changed_files_of_an_output_root_are_named_and_recomputed(checked):
     checked.done(*RUN)
     output = checked.folder / "outputs"
     before = {}
@@ -360,8 +377,8 @@ def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
             data = file.read_bytes()
             spoilt = data[:-2] + bytes([data[-2] ^ 1]) + data[-1:]
             file.write_bytes(spoilt)
-            said = refusal(lambda manifest=manifest: read_artefact(manifest.parent))
-            assert f"'{file}' was changed after it was made" in said
+            message = refusal(lambda manifest=manifest: read_artefact(manifest.parent))
+            assert f"'{file}' was changed after it was made" in message
             file.write_bytes(data)
             before[file] = data
     stages = {file.relative_to(output).parts[0] for file in before}
@@ -374,8 +391,8 @@ def test_every_changed_file_of_an_output_root_is_named_and_made_again(checked):
             file.write_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
     pipeline = checked.folder / "pipelines" / "small.yaml"
     pipeline.write_text(pipeline.read_text() + "# so that the run looks at everything\n")
-    _, said = checked.done(*RUN)
-    assert "damaged, and not used" in " ".join(said.split())
+    _, message = checked.done(*RUN)
+    assert "damaged, and not used" in " ".join(message.split())
     for file in spoilt.values():
         assert read_artefact(output / Path(*file.relative_to(output).parts[:2]))
         if file.suffix in (".safetensors", ".yaml", ".parquet") or file.name == "metrics.csv":
@@ -447,6 +464,34 @@ def test_results_of_a_work_tree_with_changes_are_not_published(published, place,
     assert metrics.read_text() != "changed\n"
 
 
+def test_an_edited_template_draws_the_report_again_and_makes_nothing_stale(
+    published, place, monkeypatch, tmp_path
+):
+    """The report of the old text was published again, as no key had the template in it."""
+    shutil.rmtree(place.folder)
+    shutil.copytree(published, place.folder)
+    shutil.rmtree(place.folder / "outputs" / "finished")
+    monkeypatch.chdir(place.folder)
+    module_folder = tmp_path / "study"
+    module_folder.mkdir()
+    template = module_folder / "report.md.j2"
+    digests = []
+    for text in ("**Question.** Which?", "**Question.** Which estimator?"):
+        template.write_text(text, encoding="utf-8")
+        with monkeypatch.context() as patch:
+            study = SimpleNamespace(__file__=str(module_folder / "document.py"))
+            patch.setattr(report_stage, "study_module", {"small": study}.get)
+            digests.append(report_stage.template_digests("small"))
+    assert [list(digest) for digest in digests] == [["report.md.j2"]] * 2
+    assert digests[0] != digests[1]
+    folder = place.folder / "outputs" / "report"
+    assert len(list(folder.iterdir())) == 1
+    monkeypatch.setattr(report_stage, "template_digests", lambda name: digests[1])
+    place.done(*RUN)
+    assert len(list(folder.iterdir())) == 2
+    assert place(*CHECK)[:2] == (0, "small: up to date\n")
+
+
 def test_the_list_of_stale_studies_only_shrinks():
     may_be_listed = {
         "cnn_ukf",
@@ -462,7 +507,8 @@ def test_the_list_of_stale_studies_only_shrinks():
     entries = yaml.safe_load((results / "stale.yaml").read_text(encoding="utf-8"))
     # Tables of other commands were not compared at all before they had records (`table_records`).
     may_be_listed |= {"examples", "export", "own_car", "reliability", "unseen_car"}
-    # learned_ukf_sim ended with its pipeline: untrained, and learned_ukf is the same on real tyre sets.
+    # learned_ukf_sim ended with its pipeline: untrained, and learned_ukf is the same on real tyre
+    # sets.
     assert not (results / "learned_ukf_sim").exists()
     assert set(entries) <= may_be_listed
     assert [name for name in may_be_listed if not (results / name / PROVENANCE).is_file()] == [], (

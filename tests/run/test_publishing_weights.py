@@ -1,4 +1,6 @@
-"""Weights are published training by training: a study that was stopped goes on elsewhere, and trains only what is missing."""
+"""Weights are published training by training: a study that was stopped goes on elsewhere, and
+trains only what is missing.
+"""
 
 import os
 import shutil
@@ -50,6 +52,11 @@ def digests(output):
     }
 
 
+def models_published(pair):
+    """Models in the file of published weights."""
+    return PublishedWeights(pair.folder / FILE)._models
+
+
 def stop_once_published(patch, n_models):
     """Send Ctrl-C after so many models have been published."""
 
@@ -69,13 +76,13 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
         code, _, _ = pair(*RUN)
     assert code == 128 + signal.SIGINT
     assert sorted(os.listdir("results/pair")) == ["weights.safetensors"]
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 4
+    assert len(models_published(pair)) == 4
     assert len(digests(pair.folder / "outputs")) == 4
     shutil.rmtree("outputs")
     _, err = pair.done(*RUN)
-    said = " ".join(err.split())
-    assert "3 of 3 taken from results/pair/weights.safetensors" in said
-    assert "1 of 3 taken from results/pair/weights.safetensors" in said
+    message = " ".join(err.split())
+    assert "3 of 3 taken from results/pair/weights.safetensors" in message
+    assert "1 of 3 taken from results/pair/weights.safetensors" in message
     assert err.count("epochs,") == 2
     resumed = pair.folder / "outputs"
     published = {
@@ -93,7 +100,7 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
 
 def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
     pair.done(*RUN[:3])
-    former = PublishedWeights(pair.folder / FILE)
+    former = models_published(pair)
     report = (pair.folder / "results/pair/report.md").read_bytes()
     pipeline = pair.change("pipelines/pair.yaml")
     pipeline["parts"]["back"]["sweeps"] = [[*GRU[:2], "seed=2", GRU[3]]]
@@ -101,14 +108,13 @@ def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
     with monkeypatch.context() as patch:
         stop_once_published(patch, 7)
         assert pair(*RUN)[0] == 128 + signal.SIGINT
-    grown = PublishedWeights(pair.folder / FILE)
-    assert grown._models.items() > former._models.items()
+    assert models_published(pair).items() > former.items()
     assert (pair.folder / "results/pair/report.md").read_bytes() == report
     (pair.folder / FILE).unlink()
     _, err = pair.done(*RUN)
     assert "epochs," not in err
     assert "3 models added to results/pair/weights.safetensors" in " ".join(err.split())
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 4  # the report is published anew
+    assert len(models_published(pair)) == 4  # the report is published anew
 
 
 def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monkeypatch):
@@ -120,12 +126,12 @@ def test_the_best_so_far_of_an_interrupted_training_is_not_published(pair, monke
         patch.setattr(runner.Runner, "_report", report)
         code, _, err = pair(*RUN)
     assert (code, "the best so far is kept" in " ".join(err.split())) == (130, True)
-    labels = [model.label for model in PublishedWeights(pair.folder / FILE)._models.values()]
+    labels = [model.label for model in models_published(pair).values()]
     assert labels == ["luenberger-luenberger-seed0"]
 
 
 def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatch):
-    first, second, *others = trained(pair)
+    first, second, *remaining = trained(pair)
     file = pair.folder / "some" / "weights.safetensors"
     published = PublishedWeights(file)
     assert published.add([first]) == 1
@@ -133,15 +139,26 @@ def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatc
     monkeypatch.setattr(weights, "MAX_MEGABYTES", len(before) / 1e6)
     assert published.add([first]) == 0
     with pytest.raises(WeightsTooLargeError, match=r"MB of weights are more than the 0\.0"):
-        published.add([second, *others])
+        published.add([second, *remaining])
     assert (os.listdir(file.parent), file.read_bytes()) == ([file.name], before)
     assert (first.key in published, second.key in published) == (True, False)
     _, err = pair.done(*RUN)
-    said = " ".join(err.split())
-    assert said.count("no more weights are published") == 1
-    assert "the report is published without weights" in said
+    message = " ".join(err.split())
+    assert message.count("no more weights are published") == 1
+    assert "the report is published without weights" in message
     assert not (pair.folder / FILE).exists()
     assert (pair.folder / "results/pair/report.md").is_file()
+
+
+def test_contents_are_compressed_and_earlier_plain_ones_are_read(monkeypatch):
+    content = ("epoch,train_loss\n" + 500 * "1,0.25\n").encode()
+    text = weights.compressed(content)
+    assert len(text) < len(content) / 10
+    assert weights.uncompressed(text) == weights.uncompressed(content.decode()) == content
+    monkeypatch.setattr(weights, "MAX_FILE_BYTES", len(content) - 1)
+    for damaged in (text, text[:-8], weights.COMPRESSED + "bm90IHpsaWI=", "zlib,*"):
+        with pytest.raises(ValueError, match="compressed file"):
+            weights.uncompressed(damaged)
 
 
 def trained(pair):
@@ -186,14 +203,14 @@ def test_a_kill_while_writing_leaves_the_file_of_before_or_after(pair, when):
     assert os.listdir(file.parent) == [file.name]
 
 
-def test_what_is_not_published_as_it_is_or_somewhere_else_is_refused(pair):
+def test_publishing_changed_results_or_to_another_place_is_refused(pair):
     pair.refused(*RUN, "training.max_epochs=1", code=2, says="leave out 'training.max_epochs=1'")
     pair.change("pipelines/pair.yaml", publish=False)
     pair.refused(*RUN, code=2, says="it needs publish: true")
     pair.change("pipelines/pair.yaml", publish=True)
-    other = pair.folder / "results" / "pair" / "notes.txt"
-    other.parent.mkdir(parents=True)
-    other.write_text("mine", encoding="utf-8")
+    foreign = pair.folder / "results" / "pair" / "notes.txt"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("mine", encoding="utf-8")
     pair.refused(*RUN, code=2, says="holds files that vehest did not publish")
 
 
@@ -209,7 +226,7 @@ def published_files(pair):
     }
 
 
-def said_by_report(pair):
+def report_message(pair):
     return (pair.folder / "results/pair/report.md").read_text()
 
 
@@ -217,15 +234,15 @@ def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others
     with monkeypatch.context() as patch:
         stop_once_published(patch, 3)
         pair(*RUN)
-    assert len(PublishedWeights(pair.folder / FILE)._models) == 3
+    assert len(models_published(pair)) == 3
     shutil.rmtree("outputs")
     pair.change("results/stale.yaml", pair="its second part is not trained")
     _, err = pair.done(*PUBLISH)
     assert "epochs," not in err, "nothing is trained"
-    said = " ".join(err.split())
-    assert "3 of 6 not done" in said
-    assert "vehest run pair tracking=none --train-missing" in said
-    assert "nothing could be trained or scored: back" in said_by_report(pair)
+    message = " ".join(err.split())
+    assert "3 of 6 not done" in message
+    assert "vehest run pair tracking=none --train-missing" in message
+    assert "nothing could be trained or scored: back" in report_message(pair)
     assert read_json(pair.folder / "results/pair/provenance.json")["n_not_trained"] == 3
     incomplete = published_files(pair)
 
@@ -250,7 +267,7 @@ def test_a_study_is_published_with_the_trainings_that_exist_and_names_the_others
     _, err = pair.done(*PUBLISH)
     refusal = "not published: 'results/pair' shows 3 trainings that this run lacks"
     assert refusal in " ".join(err.split())
-    assert said_by_report(pair).encode() == complete["report.md"]
+    assert report_message(pair).encode() == complete["report.md"]
 
 
 def test_an_incomplete_study_is_stale_once_its_configuration_changes(pair, monkeypatch):
@@ -268,7 +285,7 @@ def test_an_incomplete_study_is_stale_once_its_configuration_changes(pair, monke
     )
 
 
-def test_what_is_missing_is_announced_before_it_is_trained(pair, monkeypatch):
+def test_missing_trainings_are_announced_before_they_start(pair, monkeypatch):
     with monkeypatch.context() as patch:
         stop_once_published(patch, 3)
         pair(*RUN)

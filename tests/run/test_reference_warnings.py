@@ -1,4 +1,6 @@
-"""Every command that trains on a reference or scores against it says that it has another sign or unit, or is stuck."""
+"""Every command that trains on a reference or scores against it says that it has another sign or
+unit, or is stuck.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,6 @@
-"""A finished study is recognised by what it was made from, and prints what a run in full would print."""
+"""A finished study is recognised by what it was made from, and prints what a run in full would
+print.
+"""
 
 import json
 import os
@@ -42,7 +44,7 @@ def forget(place):
         record.unlink()
 
 
-def test_a_finished_study_prints_what_a_run_in_full_prints(study):
+def test_finished_studies_print_the_output_of_a_full_run(study):
     for words in (
         *(("run", *WORDS, *options) for options in ((), ("--json",), ("--dry-run",), ("--quiet",))),
         ("report", *WORDS),
@@ -56,15 +58,18 @@ def test_a_finished_study_prints_what_a_run_in_full_prints(study):
         study.done("run", *WORDS)  # dry runs and reports leave no record
 
 
-def test_a_finished_study_imports_nothing_that_made_it(study):
-    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+def test_finished_studies_import_no_training_code(study):
+    program = (
+        "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, "
+        "file=sys.stderr)\n"
+    )
     command = [sys.executable, "-c", program, "run", *WORDS, "--quiet"]
     result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     assert "test set 'test'" in result.stdout
     assert not {name.split(".")[0] for name in result.stderr.split()} & set(HEAVY)
 
 
-def test_a_finished_sweep_prints_what_a_run_in_full_prints(place):
+def test_finished_sweeps_print_the_output_of_a_full_run(place):
     first, _ = place.done("sweep", *SWEEP)
     assert RunCache("sweep", "", SWEEP).load() is not None
     recognised = place("sweep", *SWEEP)
@@ -138,7 +143,7 @@ def test_study_runs_anew_where_raw_files_changed_or_by_force(
     assert RunCache("run", "small", ("output='a b'",)).file is None
 
 
-def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
+def test_files_replaced_with_the_same_size_and_date_are_detected(tmp_path):
     (tmp_path / "again").symlink_to(tmp_path)  # walked once
     (tmp_path / "lap.csv").write_text("1")
     before = stamp_of(tmp_path)

@@ -4,7 +4,7 @@ from vehest.run.train import _divergence
 from vehest.training.context import FitRecord, divergence_metrics
 
 
-def test_model_says_how_often_its_step_size_was_halved_and_what_its_user_should_know():
+def test_models_report_halved_step_sizes_with_advice():
     assert _divergence(FitRecord(metrics=divergence_metrics(0, False))) == {}
     halved = _divergence(FitRecord(metrics=divergence_metrics(2, False)))
     assert halved == {"step_size_halvings": 2, "ended_by_divergence": False}

@@ -1,4 +1,7 @@
-"""What describes something, and is damaged, hostile or of another version, is one line; and no name in it leads out of the output root."""
+"""What describes something, and is damaged, hostile or of another version, is one line.
+
+And no name in it leads out of the output root.
+"""
 
 import json
 import sys
@@ -99,11 +102,14 @@ def test_model_is_read_with_its_types_and_finite_numbers(model, tmp_path):
         "ksnn",
     )
     weights = load_file(model / "model.safetensors")
-    name = max(weights, key=lambda own: weights[own].size)
+    name = max(weights, key=lambda tensor: weights[tensor].size)
     weights[name].flat[:2] = [np.nan, np.inf]
     save_file(weights, model / "model.safetensors")
-    said = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
-    assert said in refusal(lambda: load_model(model))
+    message = (
+        f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not "
+        f"finite"
+    )
+    assert message in refusal(lambda: load_model(model))
     estimator = estimator_class("kalman").from_config({})
     save_model(estimator, tmp_path)
     load_model(tmp_path)
@@ -144,7 +150,7 @@ def test_model_is_read_with_its_types_and_finite_numbers(model, tmp_path):
     ],
     ids=str,
 )
-def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model, changes, says):
+def test_invalid_descriptions_are_a_single_line_with_file_and_key(model, changes, says):
     path = model / "model.yaml"
     text = (
         changes
@@ -174,7 +180,7 @@ def with_header(header, length=None):
         ),
     ],
 )
-def test_weights_that_are_none_are_one_line(model, kind, says):
+def test_invalid_weights_are_a_single_line(model, kind, says):
     file = model / "model.safetensors"
     if isinstance(kind, bytes):
         file.write_bytes(kind)
@@ -191,7 +197,7 @@ def plan(output, label="mine"):
     return StagePlan("stage", label, {"a": 1.0}, {"raw": "0"}, "code", output)
 
 
-def made(output, label="mine"):
+def new_artefact(output, label="mine"):
     return make(plan(output, label), lambda folder: (folder / "a.txt").write_text("a") and None)
 
 
@@ -213,10 +219,8 @@ def made(output, label="mine"):
         ("link", "or is a link"),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
-    tmp_path, changes, says
-):
-    artefact = made(tmp_path)
+def test_invalid_manifests_are_a_single_line_and_their_artefact_is_absent(tmp_path, changes, says):
+    artefact = new_artefact(tmp_path)
     path = artefact.folder / "manifest.json"
     content = json.loads(path.read_text())
     assert (content["format"], artefact.config) == (1, {"a": 1.0})
@@ -236,20 +240,26 @@ def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
     assert find(plan(tmp_path)) is None
 
 
-def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path):
-    artefact = made(tmp_path)
+def test_models_without_ranges_in_their_manifest_are_a_single_line(tmp_path):
+    artefact = new_artefact(tmp_path)
     entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
-    told = replace(
+    without_ranges = replace(
         artefact, config={"estimator": {"rate_hz": 20}, "train": [entry], "validation": []}
     )
-    assert trained_rate(told) == 20.0
-    for own in (artefact, told):
+    assert trained_rate(without_ranges) == 20.0
+    for model_artefact in (artefact, without_ranges):
         assert "manifest.json': config describes no training" in refusal(
-            lambda own=own: learnt_spans(own)
+            lambda model_artefact=model_artefact: learnt_spans(model_artefact)
         )
-    own = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
-    assert own.folder == tmp_path / "stage" / f"{own.label}-{own.key[:12]}"
-    assert own.checkpoint_folder == tmp_path / "checkpoints" / f"{own.label}-{own.key[:12]}"
+    model_artefact = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
+    assert (
+        model_artefact.folder
+        == tmp_path / "stage" / f"{model_artefact.label}-{model_artefact.key[:12]}"
+    )
+    assert (
+        model_artefact.checkpoint_folder
+        == tmp_path / "checkpoints" / f"{model_artefact.label}-{model_artefact.key[:12]}"
+    )
 
 
 def recording(name="lap", n=20):
@@ -266,7 +276,7 @@ def redescribed(path, change):
     pq.write_table(table.replace_schema_metadata({b"vehest": described}), path)
 
 
-def said_of(path, change, read):
+def refusal_message(path, change, read):
     """How a recording or an estimate is refused whose description was changed."""
     redescribed(path, change)
     message = refusal(lambda: read(path))
@@ -289,11 +299,11 @@ def said_of(path, change, read):
         (b"[" * 100_000, ""),
     ],
 )
-def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
+def test_metadata_of_recordings_are_checked(tmp_path, changes, says):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     for read in (read_recording, is_stored_recording)[: 1 + isinstance(changes, bytes)]:
-        assert says in said_of(
+        assert says in refusal_message(
             path,
             lambda content: changes if isinstance(changes, bytes) else changed(content, **changes),
             read,
@@ -315,13 +325,13 @@ def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, says):
         ({"n_states": -2}, "n_states is -2"),
         ({"n_states": 3}, "n_states is 3"),
         *(
-            ({"covariance_of": own}, "covariance_of name n quantities, not (5, 2, 2) and (vy")
-            for own in (["vy"], ["vy", "luck"])
+            ({"covariance_of": case}, "covariance_of name n quantities, not (5, 2, 2) and (vy")
+            for case in (["vy"], ["vy", "luck"])
         ),
         ({"mode": "psychic"}, "mode 'psychic' is not one of"),
     ],
 )
-def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, says):
+def test_sizes_of_an_estimate_are_checked_against_its_columns(tmp_path, changes, says):
     path = tmp_path / "estimate.parquet"
     channels = {"vy": np.zeros(5), "sideslip": np.zeros(5)}
     covariance = np.tile(np.eye(2), (5, 1, 1))
@@ -330,10 +340,10 @@ def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, sa
         path,
     )
     assert read_estimate(path).covariance is not None
-    assert says in said_of(path, lambda content: changed(content, **changes), read_estimate)
+    assert says in refusal_message(path, lambda content: changed(content, **changes), read_estimate)
 
 
-def test_tables_that_are_damaged_are_one_line(tmp_path):
+def test_damaged_tables_are_a_single_line(tmp_path):
     path = tmp_path / "fit.csv"
     for text in (
         b"metric\n1\n",
@@ -378,7 +388,7 @@ def test_damaged_checkpoint_counts_as_none(tmp_path):
 
 @pytest.mark.parametrize("link", ["results", "results/study"])
 def test_nothing_is_published_through_a_link(elsewhere, link):
-    report = made(elsewhere / "out")
+    report = new_artefact(elsewhere / "out")
     Path("target").mkdir()
     Path(link).parent.mkdir(exist_ok=True)
     Path(link).symlink_to(elsewhere / "target")
@@ -431,9 +441,9 @@ BOMB = "\n".join(
             )
         ),
     ],
-    ids=lambda own: str(own)[:40],
+    ids=lambda case: str(case)[:40],
 )
-def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path, changes, says):
+def test_invalid_pipelines_are_a_single_line(tmp_path, changes, says):
     path = tmp_path / "mine.yaml"
     path.write_bytes(
         changes
@@ -482,7 +492,7 @@ def test_no_root_file_in_conf_reaches_hydras_search_path(conf, text):
         (b"defaults:\n  - ../../elsewhere", "Could not load 'dataset/../../elsewhere'"),
     ],
 )
-def test_a_file_in_conf_that_is_none_is_one_line(conf, text, says):
+def test_invalid_files_in_conf_are_a_single_line(conf, text, says):
     (conf / "dataset" / "mine.yaml").write_bytes(text)
     assert says in refusal(lambda: compose_config("ingest", ["dataset=mine"]), ConfigurationError)
 
@@ -497,8 +507,8 @@ ROOT = {
 
 
 def test_shared_groups_are_read_with_their_types():
-    def read(own):
-        return validated(Root, own, "", error=ConfigurationError)
+    def read(configuration):
+        return validated(Root, configuration, "", error=ConfigurationError)
 
     read(ROOT)
     for changes, says in (
@@ -517,14 +527,14 @@ def test_shared_groups_are_read_with_their_types():
         ({"initial_state": 1}, "initial_state must be true or false"),
         ({"rate": 20}, "rate is not an option"),
     ):
-        said = refusal(
+        message = refusal(
             lambda changes=changes: protocol_from_config({"rate_hz": 20} | changes),
             ConfigurationError,
         )
-        assert said.startswith(f"evaluation.{says}")
+        assert message.startswith(f"evaluation.{says}")
 
 
-def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
+def test_integers_stay_integers_where_any_type_is_allowed():
     assert protocol_from_config({"rate_hz": 20}).rate_hz == 20.0
     low_pass = {"name": "low_pass", "cutoff_hz": 5.0}
     assert Preparation(transforms=(low_pass,)).as_plain()["transforms"] == [low_pass]
@@ -567,8 +577,8 @@ names = st.one_of(
 @settings(max_examples=25, deadline=None)
 @given(label=names, stage=names, output=names, recording_id=names)
 def test_no_name_inside_a_file_leads_out_of_the_output_root(label, stage, output, recording_id):
-    with tempfile.TemporaryDirectory() as made_here:
-        root = Path(made_here)
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
         inside = root / "a" / "b" / "out"
         inside.mkdir(parents=True)
         before = tree(root)

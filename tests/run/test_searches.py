@@ -1,4 +1,6 @@
-"""A part of a study that searches: candidates are tried, validation chooses, and the published outcome is not searched for again."""
+"""A part of a study that searches: candidates are tried, validation chooses, and the published
+outcome is not searched for again.
+"""
 
 import shutil
 
@@ -17,7 +19,9 @@ SEARCHES = "results/tuned/searches.csv"
 
 @pytest.fixture
 def tuned(place):
-    """A place with a study of a search over two step sizes, and a part that states the first of them."""
+    """A place with a study of a search over two step sizes, and a part that states the first of
+    them.
+    """
     write_drives(place.folder, 60.0)
     place.change(
         "conf/split/forth.yaml",
@@ -59,7 +63,10 @@ def n_trained(err):
 
 def test_part_that_ignores_the_chosen_value_is_named(tuned):
     _, err = tuned.done(*RUN)
-    remark = "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: training.learning_rate=0.01"
+    remark = (
+        "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: "
+        "training.learning_rate=0.01"
+    )
     assert remark in " ".join(err.split())
     trials = pd.read_csv(SEARCHES)
     assert list(trials["name"]) == ["pace_1", "pace_2"]
@@ -92,9 +99,9 @@ def test_a_published_search_is_not_repeated_elsewhere_and_gives_the_same_results
     for again in ((), ("--force",)):
         shutil.rmtree("outputs")
         _, err = tuned.done(*RUN, *again)
-        said = " ".join(err.split())
-        taken = "2 of 2 trials taken from results/tuned/searches.csv" in said
-        assert (taken, n_trained(err)) == ((False, 3) if again else (True, 0))
+        message = " ".join(err.split())
+        is_reused = "2 of 2 trials taken from results/tuned/searches.csv" in message
+        assert (is_reused, n_trained(err)) == ((False, 3) if again else (True, 0))
         assert contents(tuned.folder / "results") == before
     shutil.rmtree("outputs")
     _, err = tuned.done(*RUN, "--retrain")
@@ -123,7 +130,7 @@ def test_a_search_is_repeated_where_a_trial_or_the_metric_is_another(tuned, chan
     assert len(pd.read_csv(SEARCHES)) == 2
 
 
-def test_a_damaged_file_is_one_line(tuned):
+def test_damaged_search_files_are_a_single_line(tuned):
     tuned.done(*RUN)
     table = pd.read_csv(SEARCHES)
     table.assign(validation="low").to_csv(SEARCHES, index=False)
@@ -141,12 +148,12 @@ def test_a_damaged_file_is_one_line(tuned):
         ({"search": {"values": [1]}}, "values"),
     ],
 )
-def test_what_is_no_search_is_refused(tuned, changes, says):
+def test_invalid_searches_are_refused(tuned, changes, says):
     change_part(tuned, "pace", **changes)
     tuned.refused(*RUN, code=2, says=says)
 
 
-def test_every_search_of_a_paper_is_over_what_its_parts_train():
+def test_searches_of_papers_cover_the_trainings_of_their_parts():
     study = read_study("learned_ukf")
     jobs = jobs_of(study, [])
     assert {name: len(trials) for name, trials in study.searches.items()} == {

@@ -55,8 +55,8 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, m
     assert list(alone) == ["lap_001", "lap_002", "lap_003"]
     for name, values in alone.items():
         np.testing.assert_array_equal(values, together[name])
-    other = samples(place.told("simulate", "sim", "seed=2")["folder"])
-    assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
+    second_samples = samples(place.told("simulate", "sim", "seed=2")["folder"])
+    assert not any(np.array_equal(values, second_samples[name]) for name, values in alone.items())
 
 
 def test_ingest_makes_the_same_drives_as_simulate(place, monkeypatch):
@@ -77,7 +77,7 @@ def test_ingest_makes_the_same_drives_as_simulate(place, monkeypatch):
     assert "error" not in place.done("data", "check", "sim")[0]
 
 
-def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypatch):
+def test_drives_completed_before_a_kill_are_not_recomputed(place, monkeypatch):
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
     read = SimulatedSource.read
     begun = []
@@ -96,7 +96,7 @@ def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypat
     )
 
 
-def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
+def test_spinning_drives_are_recorded_flagged_and_counted(place):
     tail_happy = {"tire": {"p_dy1": 1.0}, "tire_rear": {"p_dy1": 0.6}}
     simulated(
         place,
@@ -160,7 +160,7 @@ def test_a_report_of_simulated_drives_never_says_real(place):
     assert "| real |" not in report
 
 
-def test_what_cannot_be_simulated_is_one_line(place):
+def test_refusals_of_simulate_are_a_single_line(place):
     place.refused(
         "simulate",
         "mine",

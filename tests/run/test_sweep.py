@@ -1,4 +1,7 @@
-"""A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps; and what is skipped or fails."""
+"""A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps.
+
+And what is skipped or fails.
+"""
 
 import json
 import math
@@ -36,7 +39,7 @@ def jobs_of(scores, keys):
     rows = []
     for number, (values, sets) in enumerate(scores.items()):
         for seed in range(len(next(iter(sets.values())))):
-            figures = {f"rmse_sideslip.{name}": own[seed] for name, own in sets.items()}
+            figures = {f"rmse_sideslip.{name}": by_seed[seed] for name, by_seed in sets.items()}
             settings = dict(zip(keys, values, strict=True))
             rows.append(
                 {
@@ -96,7 +99,8 @@ def test_best_combination_is_chosen_on_validation_without_failed_seeds():
         (4,): ([math.nan, 0.1], [0.1, 0.1]),
     }
     jobs = jobs_of(
-        {values: {"validation": own, "test": test} for values, (own, test) in scores.items()}, KEYS
+        {values: {"validation": score, "test": test} for values, (score, test) in scores.items()},
+        KEYS,
     )
     table = artefacts_of(jobs, KEYS).table
     assert table["chosen"].tolist() == [False, True, False]
@@ -143,9 +147,9 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
         for bias in (True, False)
     }
     jobs = jobs_of(grid, keys)
-    made = heat_maps(artefacts_of(jobs, keys))
-    assert [figure.name for figure in made] == ["heat_map_validation", "heat_map_test"]
-    axes = [axes for axes in made[0].static.axes if axes.get_xlabel() == "n_local"]
+    figures = heat_maps(artefacts_of(jobs, keys))
+    assert [figure.name for figure in figures] == ["heat_map_validation", "heat_map_test"]
+    axes = [axes for axes in figures[0].static.axes if axes.get_xlabel() == "n_local"]
     assert [axes.get_title(loc="left") for axes in axes] == ["bias = true", "bias = false"]
     assert [tick.get_text() for tick in axes[0].get_xticklabels()] == ["2", "3"], (
         "sorted, though typed otherwise"
@@ -161,8 +165,8 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
         ({(2, "gru", 1): score(0.1), (3, "lstm", 2): score(0.2)}, ("a.n", "estimator", "b.n")),
         ({(2, 1, 1): score(0.1), (3, 2, 2): score(0.2)}, ("a.n", "b.n", "c.n")),
     ):
-        others = jobs_of(values, names)
-        assert heat_maps(artefacts_of(others, names)) == []
+        fixed_names = jobs_of(values, names)
+        assert heat_maps(artefacts_of(fixed_names, names)) == []
 
 
 def test_darker_is_larger_and_a_missing_cell_is_grey():
@@ -186,15 +190,15 @@ def test_report_of_a_sweep_names_command_budget_split_and_kind():
         (5,): [1.0, 1.1],
     }  # half interval of the first: 12.7 times 0.05
     jobs = jobs_of(
-        {values: {"validation": own, "test": own} for values, own in scores.items()}, KEYS
+        {values: {"validation": score, "test": score} for values, score in scores.items()}, KEYS
     )
-    for kind, shown in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
+    for kind, banner in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         text = "\n".join(
             block
             for block in build(artefacts_of(jobs, KEYS, kind)).blocks
             if isinstance(block, str)
         )
-        assert text.startswith(shown)
+        assert text.startswith(banner)
         for words in (
             "Command: `vehest sweep`",
             "Budget: 4 combinations, seeds 0, 1: 8 of 8 jobs done; training took 5 epochs",
@@ -212,13 +216,13 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     jobs = pd.read_csv(folder / "sweep.csv")
     table = pd.read_csv(folder / "summary.csv")
     assert (len(jobs), len(table), set(jobs["status"])) == (8, 4, {"done"})
-    own = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)][
+    selected = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)][
         "rmse_sideslip.test"
     ]
     row = table[(table["estimator.n_local"] == 3) & (table["estimator.n_hidden"] == 1)].iloc[0]
-    assert row["rmse_sideslip.test"] == pytest.approx(own.mean(), rel=1e-12)
+    assert row["rmse_sideslip.test"] == pytest.approx(selected.mean(), rel=1e-12)
     assert row["rmse_sideslip_half.test"] == pytest.approx(
-        stats.t.ppf(0.975, 1) * own.std() / math.sqrt(2), rel=1e-12
+        stats.t.ppf(0.975, 1) * selected.std() / math.sqrt(2), rel=1e-12
     )
     assert outcome["chosen"]["combination"] == int(table["rmse_sideslip.validation"].idxmin())
     for name in ("validation", "test"):
@@ -228,11 +232,13 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     assert "**Simulated data:**" in (folder / "report.md").read_text()
 
     by_hand = place.told("eval", *QUICK, "estimator.n_local=3", "estimator.n_hidden=1", "seed=1")
-    assert by_hand["rmse_sideslip.test"] == own.tolist()[1], "a job is what train and eval make"
+    assert by_hand["rmse_sideslip.test"] == selected.tolist()[1], (
+        "a job is what train and eval make"
+    )
 
-    made = place.files()
+    files = place.files()
     again, err = place.done("sweep", *GRID, "--json")
-    assert (json.loads(again), place.files()) == ({**outcome, "skipped": True}, made)
+    assert (json.loads(again), place.files()) == ({**outcome, "skipped": True}, files)
     assert [line.split()[0] for line in err.splitlines()] == ["reused"]
 
     out, err = place.done("sweep", *GRID[:-1], "seed=range(3)", "--name", "more")
@@ -273,7 +279,7 @@ def test_failing_combinations_are_named_and_the_others_go_on(place):
     assert "## What failed" in (Path(outcome["folder"]) / "report.md").read_text()
 
 
-def test_a_single_combination_over_one_seed_has_no_interval_and_no_heat_map(place):
+def test_single_combinations_and_seeds_have_no_interval_and_no_heat_map(place):
     out, _ = place.done("sweep", *QUICK, "estimator.n_hidden=0", "seed=4", "--quiet")
     assert "KS-NN linear no bias, P = 2" in out
     assert "±" not in out.split("data\n", 1)[1]
@@ -292,8 +298,8 @@ def test_dry_run_tells_and_makes_nothing_and_the_same_training_twice_is_refused(
     code, _, err = place(
         "sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0"
     )
-    said = "checkpoint_seconds=20 seed 0: it is the same training as checkpoint_seconds=10"
-    assert (code, said in err.splitlines()[-1]) == (5, True)
+    message = "checkpoint_seconds=20 seed 0: it is the same training as checkpoint_seconds=10"
+    assert (code, message in err.splitlines()[-1]) == (5, True)
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_a_table_is_up_to_date_until_its_content_script_or_stage_changes(
     assert outcome() == (3, "tables: stale: code (a.csv: train gru)\n")
 
 
-def test_a_table_without_a_record_and_one_that_is_gone_are_named(table, outcome):
+def test_tables_without_a_record_and_removed_tables_are_named(table, outcome):
     (table.parent / "b.csv").write_text("rmse\n")
     assert outcome() == (3, "tables: stale: data (b.csv without a record)\n")
     (table.parent / "b.csv").unlink()
@@ -73,18 +73,16 @@ def test_a_table_without_a_record_and_one_that_is_gone_are_named(table, outcome)
     assert outcome() == (3, "tables: stale: data (a.csv: content)\n")
 
 
-def test_rows_without_keys_leave_the_state_not_known(table, outcome):
-    other = table.with_name("b.csv")
-    other.write_text("rmse\n")
-    record_tables([other], "make b", [], "rows of gru")
+def test_rows_without_keys_leave_the_state_undetermined(table, outcome):
+    second_table = table.with_name("b.csv")
+    second_table.write_text("rmse\n")
+    record_tables([second_table], "make b", [], "rows of gru")
     assert outcome() == (3, "tables: not known: b.csv: rows of gru without keys (make b)\n")
-    record_tables([other], "make b", [])
+    record_tables([second_table], "make b", [])
     assert outcome() == (0, "tables: up to date\n")
 
 
-def test_keys_of_rows_that_stay_are_those_with_which_they_were_made(
-    place, table, outcome, monkeypatch
-):
+def test_unchanged_rows_retain_their_original_keys(place, table, outcome, monkeypatch):
     gru = {"gru": "train gru"}
     script = f"script {SCRIPT}"
     record_tables([table], "make a", [script], rows=RowKeys(gru | {"lstm": "train lstm"}, {}))
@@ -122,7 +120,7 @@ def test_a_trial_outside_results_is_not_recorded(tmp_path):
     assert not (tmp_path / PROVENANCE).exists()
 
 
-def test_a_record_without_the_raw_files_is_refused_and_the_former_one_stays(place, table):
+def test_records_without_raw_files_are_refused_and_the_former_record_stays(place, table):
     file = table.parent / PROVENANCE
     former = file.read_text()
     assert set(json.loads(former)["keys"]["a.csv: data mine"]) == {"code", "data"}
@@ -154,9 +152,7 @@ def test_keys_of_the_unseen_cars_can_be_recorded(tmp_path):
         assert today_of(f"report.md: {name}", tmp_path) is not None
 
 
-def test_commands_of_own_car_run_without_the_recordings_that_its_record_needs(
-    tmp_path, monkeypatch
-):
+def test_commands_of_the_car_benchmark_run_without_recordings_of_its_record(tmp_path, monkeypatch):
     monkeypatch.setenv("VEHEST_DATA", "recordings")
     environments = []
 
@@ -165,8 +161,8 @@ def test_commands_of_own_car_run_without_the_recordings_that_its_record_needs(
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(subprocess, "run", run)
-    own_car = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "own_car.py"))
-    own_car["timed"](tmp_path, "--version")
+    program = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "own_car.py"))
+    program["timed"](tmp_path, "--version")
     assert "VEHEST_DATA" not in environments[0]
     assert environments[0]["VEHEST_OUTPUT"] == str(tmp_path / "outputs")
     assert os.environ["VEHEST_DATA"] == "recordings"
@@ -204,20 +200,21 @@ def test_the_commit_of_a_record_has_no_changes_but_those_in_results(place, monke
 def test_every_folder_of_results_has_a_provenance():
     results = Path(__file__).parents[2] / RESULTS
     folders = {folder.name for folder in results.iterdir() if folder.is_dir()}
-    # Times of one machine, each with its processor, commit and libraries; verdicts on committed files.
-    others = {"benchmarks", "scorecard"}
+    # Times of one machine, each with its processor, commit and libraries; verdicts on committed
+    # files.
+    exempt = {"benchmarks", "scorecard"}
     recorded = {file.parent.name for file in results.glob(f"*/{PROVENANCE}")}
-    assert folders - others == recorded
+    assert folders - exempt == recorded
 
 
 def test_every_recorded_data_set_has_the_digest_of_its_raw_files():
     """Without one a table is stale at once wherever the raw files are."""
     records = (Path(__file__).parents[2] / RESULTS).glob(f"*/{PROVENANCE}")
     keys = {
-        f"{file.parent.name}/{what}": key
+        f"{file.parent.name}/{stage}": key
         for file in records
-        for what, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
-        if re.match(r"\S+\.\w+: (data|files) ", what)
+        for stage, key in json.loads(file.read_text(encoding="utf-8")).get("keys", {}).items()
+        if re.match(r"\S+\.\w+: (data|files) ", stage)
     }
     assert keys
-    assert [what for what, key in keys.items() if "data" not in key] == []
+    assert [stage for stage, key in keys.items() if "data" not in key] == []

@@ -1,4 +1,6 @@
-"""Runs in MLflow: in the local store, on a server of its own, and what happens when that server is away."""
+"""Runs in MLflow: in the local store, on a server of its own, and what happens when that server is
+away.
+"""
 
 import json
 import os
@@ -38,11 +40,12 @@ def test_runs_are_tracked_with_parameters_metrics_and_model(
         trained.data.params["estimator.n_local"],
         trained.data.params["training.learning_rate"],
     ) == ("2", "0.001")
-    assert _is_whole(client, trained)
+    assert _is_complete(client, trained)
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     done = _in_process(
-        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()",
+        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); "
+        "vehest.cli.main()",
         "run",
         "small",
     )
@@ -65,22 +68,26 @@ def _runs(client, name="vehest"):
 
 def _local(place, stage=""):
     """Runs in the local store, of one stage or of all."""
-    kept = [(run, run.data.tags["vehest.stage"]) for run in _runs(_client(place))]
-    return [run for run, own in kept if own == stage or (not stage and own != "study")]
+    runs = [(run, run.data.tags["vehest.stage"]) for run in _runs(_client(place))]
+    return [
+        run
+        for run, stage_of_run in runs
+        if stage_of_run == stage or (not stage and stage_of_run != "study")
+    ]
 
 
-def _is_whole(client, run):
+def _is_complete(client, run):
     """Whether a training's run has its losses and its files."""
-    kept = {entry.path for entry in client.list_artifacts(run.info.run_id)}
+    paths = {entry.path for entry in client.list_artifacts(run.info.run_id)}
     losses = [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")]
     return (
         run.info.status == "FINISHED"
         and losses == [1, 2]
-        and {"model.safetensors", "model.yaml", "manifest.json"} <= kept
+        and {"model.safetensors", "model.yaml", "manifest.json"} <= paths
     )
 
 
-def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
+def test_runs_missed_by_an_absent_server_are_logged_by_the_next_run(place, monkeypatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
         _, err = place.done("run", "small")
@@ -105,7 +112,7 @@ def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
         0,
     )
     [run] = _local(place, "train")
-    assert _is_whole(_client(place), run)
+    assert _is_complete(_client(place), run)
 
 
 def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypatch):
@@ -120,7 +127,7 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypat
     assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
 
 
-def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place):
+def test_repeated_trainings_are_the_same_run_unless_the_outcome_differs(place):
     assert (place(*TRAIN)[0], place(*TRAIN, "--force")[0]) == (0, 0)
     [run] = _local(place, "train")
     tracker = Tracker({"name": "mlflow"}, place.folder / "outputs", pytest.fail)
@@ -138,10 +145,13 @@ def test_a_store_that_is_gone_is_filled_again(place):
     assert (place(*TRAIN)[0], len(_local(place, "train"))) == (0, 1)
 
 
-FULL = "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); vehest.cli.main()"
+FULL = (
+    "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); "
+    "vehest.cli.main()"
+)
 
 
-def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place):
+def test_runs_untracked_because_of_a_full_disk_are_logged_by_the_next_run(place):
     assert place(*TRAIN, "tracking=none")[0] == 0
     full = _in_process(FULL, *TRAIN)
     assert full.returncode == 0, full.stderr
@@ -175,14 +185,14 @@ def _raising(error):
 
 
 def _in_process(code, *arguments):
-    """A command in a process of its own, run by ``code``."""
-    own = [
+    """A command in a process of its command, run by ``code``."""
+    command = [
         sys.executable,
         "-c",
         f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}",
         *arguments,
     ]
-    return subprocess.run(own, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def mlflow_server(folder):
@@ -230,7 +240,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
     assert "logging to MLflow" not in err
     runs = {run.info.run_name: run for run in _runs(client)}
     assert len(runs) == 13
-    assert _is_whole(client, runs["ksnn-linear_no_bias_p2-seed1"])
+    assert _is_complete(client, runs["ksnn-linear_no_bias_p2-seed1"])
     assert not (place.folder / "outputs" / "mlflow.db").exists()
 
     def fell_over():
@@ -261,7 +271,7 @@ def test_training_goes_on_when_the_tracking_server_is_away(place):
     assert (err.count("logging to MLflow"), "going on without tracking" in err) == (1, True)
 
 
-def test_a_server_that_hears_and_never_answers_is_given_up(place, monkeypatch):
+def test_servers_that_never_answer_are_abandoned(place, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
@@ -279,9 +289,9 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     for file in ("fit.csv", "timings.csv"):
         (tmp_path / file).write_text("metric,value\n")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
-    said = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact)
-    assert not said
+    messages = []
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", messages.append).log(artefact)
+    assert not messages
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}"))
     assert {key: int(value) for key, value in run.data.params.items()} == {
         f"group.{key}": v for key, v in config["group"].items()
@@ -316,7 +326,7 @@ def test_an_output_root_of_any_name_has_its_store(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a?b", "a%20b", "a\udcffb"])
-def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(tmp_path, name):
+def test_output_roots_invalid_for_mlflow_are_a_single_line(tmp_path, name):
     warnings = []
     output = tmp_path / name / "outputs"
     Tracker({"name": "mlflow"}, output, warnings.append).log(_small_artefact(tmp_path / "model"))
@@ -327,7 +337,7 @@ def test_an_output_root_that_mlflow_cannot_take_is_one_line_and_no_other_folder(
     assert not list(tmp_path.rglob("*.db*"))
 
 
-def test_a_store_that_links_to_itself_is_one_warning(tmp_path):
+def test_stores_that_link_to_themselves_are_a_single_warning(tmp_path):
     warnings = []
     output = tmp_path / "outputs"
     output.mkdir()

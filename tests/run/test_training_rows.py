@@ -1,4 +1,6 @@
-"""Errors on the training ranges are left out where a reference has gaps, and not where a recording cannot be read."""
+"""Errors on the training ranges are left out where a reference has gaps, and not where a recording
+cannot be read.
+"""
 
 from types import SimpleNamespace
 
@@ -21,9 +23,9 @@ def test_gaps_leave_training_rows_out_and_a_damaged_recording_is_an_error(monkey
     monkeypatch.setattr(evaluate, "sequences", gappy)
     readable = {"reference": lambda span: None, "measured": lambda span: None}
     for spoilt in ({}, {"reference": damaged}, {"measured": damaged}):
-        how = SimpleNamespace(data={"mine": None}, protocol=None, **{**readable, **spoilt})
+        settings = SimpleNamespace(data={"mine": None}, protocol=None, **{**readable, **spoilt})
         if spoilt:
             with pytest.raises(DataError, match="truncated or damaged"):
-                evaluate._training_rows(how, None, None)
+                evaluate._training_rows(settings, None, None)
         else:
-            assert evaluate._training_rows(how, None, None) == []
+            assert evaluate._training_rows(settings, None, None) == []

@@ -1,4 +1,6 @@
-"""What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
+"""What estimators lack is said before anything is trained, what is promised to supply it does, and
+rates fit the recordings.
+"""
 
 import json
 from dataclasses import replace
@@ -57,9 +59,9 @@ def log(channels, rate_hz=50.0, seed=1, seconds=30.0, name="lap"):
     """A drive of which only these channels were logged."""
     drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02, name=name)
     steer = 2.5 * drive["yaw_rate"] / drive["vx"]
-    known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
-    known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
-    return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
+    available = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
+    available |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
+    return replace(drive, channels={channel: available[channel] for channel in sorted(channels)})
 
 
 def rows(recording):
@@ -82,13 +84,13 @@ def add_logged(place, channels, rate_hz=50.0, **options):
             place.folder / "raw" / "logged" / f"lap{seed}.csv", index=False
         )
     declared = {name: {"column": name, "unit": UNITS[name]} for name in sorted(channels)}
-    own = {
+    entry = {
         "name": "logged",
         "path": "${root}/logged",
         "time": {"column": "t", "unit": "s"},
         "channels": declared,
     }
-    place.change("conf/dataset/logged.yaml", **DATASET | own | options)
+    place.change("conf/dataset/logged.yaml", **DATASET | entry | options)
     train, validation, test = ([{"recording": f"lap{number}"}] for number in (1, 2, 3))
     place.change(
         "conf/split/logged.yaml",
@@ -125,23 +127,23 @@ QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
 
 
 @pytest.mark.parametrize("name", [name for name in estimator_names() if name != "data_sheet"])
-def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
+def test_fit_fails_without_each_required_channel(name):
     config = compose_config("train", [f"estimator={name}", *QUICK.get(name, ())])
     estimator = new_estimator(config["estimator"])
     training = settings_from_config(estimator.training_type, config["training"], "training")
-    needed = lacking_to_train(estimator, training, ())
+    required = lacking_to_train(estimator, training, ())
     unread = (
         {"vx"} if name in ("learned_ukf", "kalman") else set()
     )  # their estimates read it, their fits do not
-    assert bool(needed) == estimator.learns
+    assert bool(required) == estimator.learns
     generator = np.random.default_rng(0)
-    channels = {channel: 10.0 + generator.normal(size=400) for channel in needed}
-    stops = (
-        name not in QUICK
-    )  # at once where a fit would go on; of these the filter is identified whole before the network is trained
-    for channel in set(needed) - unread:
-        held = {other: samples for other, samples in channels.items() if other != channel}
-        lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, held, "simulated")
+    channels = {channel: 10.0 + generator.normal(size=400) for channel in required}
+    # at once where a fit would go on; of these the filter is identified whole before the network is
+    # trained
+    stops = name not in QUICK
+    for channel in set(required) - unread:
+        remaining = {second: samples for second, samples in channels.items() if second != channel}
+        lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, remaining, "simulated")
         with pytest.raises(DataError, match=f"'{channel}'|no {channel} "):
             new_estimator(config["estimator"]).fit(
                 FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops)
@@ -149,7 +151,7 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
 
 
 def test_channels_of_a_settings_choice_and_references_of_outputs_count():
-    def needed(*overrides):
+    def requirements(*overrides):
         config = compose_config("train", list(overrides))
         estimator = new_estimator(config["estimator"])
         return set(
@@ -160,33 +162,35 @@ def test_channels_of_a_settings_choice_and_references_of_outputs_count():
             )
         )
 
-    assert needed("estimator=sideslip_ffnn", "estimator.inputs=imu") == FULL
-    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]", "estimator.outputs=[vy]") == {
+    assert requirements("estimator=sideslip_ffnn", "estimator.inputs=imu") == FULL
+    assert requirements(
+        "estimator=velocity_gru", "estimator.inputs=[ay]", "estimator.outputs=[vy]"
+    ) == {
         "vx",
         "ay",
         "vy_ref",
     }
-    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]") == {
+    assert requirements("estimator=velocity_gru", "estimator.inputs=[ay]") == {
         "vx",
         "ay",
         "vx_ref",
         "vy_ref",
         "yaw_rate_ref",
     }
-    assert needed("estimator=kalman") == {"vx", "yaw_rate", "ay", "steer"}, (
+    assert requirements("estimator=kalman") == {"vx", "yaw_rate", "ay", "steer"}, (
         "noise levels are read off measured channels"
     )
-    assert needed("estimator=zero") == set()
+    assert requirements("estimator=zero") == set()
 
 
 def test_estimators_of_other_packages_state_their_needs():
     kind = estimator_class("static_map")
-    other = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
-    assert set(lacking_to_train(other, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
-    found = usability(
+    plugin = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
+    assert set(lacking_to_train(plugin, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
+    row = usability(
         "luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))]
     )
-    assert (found.usable, found.rate_hz, found.configured_rate_hz) == ("yes", 50.0, 100.0)
+    assert (row.usable, row.rate_hz, row.configured_rate_hz) == ("yes", 50.0, 100.0)
 
 
 LOGS = {
@@ -217,14 +221,14 @@ def test_every_transform_that_is_promised_makes_its_channel(channels, rate_hz):
 
 
 @pytest.mark.parametrize("channels", LOGS.values(), ids=list(LOGS))
-def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels):
+def test_supplying_all_missing_channels_makes_estimators_usable(channels):
     recording = log(channels)
     before = rows(recording)
     entries = {
         json.dumps(entry): entry
         for row in before.values()
-        for made in row["supplies"].values()
-        for entry in with_values(made)
+        for transform in row["supplies"].values()
+        for entry in with_values(transform)
     }
     for entry in sorted(
         entries.values(), key=lambda entry: entry["name"] != "speed_from_wheels"
@@ -253,47 +257,50 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
+def test_supplying_all_missing_settings_makes_estimators_usable(name):
     contents = [summary_of(log(FULL))]
     plain = usability(name, compose_config("train", [f"estimator={name}"]), contents)
     expected = "no" if name == "data_sheet" else "with settings"
     assert plain.usable == expected
     assert ("estimator.wheelbase=" in plain.to_give) == (name == "data_sheet")
-    given = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
-    after = usability(name, compose_config("train", [f"estimator={name}", *given]), contents)
+    settings = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
+    after = usability(name, compose_config("train", [f"estimator={name}", *settings]), contents)
     assert after.missing.to_estimate == after.missing.to_train == []
     assert after.patterns == ()
     assert after.usable == ("with settings" if after.of_car else "yes")
 
 
 def test_missing_references_gaps_and_channels_are_named_by_estimator():
-    found = rows(log(FULL - {"vy_ref"}))
-    assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == (
+    table = rows(log(FULL - {"vy_ref"}))
+    assert (table["ksnn"]["usable"], table["ksnn"]["missing_to_train"]) == (
         "not to train",
         ["vy_ref"],
     )
-    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "with settings"), (
+    assert (table["zero"]["usable"], table["kalman"]["usable"]) == ("yes", "with settings"), (
         "they learn nothing of a reference"
     )
     drive = log(FULL)
     ay = np.where(np.arange(len(drive)) == 10, np.nan, drive["ay"])
-    found = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
-    assert (found["ksnn"]["gaps"], found["kalman"]["gaps"]) == (["ay"], []), (
+    table = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
+    assert (table["ksnn"]["gaps"], table["kalman"]["gaps"]) == (["ay"], []), (
         "the filter skips a sample of ay"
     )
-    one = summary_of(drive)
-    other = summary_of(log(FULL - {"ax"}, name="other"))
-    assert common_channels([one, other]) == FULL - {"ax"}
+    complete = summary_of(drive)
+    incomplete = summary_of(log(FULL - {"ax"}, name="other"))
+    assert common_channels([complete, incomplete]) == FULL - {"ax"}
     assert (
-        usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
+        usability(
+            "ksnn", compose_config("train", ["estimator=ksnn"]), [complete, incomplete]
+        ).usable
+        == "no"
     )
-    for channel, held, gappy in (
+    for channel, channels, gappy in (
         ("ax", {"vx"}, {"vx"}),
         ("steer", {"vx", "yaw_rate"}, ()),
         ("vy_ref", {"sideslip_ref"}, ()),
         ("motor_current", set(UNITS), ()),
     ):
-        assert derivation_of(channel, held, gappy, 50.0) is None
+        assert derivation_of(channel, channels, gappy, 50.0) is None
 
 
 def test_every_transform_that_makes_a_channel_is_listed(tmp_path):
@@ -304,27 +311,29 @@ def test_every_transform_that_makes_a_channel_is_listed(tmp_path):
             "speed_from_wheels": {"wheel_radius": RADIUS},
             "steering_ratio": {"ratio": RATIO},
         }.get(name, {})
-        lacking = recording.select([own for own in recording.channels if own != channel])
-        assert channel in transform_from_config({"name": name, **options})(lacking)
+        reduced = recording.select(
+            [candidate for candidate in recording.channels if candidate != channel]
+        )
+        assert channel in transform_from_config({"name": name, **options})(reduced)
     vx = np.where(np.arange(40) == 3, np.nan, 1.0)
     recording = Recording(
         "gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"})
     )
     write_recording(recording, tmp_path / "gap.parquet")
-    told = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
-    assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == told
+    summary = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
+    assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == summary
 
 
 def test_table_names_all_estimators_and_json_says_the_same(place):
     add_logged(place, LOGS["wheels"])
     place("ingest", "logged")
-    told = place.told("data", "usable", "logged")
-    assert ({row["estimator"] for row in told["estimators"]}, told["rate_hz"]) == (
+    result = place.told("data", "usable", "logged")
+    assert ({row["estimator"] for row in result["estimators"]}, result["rate_hz"]) == (
         set(estimator_names()),
         50.0,
     )
-    assert told["missing_to_score"] == ["vx", "vy_ref"]
-    ksnn = next(row for row in told["estimators"] if row["estimator"] == "ksnn")
+    assert result["missing_to_score"] == ["vx", "vy_ref"]
+    ksnn = next(row for row in result["estimators"] if row["estimator"] == "ksnn")
     assert (ksnn["missing_to_estimate"], ksnn["missing_to_train"]) == (
         ["vx", "ax"],
         ["vx", "ax", "vy_ref"],
@@ -337,12 +346,12 @@ def test_table_names_all_estimators_and_json_says_the_same(place):
     words = " ".join(out.split())
     assert "luenberger no 50 Hz, not 100" in words
     assert (
-        "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]"
-        in words
+        "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: "
+        "acceleration_from_speed}]" in words
     )
 
 
-def test_bare_file_is_told_by_its_columns(place):
+def test_bare_files_are_assessed_by_their_columns(place):
     lap = log({"vx", "yaw_rate", "ay"})
     table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
     table.to_csv("lap.csv", index=False)
@@ -373,11 +382,11 @@ def test_training_without_a_channel_is_refused_with_a_working_remedy(place):
         "conf/dataset/logged.yaml",
         transforms=[{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}],
     )
-    few = ("training.grid=1", "training.max_evaluations=10")
-    place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
+    fast_settings = ("training.grid=1", "training.max_evaluations=10")
+    place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *fast_settings)
 
 
-def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
+def test_unusable_candidates_are_listed_at_once_and_others_are_evaluated(place):
     add_logged(place, FULL - {"ax", "steer"})
     add_study(
         place,
@@ -388,28 +397,28 @@ def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_show
     )
     code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
-    told = json.loads(out)
-    assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "static_map"}
-    reasons = {name.split("-")[0]: reason for name, reason in told["failed"].items()}
+    result = json.loads(out)
+    assert {row["estimator"] for row in result["leaderboard"]} == {"zero", "static_map"}
+    reasons = {name.split("-")[0]: reason for name, reason in result["failed"].items()}
     assert set(reasons) == {"ksnn", "kalman"}
     assert (
-        "lack channels that estimator 'ksnn' requires: ax (transforms: [{name: acceleration_from_speed}] of vx)"
-        in reasons["ksnn"]
+        "lack channels that estimator 'ksnn' requires: ax (transforms: [{name: "
+        "acceleration_from_speed}] of vx)" in reasons["ksnn"]
     )
     assert "steer (not in the log)" in reasons["kalman"]
     assert models(place) == {"zero", "static_map"}
     lines = [line.split() for line in err.splitlines()]
-    said = [position for position, line in enumerate(lines) if line[0] == "failed"]
-    made = [
+    failures = [position for position, line in enumerate(lines) if line[0] == "failed"]
+    completions = [
         position
         for position, line in enumerate(lines)
         if line[:2] in (["done", "train"], ["done", "downsample"])
     ]
-    assert len(said) == 2
-    assert max(said) < min(made)
-    assert "seeds 0, 1" in " ".join(lines[said[0]])
+    assert len(failures) == 2
+    assert max(failures) < min(completions)
+    assert "seeds 0, 1" in " ".join(lines[failures[0]])
     code, again, _ = place("report", "logged", "--json", "tracking=none")
-    assert (code, json.loads(again)["failed"].keys()) == (5, told["failed"].keys())
+    assert (code, json.loads(again)["failed"].keys()) == (5, result["failed"].keys())
 
 
 @pytest.mark.parametrize(
@@ -437,12 +446,12 @@ def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(pl
     code, out, err = place(
         "sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none"
     )
-    told = json.loads(out)
+    result = json.loads(out)
     assert (code, models(place)) == (5, {"static_map"})
     assert [
-        row["estimator"] for row in told["summary"] if row["rmse_sideslip.test"] is not None
+        row["estimator"] for row in result["summary"] if row["rmse_sideslip.test"] is not None
     ] == ["static_map"]
-    assert "steer (transforms: [{name: steering_ratio" in told["failed"][0]["message"]
+    assert "steer (transforms: [{name: steering_ratio" in result["failed"][0]["message"]
     assert err.index("steer (") < err.index("static_map")
     add_study(
         place,
@@ -456,30 +465,35 @@ def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(pl
 
 def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     add_logged(place, FULL)
-    few = (
+    fast_settings = (
         "estimator=luenberger",
         "split=logged",
         "tracking=none",
         "training.grid=1",
         "training.max_evaluations=10",
     )
-    out, err = place.done("train", *few, "--json")
-    said = (
+    out, err = place.done("train", *fast_settings, "--json")
+    message = (
         "luenberger runs at 50 Hz instead of its 100 Hz, since recording 'lap1' is sampled at 50 Hz"
     )
-    assert " ".join(err.split()).count(said) == 1
+    assert " ".join(err.split()).count(message) == 1
     folder = Path(json.loads(out)["model"])
     assert yaml.safe_load((folder / "model.yaml").read_text())["settings"]["rate_hz"] == 50.0
     assert (
         json.loads((folder / "manifest.json").read_text())["config"]["estimator"]["rate_hz"] == 50.0
     )
-    assert place("eval", *few, "--json")[0] == 0, "it finds the model by the same overrides"
+    assert place("eval", *fast_settings, "--json")[0] == 0, (
+        "it finds the model by the same overrides"
+    )
     assert place("eval", "--model", str(folder), "split=logged", "tracking=none")[0] == 0
-    same = place.told("train", *few, "estimator.rate_hz=50.0")
-    assert (same["model"], same["skipped"]) == (str(folder), True), (
+    same_model = place.told("train", *fast_settings, "estimator.rate_hz=50.0")
+    assert (same_model["model"], same_model["skipped"]) == (str(folder), True), (
         "the same training as if the rate had been given"
     )
-    said = "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less"
+    message = (
+        "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give "
+        "estimator.rate_hz=50 or less"
+    )
     place.refused(
         "train",
         "estimator=luenberger",
@@ -487,11 +501,11 @@ def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
         "split=logged",
         "tracking=none",
         code=3,
-        says=said,
+        says=message,
     )
 
 
-def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
+def test_candidates_at_an_unavailable_rate_hide_no_other(place):
     add_logged(place, FULL)
     add_study(
         place,
@@ -501,11 +515,11 @@ def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place
     )
     code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
-    told = json.loads(out)
-    assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "kalman"}
-    assert [name.split("-")[0] for name in told["failed"]] == ["static_map"]
+    result = json.loads(out)
+    assert {row["estimator"] for row in result["leaderboard"]} == {"zero", "kalman"}
+    assert [name.split("-")[0] for name in result["failed"]] == ["static_map"]
     assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
-    report = (Path(told["report"]).parent / "report.md").read_text(encoding="utf-8")
+    report = (Path(result["report"]).parent / "report.md").read_text(encoding="utf-8")
     assert all(
         words in report
         for words in ("kalman runs at 50 Hz instead of its 100 Hz", "Recordings at 20 and 50 Hz")
@@ -550,7 +564,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
 
 
-def test_available_rates_are_kept_and_lowered_ones_explained():
+def test_available_rates_remain_and_lowered_rates_are_explained():
     def at(rate_hz):
         return RecordingSummary("lap", rate_hz, frozenset())
 
@@ -560,7 +574,8 @@ def test_available_rates_are_kept_and_lowered_ones_explained():
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
     with pytest.raises(
         DataError,
-        match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window",
+        match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: "
+        r"estimator.window",
     ):
         lower_rate(config, "estimator", at(20.0))
     _, ((_, text),) = lower_rate(
@@ -604,7 +619,9 @@ PLUGINS = {
 
 @pytest.fixture
 def plugins(tmp_path, monkeypatch):
-    """An installed package whose estimators and whose study fail in one way each, but for the estimator `sound`."""
+    """An installed package whose estimators and whose study fail in one way each, but for the
+    estimator `sound`.
+    """
     info = tmp_path / "plugins" / "broken-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
@@ -641,35 +658,35 @@ def test_plugins_that_fail_are_named_and_the_others_are_listed():
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_new_car_says_what_plugins_without_a_settings_file_lack(place):
+def test_new_car_lists_requirements_of_plugins_without_a_settings_file(place):
     place.add_steered()
     logs = [f"raw/steered/{name}.csv" for name in ("first", "second")]
-    said, _ = place.done("new", "my_car", *logs, "--yes")
-    lacking = {}
-    for line in said.splitlines():
+    output, _ = place.done("new", "my_car", *logs, "--yes")
+    requirements = {}
+    for line in output.splitlines():
         if line.startswith("not compared: "):
             names, reason = line.removeprefix("not compared: ").split(": ", 1)
-            lacking |= dict.fromkeys(names.split(", "), reason)
-    assert "is not there" not in said
-    assert lacking["sound"].startswith("there is no conf/estimator/sound.yaml; write one with")
+            requirements |= dict.fromkeys(names.split(", "), reason)
+    assert "is not there" not in output
+    assert requirements["sound"].startswith("there is no conf/estimator/sound.yaml; write one with")
     for name in ("broken_constructor", "broken_property"):
-        assert f"of another package cannot be {PLUGINS[name][1]}" in lacking[name]
+        assert f"of another package cannot be {PLUGINS[name][1]}" in requirements[name]
 
 
 @pytest.mark.usefixtures("plugins")
 @pytest.mark.parametrize("name", PLUGINS)
-def test_a_study_that_names_a_plugin_that_fails_is_one_line_and_trains_nothing(place, name):
+def test_studies_naming_a_broken_plugin_are_a_single_line_and_train_nothing(place, name):
     add_logged(place, FULL)
     place.done("ingest", "logged")
     place.change(f"conf/estimator/{name}.yaml", name=name)
     add_study(place, ["estimator=zero"], [f"estimator={name}", "training=none"])
-    said = f"estimator '{name}' of another package cannot be {PLUGINS[name][1]}"
+    message = f"estimator '{name}' of another package cannot be {PLUGINS[name][1]}"
     for command in ("run", "report"):
-        place.refused(command, "logged", "tracking=none", code=2, says=said)
+        place.refused(command, "logged", "tracking=none", code=2, says=message)
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
+def test_broken_study_modules_are_a_single_line(place):
     place.change(
         "pipelines/odd.yaml",
         study="odd",
@@ -677,9 +694,11 @@ def test_a_study_module_that_cannot_be_loaded_is_one_line(place):
         split="mine",
         sweeps=[["estimator=zero"]],
     )
-    said = "study module 'broken_study' of another package cannot be loaded (RuntimeError: no such"
+    message = (
+        "study module 'broken_study' of another package cannot be loaded (RuntimeError: no such"
+    )
     for command in ("run", "report"):
-        place.refused(command, "odd", "tracking=none", code=2, says=said)
+        place.refused(command, "odd", "tracking=none", code=2, says=message)
     place.done("data", "list")
 
 

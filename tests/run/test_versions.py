@@ -54,7 +54,7 @@ def test_renamed_module_retrains_nothing(
     )
 
 
-def test_what_has_no_version_is_of_version_1():
+def test_unversioned_objects_have_version_1():
     assert code_of("train", "zero").endswith(" training=1")
     assert code_of("report", "folds").endswith(" folds=3")
     assert "no study module 'nobody'" in refusal(

@@ -47,9 +47,9 @@ def test_two_commands_lead_to_a_verdict_and_two_more_to_an_estimate_and_to_c(
         capsys, "run", "my_car", "--minutes", "60", "tracking=none", "training.max_epochs=3"
     )
     assert code == 0, err
-    said = out[out.index("FVU") :]
-    assert "No estimator is recommended" in said, "after 3 epochs none beats the static map"
-    assert "vehest estimate" not in said
+    message = out[out.index("FVU") :]
+    assert "No estimator is recommended" in message, "after 3 epochs none beats the static map"
+    assert "vehest estimate" not in message
     report = (next((log / "outputs" / "report").iterdir()) / "report.md").read_text(
         encoding="utf-8"
     )

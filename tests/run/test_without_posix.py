@@ -1,4 +1,6 @@
-"""From a log to C where no module of POSIX can be imported and nothing can fork, as on Windows, in a folder with spaces in its name."""
+"""From a log to C where no module of POSIX can be imported and nothing can fork, as on Windows, in
+a folder with spaces in its name.
+"""
 
 import os
 import subprocess
@@ -21,7 +23,8 @@ for name in ("fork", "forkpty", "geteuid", "getuid", "killpg", "setsid"):
 from matplotlib.figure import Figure
 from vehest.cli import main
 save = Figure.savefig
-Figure.savefig = lambda _, *arguments, **options: save(Figure(), *arguments, **options)  # nothing is drawn, for the sake of time
+# nothing is drawn, for the sake of time
+Figure.savefig = lambda _, *arguments, **options: save(Figure(), *arguments, **options)
 for words in WORDS:
     sys.argv = ["vehest", *words]
     try:

@@ -1,4 +1,6 @@
-"""Tasks in processes of this machine: one that is killed fails its own task, and Ctrl-C ends all while they start."""
+"""Tasks in processes of this machine: one that is killed fails its own task, and Ctrl-C ends all
+while they start.
+"""
 
 import os
 import signal
@@ -72,7 +74,7 @@ def until_stopped(should_stop, on_progress):
     return "best so far"
 
 
-def test_a_killed_worker_fails_its_own_task_alone(tmp_path):
+def test_killed_workers_fail_only_their_task(tmp_path):
     others_run = tmp_path / "others_run"
     other_failed = tmp_path / "other_failed"
     tasks = [
@@ -116,12 +118,14 @@ def test_a_stop_ends_running_tasks_with_their_outcome_and_begins_no_other():
 
     done = list(launch([until_stopped] * 5, 2, stop, report))
     assert sorted(begun) == [0, 1]
-    assert {own.position: own.outcome for own in done} == dict.fromkeys((0, 1), "best so far")
+    assert {entry.position: entry.outcome for entry in done} == dict.fromkeys((0, 1), "best so far")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_ctrl_c_while_workers_start_ends_them_all(tmp_path):
-    """The terminal sends it to every process: here six times, as soon as one or two workers can be seen."""
+    """The terminal sends it to every process: here six times, as soon as one or two workers can be
+    seen.
+    """
     script = tmp_path / "driver.py"
     script.write_text(DRIVER, encoding="utf-8")
     try:
@@ -145,7 +149,9 @@ def test_ctrl_c_while_workers_start_ends_them_all(tmp_path):
 
 
 def test_ctrl_c_while_workers_import_ends_them_all(tmp_path):
-    """Workers that Ctrl-C reached and that took a moment to end left tasks behind that nobody ended."""
+    """Workers that Ctrl-C reached and that took a moment to end left tasks behind that nobody
+    ended.
+    """
     script = tmp_path / "driver.py"
     script.write_text(SLOW_IMPORTS + DRIVER, encoding="utf-8")
     log = tmp_path / "log"

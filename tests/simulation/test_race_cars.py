@@ -1,4 +1,6 @@
-"""What makes simulated cars differ as real ones do: tyres that lag and wear, payloads, installations, drivers who correct, traffic."""
+"""What makes simulated cars differ as real ones do: tyres that lag and wear, payloads,
+installations, drivers who correct, traffic.
+"""
 
 import math
 from dataclasses import replace
@@ -32,7 +34,9 @@ def _lagging(lengths=LENGTHS):
 
 
 def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
-    """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a plant without lag asks for there."""
+    """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a
+    plant without lag asks for there.
+    """
     plant = _lagging()
     plain = _lagging((0.0, 0.0))
     states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
@@ -65,7 +69,7 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
         np.testing.assert_allclose(ours, relaxed, atol=0.01 * np.abs(relaxed).max())
 
 
-def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_refused():
+def test_short_relaxation_lengths_converge_to_none_and_negative_ones_are_refused():
     def off(step):
         ends = []
         for length in (1e-4, 0.0):
@@ -161,7 +165,7 @@ def test_roll_leaks_by_its_share_and_sign(share):
         ({"sensors": "racing"}, "sensors 'racing' is not one of"),
     ],
 )
-def test_what_a_drive_says_of_its_own_is_checked_before_anything_is_simulated(change, message):
+def test_settings_of_a_drive_are_checked_before_the_simulation(change, message):
     dataset = compose_config("ingest", ["dataset=sim_race_cars"])["dataset"]
     dataset["drives"] = [{**dict(dataset["drives"][0]), **change}]
     with pytest.raises(ConfigurationError, match=message):

@@ -1,4 +1,6 @@
-"""The data set sim_bmw stands in for the recordings of Bertipaglia et al. 2024: mix, length, splits, and the car."""
+"""The data set sim_bmw stands in for the recordings of Bertipaglia et al. 2024: mix, length,
+splits, and the car.
+"""
 
 from collections import Counter
 from functools import cache, partial
@@ -15,8 +17,8 @@ from vehest.sources.simulated import SimulatedSource
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf"
 
-# Section IV-A: "23 manoeuvres: two braking in the turn, two skidpad, five J-turn, four slalom, four lane change, two random steers, three
-# spiral and one lap track".
+# Section IV-A: "23 manoeuvres: two braking in the turn, two skidpad, five J-turn, four slalom, four
+# lane change, two random steers, three spiral and one lap track".
 TEST_MANOEUVRES = {
     "braking_in_turn": 2,
     "skidpad": 2,
@@ -57,7 +59,7 @@ def mix(role, dataset="sim_bmw"):
     )
 
 
-def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_the_papers():
+def test_mix_of_manoeuvres_and_car_parameters_are_those_of_the_paper():
     roles = Counter(role_of(name) for name in source().drives)
     assert sum(roles.values()) == 216
     assert set(roles) == {"train", "validation", "test"}
@@ -147,7 +149,7 @@ def split(name):
     )
 
 
-def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_7():
+def test_splits_select_drives_by_name_and_the_limited_split_trains_below_7():
     for name in ("sim_bmw", "sim_bmw_limited"):
         parts = {
             "train": split(name).train,
@@ -186,8 +188,11 @@ def test_sim_bmw_cars_has_125_manoeuvres_of_each_group_on_three_cars():
 
 def test_skids_are_trained_on_and_tests_are_of_sim_bmw_cars_alone():
     for name in ("sim_bmw_cars", "sim_bmw_cars_limited"):
-        own = configuration("split", name)
-        learnt = [entry["keep"]["magnitude"] for entry in (*own["train"], *own["validation"])]
+        split_settings = configuration("split", name)
+        learnt = [
+            entry["keep"]["magnitude"]
+            for entry in (*split_settings["train"], *split_settings["validation"])
+        ]
         assert not any("sideslip_ref" in bounds for bounds in learnt)
-        assert {entry["dataset"] for entry in own["train"]} == {"sim_bmw"}
-        assert {entry["dataset"] for entry in own["tests"]["test"]} == {"sim_bmw_cars"}
+        assert {entry["dataset"] for entry in split_settings["train"]} == {"sim_bmw"}
+        assert {entry["dataset"] for entry in split_settings["tests"]["test"]} == {"sim_bmw_cars"}

@@ -108,13 +108,22 @@ def test_courses_do_not_come_near_themselves(name):
 
 def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile():
     course = course_by_name("palm_beach_like")
-    # A turn is a stretch to one side; the two compound corners count as two turns, the opening kink after a corner as none.
+    # A turn is a stretch to one side; the two compound corners count as two turns, the opening kink
+    # after a corner as none.
     straight = np.abs(course.curvature) < 1e-9
     changes = np.flatnonzero(np.diff(straight.astype(int)))
     runs = np.diff(np.concatenate([changes, [changes[0] + len(straight) - 1]]))
     assert runs.max() * course.arc_length[1] == pytest.approx(0.6 * 1609.0, rel=0.05)
-    radii = [1.0 / abs(corner.curvature) for segment in LAYOUTS["palm_beach_like"].segments if not isinstance(segment, Straight)
-             for corner in (segment.parts if isinstance(segment, Compound) else (segment,))]  # fmt: skip
+    bends = [
+        segment
+        for segment in LAYOUTS["palm_beach_like"].segments
+        if not isinstance(segment, Straight)
+    ]
+    radii = [
+        1.0 / abs(corner.curvature)
+        for bend in bends
+        for corner in (bend.parts if isinstance(bend, Compound) else (bend,))
+    ]
     assert len([radius for radius in radii if radius < 240.0]) == 11
     assert math.degrees(np.abs(course.bank).max()) == pytest.approx(6.0)
 
@@ -172,7 +181,7 @@ def test_courses_styles_and_steps_that_make_no_sense_are_refused():
         trip(0, step=3e-3, duration=1.0)
 
 
-def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_lap():
+def test_patches_depend_on_the_seed_and_repeat_every_lap():
     patchy = surface_from_config("patchy")
     places = np.arange(0.0, 5000.0)
     scale = patchy.along(places, 3, 2500.0)
@@ -240,7 +249,7 @@ def test_driver_laps_fast_near_the_centre_line_and_without_spin(laps):
         assert not any((lap.flags.spun, lap.flags.left_road, lap.flags.stood))
 
 
-def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippery_road():
+def test_speed_profile_stays_within_friction_and_power():
     driver = Driver()
     car = car_of(MultiBodyPlant(LOWERED))
     max_grip = np.full_like(HANDLING.curvature, 8.0)
@@ -267,7 +276,7 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert slippery**2 * 0.02 == pytest.approx(4.0, rel=3e-3)
 
 
-def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_when():
+def test_driver_values_of_a_vehicle_are_used_and_a_rollover_names_its_drive():
     vehicle = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
     car = car_of(MultiBodyPlant(vehicle))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
@@ -325,7 +334,7 @@ def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit):
     )  # and does not without gravity
 
 
-def test_flat_leaves_bank_and_grade_out_and_the_sampling_rate_does_not_change_the_drive():
+def test_flat_omits_bank_and_grade_and_drives_do_not_depend_on_the_sampling_rate():
     motion = trip(1, course="palm_beach_like", duration=2.0, flat=True).motion
     assert not motion.bank.any()
     assert not motion.grade.any()
@@ -337,7 +346,7 @@ def test_flat_leaves_bank_and_grade_out_and_the_sampling_rate_does_not_change_th
         np.testing.assert_array_equal(coarse[name], fine[name][::5])
 
 
-def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
+def test_wet_road_lowers_the_accelerations_and_patches_are_in_the_motion():
     dry, wet, patchy = (trip(3, surface=name, duration=40.0) for name in ("dry", "wet", "patchy"))
     assert np.abs(wet.motion.ay).max() < 0.8 * np.abs(dry.motion.ay).max()
     assert wet.motion.friction.min() == wet.motion.friction.max() == 0.7

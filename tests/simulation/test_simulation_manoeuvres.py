@@ -1,4 +1,6 @@
-"""Manoeuvres of the proving ground, with every shipped car: what each is for, how it ends, and what the seed decides."""
+"""Manoeuvres of the proving ground, with every shipped car: what each is for, how it ends, and what
+the seed decides.
+"""
 
 import math
 from dataclasses import fields, replace
@@ -50,12 +52,18 @@ def vehicle(name):
 
 
 @cache
-def moderate(car, which):
+def moderate(car, case):
     return drive(
         MultiBodyPlant(vehicle(car)),
-        manoeuvre_from_config((MODERATE | MODERATE_LAPS)[which]),
+        manoeuvre_from_config((MODERATE | MODERATE_LAPS)[case]),
         seed=1,
     )
+
+
+def among_cones(car, case):
+    """A moderate trip, its manoeuvre, and the car's width [m]."""
+    width = car_of(MultiBodyPlant(vehicle(car))).width
+    return moderate(car, case), manoeuvre_from_config(MODERATE[case]), width
 
 
 def go(car, seed=1, surface="dry", stability_control=False, **configuration):
@@ -68,6 +76,13 @@ def go(car, seed=1, surface="dry", stability_control=False, **configuration):
         surface=surface_from_config(surface),
         stability_control=stability_control,
     )
+
+
+def assert_finite(motion):
+    """All quantities that the motion has are finite."""
+    for entry in fields(motion):
+        values = getattr(motion, entry.name)
+        assert values is None or np.isfinite(values).all(), entry.name
 
 
 def side_of(trip):
@@ -95,37 +110,30 @@ def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     "car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)]
 )
 @pytest.mark.parametrize(
-    "which", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)]
+    "case", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)]
 )
-def test_moderate_severity_is_completed_by_every_car(car, which):
-    trip = moderate(car, which)
+def test_moderate_severity_is_completed_by_every_car(car, case):
+    trip = moderate(car, case)
     flags = trip.flags
     motion = trip.motion
     assert flags.completed
     assert not flags.spun
     assert not flags.left_road
     assert flags.gave_up_at is None
-    assert flags.stood == (which in ("braking in turn", "speed lap"))
+    assert flags.stood == (case in ("braking in turn", "speed lap"))
     assert flags.largest_lateral_error is None or flags.largest_lateral_error < 0.6
     assert math.degrees(flags.largest_sideslip) < 6.0
     assert motion.vx[0] > 5.0  # rolls from the first sample on
     # The circuit's banked corner takes a little more than a level road's grip.
     grip = car_of(MultiBodyPlant(vehicle(car))).grip
     assert 0.25 * grip < flags.largest_ay < 1.1 * grip
-    for values in (
-        getattr(motion, entry.name)
-        for entry in fields(motion)
-        if getattr(motion, entry.name) is not None
-    ):
-        assert np.isfinite(values).all()
+    assert_finite(motion)
 
 
 @pytest.mark.parametrize("car", CARS)
-@pytest.mark.parametrize("which", ["lane change", "obstacle"])
-def test_lane_change_keeps_the_car_between_the_cones(car, which):
-    trip = moderate(car, which)
-    manoeuvre = manoeuvre_from_config(MODERATE[which])
-    width = car_of(MultiBodyPlant(vehicle(car))).width
+@pytest.mark.parametrize("case", ["lane change", "obstacle"])
+def test_lane_change_keeps_the_car_between_the_cones(car, case):
+    trip, manoeuvre, width = among_cones(car, case)
     x = trip.motion.x
     y = side_of(trip) * trip.motion.y
     for gate in manoeuvre.gates(width):
@@ -153,11 +161,9 @@ def test_gates_are_those_of_the_standards():
 
 
 @pytest.mark.parametrize("car", CARS)
-@pytest.mark.parametrize("which", ["slalom 18 m", "slalom 30 m"])
-def test_slalom_passes_the_cones_on_alternating_sides(car, which):
-    trip = moderate(car, which)
-    manoeuvre = manoeuvre_from_config(MODERATE[which])
-    width = car_of(MultiBodyPlant(vehicle(car))).width
+@pytest.mark.parametrize("case", ["slalom 18 m", "slalom 30 m"])
+def test_slalom_passes_the_cones_on_alternating_sides(car, case):
+    trip, manoeuvre, width = among_cones(car, case)
     cones = np.arange(manoeuvre.cones) * manoeuvre.spacing
     at_cones = side_of(trip) * np.interp(cones, trip.motion.x, trip.motion.y)
     alternating = np.where(np.arange(manoeuvre.cones) % 2 == 0, 1.0, -1.0)
@@ -223,7 +229,7 @@ def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
+def test_j_turn_reaches_the_configured_steady_turn(car):
     trip = moderate(car, "j-turn")
     motion = trip.motion
     drawn = trip.drawn
@@ -239,7 +245,7 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     assert reached - drawn["begin"] < drawn["steer_time"] + 0.3
 
 
-def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
+def test_spiral_tightens_slowly_to_both_sides_in_turn():
     trip = moderate("bmw_545i", "spiral")
     motion = trip.motion
     side = side_of(trip)
@@ -273,7 +279,8 @@ def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
     ("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)]
 )
 def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(car, reached):
-    # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6 to 10.8 m/s² for the Ferrari.
+    # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6
+    # to 10.8 m/s² for the Ferrari.
     trip = go(car, seed=100, name="laps", course="palm_beach_like", severity=0.95, laps=1)
     assert (trip.flags.spun, trip.flags.left_road, trip.flags.completed) == (False, False, True)
     assert trip.flags.largest_lateral_error < 1.5
@@ -300,8 +307,9 @@ def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
     assert (trip.flags.completed, trip.flags.stood, trip.flags.left_road) == (True, True, False)
 
 
-def test_fast_lap_has_the_papers_mean_and_top_speed_and_says_what_is_reached():
-    # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan that has them exactly.
+def test_fast_lap_has_the_papers_speeds_and_names_the_reachable_limit():
+    # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan
+    # that has them exactly.
     trip = go("heavy_truck", name="fast_lap")
     duration = len(trip.motion) / 100.0
     assert 3.6 * course_by_name("vairano_like").length / duration == pytest.approx(76.0, rel=0.02)
@@ -324,7 +332,7 @@ def oversteering():
     return replace(base, name="oversteering", overrides={**base.overrides, "tire_rear": rear})
 
 
-def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
+def test_spin_is_recorded_and_flagged_until_a_second_after_the_stand():
     trip = go(oversteering(), **SPINNING)
     flags = trip.flags
     motion = trip.motion
@@ -336,12 +344,7 @@ def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
     assert speed[0] > 25.0
     last_moving = np.flatnonzero(speed > 0.01)[-1]
     assert (len(motion) - 1 - last_moving) / 100.0 == pytest.approx(1.0, abs=0.05)
-    for values in (
-        getattr(motion, entry.name)
-        for entry in fields(motion)
-        if getattr(motion, entry.name) is not None
-    ):
-        assert np.isfinite(values).all()
+    assert_finite(motion)
 
 
 @pytest.mark.parametrize("seed", [1, 2])  # to the right and to the left

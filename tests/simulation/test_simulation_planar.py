@@ -1,4 +1,6 @@
-"""The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what the simulated tyre sets hold."""
+"""The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what
+the simulated tyre sets hold.
+"""
 
 import math
 import re
@@ -221,7 +223,7 @@ def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate):
     assert energies[-1] < 1e-4 * energies[0]
 
 
-def test_a_car_at_rest_stays_at_rest_and_a_slippery_floor_lowers_what_is_reached():
+def test_car_at_rest_stays_there_and_slippery_floors_lower_accelerations():
     state = coasted(CAR, 2.0, steer=0.4)
     assert state[STEER] == pytest.approx(0.4)
     np.testing.assert_array_equal(state[:STEER], 0.0)
@@ -239,7 +241,7 @@ def test_a_car_at_rest_stays_at_rest_and_a_slippery_floor_lowers_what_is_reached
     assert reached["wet"] / reached["dry"] == pytest.approx(0.7, rel=0.05)
 
 
-def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spins_and_backwards():
+def test_states_stay_finite_under_random_inputs():
     plant = PlanarPlant(CAR)
     generator = np.random.default_rng(5)
     state = plant.initial_state()
@@ -296,7 +298,8 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
     )
     for pattern, minutes in (("learn_a", 3.0), ("test_a", 1.5), ("test_d", 3.0)):
         assert len(of(pattern, "vx")) / 6000.0 == pytest.approx(minutes, rel=0.1)
-    # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
+    # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above
+    # 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
     for pattern in ("learn_a", "test_a", "test_d"):
         vx = of(pattern, "vx_ref")
         vy = of(pattern, "vy_ref")

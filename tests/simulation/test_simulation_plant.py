@@ -1,4 +1,6 @@
-"""The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
+"""The plant: library's equations, what was added to them, and that it holds from standstill to a
+spin.
+"""
 
 import fcntl
 import math
@@ -37,7 +39,8 @@ FERRARI = shipped("ferrari_250_lm")
 CORVETTE = shipped("corvette_grand_sport")
 TRUCK = shipped("heavy_truck")
 
-# CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py): BMW 320i, state, derivatives.
+# CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py):
+# BMW 320i, state, derivatives.
 PUBLISHED_INPUTS = (0.15, 0.63 * GRAVITY)
 PUBLISHED_STATE = [
     *(
@@ -124,22 +127,26 @@ PUBLISHED_DERIVATIVES = [
 
 
 class TwoTyres:
-    """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one for two, and so on."""
+    """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one
+    for two, and so on.
+    """
 
     def __init__(self, vehicle):
         self.values = library_parameters(vehicle)
-        self.asked = 0
+        self.evaluations = 0
         self.tyres = (self.values.tire, rear_tyre(vehicle))
 
     def __getattr__(self, name):
         if name == "tire":
-            self.asked += 1
-            return self.tyres[(self.asked - 1) % 4 // 2]
+            self.evaluations += 1
+            return self.tyres[(self.evaluations - 1) % 4 // 2]
         return getattr(self.values, name)
 
 
 def in_python(function):
-    """A compiled function as plain Python, with all it calls: Python's sines are those of the library."""
+    """A compiled function as plain Python, with all it calls: Python's sines are those of the
+    library.
+    """
     plain = function.py_func
     functions = {
         name: plain.__globals__[name]
@@ -330,6 +337,14 @@ def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     )
 
 
+def velocities_and_rates(motion):
+    """Both velocities with their derivatives by the kinematics of the plane."""
+    return (
+        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
+        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
+    )
+
+
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
     motion, states = drive(
@@ -337,10 +352,7 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     )
     assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
     assert motion.vx[-1] == 0.0
-    for velocity, rate in (
-        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
-        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
-    ):
+    for velocity, rate in velocities_and_rates(motion):
         error = np.abs((velocity[2:] - velocity[:-2]) / 2e-3 - rate[1:-1])
         assert np.median(error) < 1e-5
         # Inputs that jump (brakes at 2 s) and the stop itself leave a few samples with half a jump.
@@ -349,17 +361,15 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     motion, states = spin
     sliding = np.array([state.regime == Regime.SLIDING for state in states])
     inside = np.flatnonzero(sliding[:-2] & sliding[2:])
-    for velocity, rate in (
-        (motion.vy, motion.ay - motion.vx * motion.yaw_rate),
-        (motion.vx, motion.ax + motion.vy * motion.yaw_rate),
-    ):
+    for velocity, rate in velocities_and_rates(motion):
         error = np.abs((velocity[inside + 2] - velocity[inside]) / 0.02 - rate[inside + 1])
         assert np.median(error) < 0.02  # the sampling is ten times coarser here
 
 
 @pytest.mark.parametrize("moment", [0.0, 900.0, -900.0])
 def test_tyre_forces_account_for_all_accelerations(moment):
-    # Masses times accelerations by differences of velocities of the body and of both axles, against the sum of forces.
+    # Masses times accelerations by differences of velocities of the body and of both axles, against
+    # the sum of forces.
     plant = MultiBodyPlant(FERRARI)
     slope = road_gravity(bank=0.05, grade=0.03)
     p = plant.parameters
@@ -383,7 +393,8 @@ def test_tyre_forces_account_for_all_accelerations(moment):
         mass * (change[:, place] + vx * yaw_rate - slope[1])
         for mass, place in ((p.m_s, VY), (p.m_uf, 15), (p.m_ur, 20))
     )
-    joint = 8.0  # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
+    # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
+    joint = 8.0
     np.testing.assert_allclose(forces[1].sum(axis=1), lateral, atol=joint)
     arm_x = np.array([p.a, p.a, -p.b, -p.b])
     arm_y = 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])
@@ -392,7 +403,7 @@ def test_tyre_forces_account_for_all_accelerations(moment):
     assert np.abs(motion.ay).max() > 8.0
 
 
-def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
+def test_yaw_moment_turns_left_and_is_limited_by_the_brakes_of_a_side():
     plant = MultiBodyPlant(FERRARI)
     p = plant.parameters
     state = plant.initial_state(0.0, 0.0, 0.0, 30.0)
@@ -409,7 +420,7 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     )  # the tyres already resist
 
 
-def test_gravity_on_a_bank_pulls_alike_and_friction_halves_what_is_reached():
+def test_bank_pulls_all_masses_equally_and_half_friction_halves_grip():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
     plant = MultiBodyPlant(FERRARI)
     across = road_gravity(bank=0.1, grade=0.0)[1]
@@ -529,7 +540,7 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     assert away.spun  # it has been in a spin, whatever it does now
 
 
-def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_rolls_over():
+def test_rollovers_and_non_finite_states_are_errors():
     with pytest.raises(SimulationError, match="rolled over") as raised:
         turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
     assert raised.value.exit_code == 3

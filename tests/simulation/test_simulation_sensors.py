@@ -1,4 +1,6 @@
-"""Simulated sensors: each error against theory, each alone, and the levels against the real recording."""
+"""Simulated sensors: each error against theory, each alone, and the levels against the real
+recording.
+"""
 
 import math
 from dataclasses import asdict, fields, replace
@@ -52,7 +54,10 @@ def motion_of(n_samples, rate_hz=100.0, **values):
 
 
 def weaving(seconds=20.0, rate_hz=100.0):
-    """A car that weaves, rolls and pitches on a banked grade; every quantity moves, and each in its own way."""
+    """A car that weaves, rolls and pitches on a banked grade.
+
+    Every quantity moves, and each in its own way.
+    """
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     wheels = np.stack([80.0 + i + np.sin((1.0 + i) * t) for i in range(4)], axis=1)
     yaw_rate = 0.4 * np.sin(1.1 * t)
@@ -83,7 +88,9 @@ def weaving(seconds=20.0, rate_hz=100.0):
 
 
 def swerving(seconds):
-    """A hard drive that obeys planar kinematics, whose body rolls with ay and pitches with ax as the Ferrari's does."""
+    """A hard drive that obeys planar kinematics, whose body rolls with ay and pitches with ax as
+    the Ferrari's does.
+    """
     t = np.arange(round(seconds * 100.0)) / 100.0
 
     def sines(*parts):
@@ -124,7 +131,7 @@ def differing_channels(first, second):
     return {name for name in first if not np.array_equal(first[name], second[name])}
 
 
-def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of_the_body():
+def test_ideal_sensors_measure_the_exact_motion():
     motion = weaving()
     channels = measure(motion, PRESETS["ideal"], seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
@@ -191,7 +198,8 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
 
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
 def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz):
-    # 20,000 samples: the standard deviation is known to 0.5 %, a correlation to 0.007; four of either are allowed.
+    # 20,000 samples: the standard deviation is known to 0.5 %, a correlation to 0.007; four of
+    # either are allowed.
     channels = measure(
         motion_of(20_000, rate_hz, vx=20.0), only(ay=SensorLevel(noise=0.01)), seed=5
     )
@@ -206,7 +214,8 @@ def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz):
 
 
 def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel():
-    # 400 draws: a standard deviation is known to 3.5 %, a mean to 5 % of it, a correlation to 0.05; four of each are allowed.
+    # 400 draws: a standard deviation is known to 3.5 %, a mean to 5 % of it, a correlation to 0.05;
+    # four of each are allowed.
     levels = only(ay=SensorLevel(offset=0.03), wheel_speed=SensorLevel(scale=0.01))
     drives = [measure(motion_of(2, wheel_speed=50.0), levels, seed) for seed in range(400)]
     offsets = np.array([drive["ay"] for drive in drives])
@@ -221,7 +230,8 @@ def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel():
 
 
 def test_drift_is_a_stationary_gauss_markov_process():
-    # 2000 s with a correlation time of 2 s are about 1000 independent values: 2.5 % of the deviation, 0.03 of a correlation.
+    # 2000 s with a correlation time of 2 s are about 1000 independent values: 2.5 % of the
+    # deviation, 0.03 of a correlation.
     drift = measure(
         motion_of(40_000, 20.0), only(yaw_rate=SensorLevel(drift=0.01, drift_time=2.0)), seed=2
     )["yaw_rate"]
@@ -254,7 +264,8 @@ def test_quantisation_error_is_uniform_within_half_a_step():
 
 @pytest.mark.parametrize("delay", [0.004, 0.01, 0.0137, 0.25])
 def test_delay_of_a_sine_is_its_phase(delay):
-    # At 5 Hz and 100 Hz sampling the cubic between samples loses up to 3/128 (2π·0.05)⁴ = 0.02 % of the amplitude.
+    # At 5 Hz and 100 Hz sampling the cubic between samples loses up to 3/128 (2π·0.05)⁴ = 0.02 % of
+    # the amplitude.
     t = np.arange(1000) / 100.0
     values = measure(
         motion_of(1000, yaw_rate=np.sin(2.0 * np.pi * 5.0 * t)),
@@ -267,7 +278,7 @@ def test_delay_of_a_sine_is_its_phase(delay):
     )
 
 
-def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
+def test_delay_repeats_the_start_and_shifts_integer_samples_exactly():
     ramp = 5.0 + np.arange(50.0)
     delayed_ramp = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.03)), seed=0)["vx"]
     np.testing.assert_array_equal(delayed_ramp, np.concatenate([[5.0, 5.0, 5.0], ramp[:-3]]))
@@ -295,13 +306,17 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
         body = _rotation(motion.roll[k], motion.pitch[k])
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
-    # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
+    # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity
+    # the skew matrix RᵀdR/dt.
     rates = body_rates(motion, Tilt())
     t = 3.21
     h = 1e-5
     k = 321
-    yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
-    at = lambda s: _turn_z(yaw(s)) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s))  # noqa: E731
+
+    def at(s):
+        yaw = -0.4 / 1.1 * math.cos(1.1 * s)
+        return _turn_z(yaw) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s))
+
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
     np.testing.assert_allclose(rates[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][
@@ -325,14 +340,16 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
 
 
 def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
-    # Yaw rate 0.5 t about the centre: tangential 0.5 l, centripetal (0.5 t)² l; central differences of a line are exact.
+    # Yaw rate 0.5 t about the centre: tangential 0.5 l, centripetal (0.5 t)² l; central differences
+    # of a line are exact.
     t = np.arange(200) / 100.0
     channels = measure(
         motion_of(200, yaw_rate=0.5 * t), only(imu=Mounting(lever_x=1.2, lever_y=-0.4)), seed=0
     )
     np.testing.assert_allclose(channels["ax"], 0.5 * 0.4 - (0.5 * t) ** 2 * 1.2, atol=1e-12)
     np.testing.assert_allclose(channels["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
-    # Place R(t) l by differentiation, with all three rates at work; differences over 10 ms are good to 1e-3 of the amplitude.
+    # Place R(t) l by differentiation, with all three rates at work; differences over 10 ms are good
+    # to 1e-3 of the amplitude.
     motion = weaving()
     lever = np.array([1.0, -0.6, 0.8])
     levels = only(imu=Mounting(*lever), tilt=Tilt(bank=False, grade=False))
@@ -399,7 +416,7 @@ def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity(
     )  # nose going down: what is below goes back
 
 
-def test_reference_and_car_err_apart():
+def test_errors_of_reference_and_car_sensors_are_independent():
     channels = measure(
         motion_of(20_000, vx=20.0),
         only(vx=LOUD, yaw_rate=LOUD, reference=Reference("gnss", vx=LOUD, yaw_rate=LOUD)),
@@ -438,7 +455,7 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     assert differing_channels(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
-def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_other():
+def test_error_streams_of_sensors_are_independent():
     motion = motion_of(500, ay=3.0)
     ay = {
         kind: measure(motion, only(ay=level), seed=7)["ay"] - 3.0
@@ -482,13 +499,13 @@ def test_switching_off_takes_parts_wholes_and_kinds():
 @pytest.mark.parametrize(
     "name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""]
 )
-def test_switching_off_what_there_is_not_names_what_there_is(name):
+def test_switching_off_an_unknown_part_lists_the_parts(name):
     assert "cannot switch off" in refusal(
         lambda: switched_off(SensorLevels(), name), ConfigurationError
     )
 
 
-def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
+def test_seed_determines_every_sample_independent_of_the_duration():
     motion = weaving()
     first, again, second = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
     assert differing_channels(first, again) == set()
@@ -526,12 +543,12 @@ def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
         ),
     ],
 )
-def test_configurations_mean_what_they_say(spelt, meant):
+def test_sensor_configurations_are_parsed(spelt, meant):
     assert sensor_levels_from_config(yaml.safe_load(spelt)) == meant
 
 
 @pytest.mark.parametrize(
-    ("spelt", "said"),
+    ("spelt", "message"),
     [
         ("perfect", "sensors 'perfect' is not one of: default, race, ideal"),
         ("{az: {noise: 0}}", "sensors: 'az' is not one of: vx, yaw_rate"),
@@ -553,13 +570,13 @@ def test_configurations_mean_what_they_say(spelt, meant):
         ),
     ],
 )
-def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt, said):
-    assert said in refusal(
+def test_invalid_sensor_configurations_are_refused_in_a_single_line(spelt, message):
+    assert message in refusal(
         lambda: sensor_levels_from_config(yaml.safe_load(spelt)), ConfigurationError
     )
 
 
-def test_density_is_found_beside_a_resonance_and_jolts():
+def test_noise_density_is_measured_despite_resonance_and_jolts():
     noise = measure(motion_of(60_000), only(ay=SensorLevel(noise=0.02)), seed=0)["ay"]
     assert noise_density(noise, 100.0) == pytest.approx(0.02, rel=0.05)
     shaken = noise + 0.3 * np.sin(2.0 * np.pi * 21.0 * np.arange(60_000) / 100.0)
@@ -569,8 +586,9 @@ def test_density_is_found_beside_a_resonance_and_jolts():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_reading_a_simulated_race_car_gives_its_levels_back(seed):
-    # 25 minutes are 250 correlation times of ay's drift: 5 % of its deviation. Its time, where the correlation falls to 1/e, is less
-    # well known, and the reference's own slow errors blur all that is slow.
+    # 25 minutes are 250 correlation times of ay's drift: 5 % of its deviation. Its time, where the
+    # correlation falls to 1/e, is less well known, and the reference's own slow errors blur all
+    # that is slow.
     race = PRESETS["race"]
     levels = replace(
         race,

@@ -1,4 +1,6 @@
-"""The shipped vehicles: steady handling, load transfer, springs, stability control, and that they are the cars of their sources."""
+"""The shipped vehicles: steady handling, load transfer, springs, stability control, and that they
+are the cars of their sources.
+"""
 
 import math
 import re
@@ -93,15 +95,15 @@ def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
 
 
 @each_vehicle
-def test_grip_is_what_the_car_reaches_in_steady_state(name):
+def test_grip_is_the_steady_state_limit(name):
     plant = plant_of(name)
     assert ramp_of(name).ay.max() == pytest.approx(plant.grip, rel=0.055)
     assert ramp_steer(plant, 15.0).ay.max() == pytest.approx(plant.grip, rel=0.055)
 
 
 def test_cars_reach_the_lateral_accelerations_of_the_papers():
-    # Table I of Da Lio et al. 2023: 99 % quantiles of the laps; Fig. 4 of Bertipaglia et al. 2024: spread over ±10 m/s²,
-    # in transients too, which reach a little more than a steady turn.
+    # Table I of Da Lio et al. 2023: 99 % quantiles of the laps; Fig. 4 of Bertipaglia et al. 2024:
+    # spread over ±10 m/s², in transients too, which reach a little more than a steady turn.
     for name, published, at_most in (
         ("corvette_grand_sport", 11.6, 12.5),
         ("ferrari_250_lm", 10.78, 11.7),
@@ -116,9 +118,10 @@ def test_cars_reach_the_lateral_accelerations_of_the_papers():
 
 @each_vehicle
 def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
-    # Moments about the ground below the middle of the track, from forces and angles that sensors could see: mass times
-    # acceleration times height, the weight of the leaning body and of axles on tyres of unlike deflection, and the tyres'
-    # sideways give. Heights are less than the drawing's by the tyres' deflection.
+    # Moments about the ground below the middle of the track, from forces and angles that sensors
+    # could see: mass times acceleration times height, the weight of the leaning body and of axles
+    # on tyres of unlike deflection, and the tyres' sideways give. Heights are less than the
+    # drawing's by the tyres' deflection.
     plant = plant_of(name)
     p = plant.parameters
     turn = steady_turn(plant, 20.0, 0.02)
@@ -169,7 +172,8 @@ def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
     assert p.I_z == pytest.approx(982.0 / 12.0 * (1.7**2 + 4.09**2), rel=1e-4)
     assert front == pytest.approx(0.7e5, rel=0.01)
     assert rear == pytest.approx(1.2e5, rel=0.01)
-    # Di Biase et al. 2020, Table 1 and the remark below Eq. 27, with the rational tyre at friction 1.
+    # Di Biase et al. 2020, Table 1 and the remark below Eq. 27, with the rational tyre at friction
+    # 1.
     plant = plant_of("heavy_truck")
     p = plant.parameters
     for load_arm, tyre, c1, c2 in (
@@ -193,7 +197,8 @@ def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
 
 SOURCE = re.compile(
     r"assumed|Neither ply steer nor conicity"  # an assumption
-    r"|\[\d\]|as BMW 320i"  # a source that the file's head names, or the published set that it starts from
+    # a source that the file's head names, or the published set that it starts from
+    r"|\[\d\]|as BMW 320i"
     r"|likewise|see \w+|follows from|m - m_uf - m_ur|m a b"  # from other values of the file
 )
 
@@ -215,7 +220,7 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
     ).read_text(encoding="utf-8")
 
 
-def test_overrides_reach_the_plant_and_cars_without_stated_shifts_pull_to_neither_side():
+def test_overrides_reach_the_plant_and_cars_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
         after = plant.advance(
@@ -267,7 +272,9 @@ CONTROL = StabilityControl(
 
 
 def sine_with_dwell(plant, amplitude, control, friction):
-    """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that the control asked for."""
+    """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that
+    the control asked for.
+    """
     state = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6)
     doing = StabilityState()
     largest = 0.0
@@ -309,7 +316,7 @@ def test_sideslip_stays_lower_with_control_than_without(name, friction):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
+def test_largest_moment_is_within_the_braking_limit_of_both_sides(name):
     plant = plant_of(name)
     rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
     forces = plant.motion(

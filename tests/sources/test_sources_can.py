@@ -93,7 +93,7 @@ def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_pat
     for options, said in (
         (
             {"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}},
-            "no signal 'Speed.VehSpeed' (near it: Speed.VehSpd,",
+            "no signal 'Speed.VehSpeed'; did you mean 'Speed.VehSpd'?",
         ),
         (
             {"channels": {"vx": {"column": "Counter", "unit": "m/s"}}},

@@ -139,7 +139,7 @@ def test_a_name_in_several_groups_needs_its_group_and_an_absent_signal_is_answer
             of("VehSpd", group=2),
             "signal 'VehSpd' is not in group '2', but in 0 'Powertrain', 1 'Gateway'",
         ),
-        (of("Vehspeed"), "has no signal 'Vehspeed' (near it: VehSpd)"),
+        (of("Vehspeed"), "has no signal 'Vehspeed'; did you mean 'VehSpd'?"),
         (of("time"), "has no signal 'time'"),  # a master is no signal
     ):
         assert said in refused(drive, channels=channels)

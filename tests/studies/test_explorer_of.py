@@ -39,24 +39,24 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     yaw_rate[drive.time >= FROZEN] = yaw_rate[drive.time >= FROZEN][0]
     drive = replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
     part, model = comparison_on(drive, tmp_path, RATE)
-    found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
+    health = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]
-    assert len(found) == sum(lengths) + 5
-    first = found[: lengths[0]]
-    second = found[lengths[0] + 5 :]
+    assert len(health) == sum(lengths) + 5
+    first = health[: lengths[0]]
+    second = health[lengths[0] + 5 :]
     onset = round((FROZEN - SPANS[1].start - 1.5) * RATE)
     assert (first == VALID).all()
     assert (second[:onset] == VALID).all()
     assert (second[onset + round(RATE) :] == INVALID).mean() > 0.95
-    assert np.isnan(found[lengths[0] : lengths[0] + 5]).all()
+    assert np.isnan(health[lengths[0] : lengths[0] + 5]).all()
 
 
-def test_health_is_shown_at_the_rate_of_the_model_alone(tmp_path):
+def test_health_is_drawn_at_the_rate_of_the_model_only(tmp_path):
     drive = measured_drive(3)
     part, model = comparison_on(drive, tmp_path, RATE)
     pieces = list(pieces_of(SPANS, lambda span: drive, part.protocol))
-    other = replace(part, protocol=replace(part.protocol, rate_hz=2 * RATE))
-    assert health_over(model, pieces, other, 5) is None
+    faster_part = replace(part, protocol=replace(part.protocol, rate_hz=2 * RATE))
+    assert health_over(model, pieces, faster_part, 5) is None
     assert health_over(replace(model, calibration_folder=None), pieces, part, 5) is None
     assert chained([np.ones(2), np.zeros(1)], 2).tolist() == pytest.approx(
         [1.0, 1.0, np.nan, np.nan, 0.0], nan_ok=True

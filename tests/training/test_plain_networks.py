@@ -1,4 +1,6 @@
-"""Networks over windows in plain PyTorch: trained, estimated, run online and trained as members without a hook of their own."""
+"""Networks over windows in plain PyTorch: trained, estimated, run online and trained as members
+without a hook of their own.
+"""
 
 from functools import cache
 
@@ -8,6 +10,7 @@ import torch
 from torch import nn
 
 from conftest import flat_weights, planar_drive, stop_after
+from every_estimator import online_rows
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.networks.standardised import StandardisedNetwork
@@ -117,12 +120,12 @@ def test_members_equal_training_each_alone(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "one_by_one"),
+    ("name", "is_sequential"),
     [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)],
 )
-def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one_by_one):
+def test_members_are_batched_where_torch_can_batch_every_layer(name, is_sequential):
     members, _ = fit(NETWORKS[name], [0, 1])
-    assert (members[0].network in _UNBATCHABLE) is one_by_one
+    assert (members[0].network in _UNBATCHABLE) is is_sequential
 
 
 @cache
@@ -137,11 +140,7 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
     member = network_type(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
     batch = member.estimate([drive])[0]["vy"]
-    stepper = member.online()
-    online = [
-        stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
-        for k in range(len(drive))
-    ]
+    online = [row["vy"] for row in online_rows(member, drive, drive.channels)]
     assert np.isnan(batch[:WINDOW]).all()
     assert np.abs(np.array(online)[WINDOW - 1 : -1] - batch[WINDOW:]).max() <= tolerance
 
@@ -210,7 +209,7 @@ class Frozen(Perceptron):
         return super().forward(windows) + self.offset
 
 
-def test_frozen_parameters_and_buffers_stay_each_member_s_own():
+def test_frozen_parameters_and_buffers_stay_per_member():
     together, _ = fit(Frozen, [0, 1], learning_rate=1e-2)
     for seed, member in enumerate(together):
         with torch.random.fork_rng():
@@ -244,7 +243,8 @@ def masked():
         (nn.Identity, "Identity has no parameters to train"),
         (
             lambda: nn.Sequential(nn.Linear(4, 1), nn.Flatten()),
-            r"Sequential maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one lateral velocity a window, \(64,\)",
+            r"Sequential maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one "
+            r"lateral velocity a window, \(64,\)",
         ),
     ],
 )

@@ -1,4 +1,6 @@
-"""Training through a filter: truncation, curriculum, placing, what learns in which phase, and that a killed training ends the same."""
+"""Training through a filter: truncation, curriculum, placing, what learns in which phase, and that
+a killed training ends the same.
+"""
 
 import numpy as np
 import pytest
@@ -23,13 +25,13 @@ from vehest.training.through_filter import (
 )
 
 DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
-ONE_STEP_PHASE = PhaseSettings(learning_rate=5e-3, max_epochs=3)
+SINGLE_STEP_PHASE = PhaseSettings(learning_rate=5e-3, max_epochs=3)
 THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
 def settings(**changes):
     defaults = {
-        "one_step": ONE_STEP_PHASE,
+        "one_step": SINGLE_STEP_PHASE,
         "one_step_batch": 100,
         "through": THROUGH,
         "noise": THROUGH,
@@ -51,9 +53,21 @@ def estimator(seed=0, **config):
     return learned
 
 
+def training_drives(learned):
+    """Drives of the training recordings for the filter, in double precision."""
+    return [learned.drive(recording, torch.float64) for recording in DATA.train]
+
+
+def prepared():
+    """A filter whose noise is initialised, and its training drives."""
+    learned = estimator()
+    drives(learned)
+    return learned, training_drives(learned)
+
+
 def drives(learned, steps=40):
     """Sequences, and the filter made ready for them."""
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    parts = training_drives(learned)
     learned.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
     learned.filter.begin_noise(parts, 0.0)
     return sequences_of(parts, steps)
@@ -88,9 +102,7 @@ def test_drives_are_cut_from_their_start_or_at_random_places():
 
 
 def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others():
-    learned = estimator()
-    drives(learned)
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    learned, parts = prepared()
     for placing, is_repeated in (("fixed", True), ("random", False)):
         (phase,) = phases_of(learned, parts, settings(placing=placing, start_spread=0.0))
         generator = torch.Generator().manual_seed(0)
@@ -122,9 +134,7 @@ def phases_of(learned, parts, training):
 
 
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true():
-    learned = estimator()
-    drives(learned)
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    learned, parts = prepared()
     (phase,) = phases_of(learned, parts, settings(start_spread=0.2, placing="fixed"))
     batches = list(phase.batches(torch.Generator().manual_seed(0)))
     off = torch.cat([start - batch.states[:, 0] for batch, start in batches])
@@ -133,10 +143,8 @@ def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true
     assert off[:, 4].unique().numel() == len(off)
 
 
-def test_a_share_of_sequences_is_seen_in_a_mirror():
-    learned = estimator()
-    drives(learned)
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+def test_a_share_of_sequences_is_mirrored():
+    learned, parts = prepared()
     signs = [torch.tensor(part, dtype=torch.float64) for part in learned.filter.mirror]
     for share, allowed in ((0.0, {False}), (1.0, {True}), (0.5, {False, True})):
         (phase,) = phases_of(
@@ -159,7 +167,7 @@ def test_a_share_of_sequences_is_seen_in_a_mirror():
         assert is_mirrored == allowed
 
 
-def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its_starts():
+def test_truncated_training_keeps_estimates_and_cuts_gradients():
     learned = estimator()
     sequences = drives(learned)
     results = {}
@@ -200,9 +208,9 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     ) == pytest.approx(expected, rel=1e-9)
 
 
-def test_noise_starts_where_residuals_say_or_as_given():
+def test_noise_starts_from_residuals_or_settings():
     learned = estimator(dynamics="pacejka", noise="constant")
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    parts = training_drives(learned)
     learned.filter.to(torch.float64).begin_noise(parts, 0.0)
     with torch.no_grad():
         model = learned.filter.dynamics
@@ -266,9 +274,7 @@ def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
 
 
 def test_a_curriculum_trains_on_shorter_sequences_first():
-    learned = estimator()
-    drives(learned)
-    parts = [learned.drive(recording, torch.float64) for recording in DATA.train]
+    learned, parts = prepared()
     phases = phases_of(learned, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
     assert [phase.name for phase in phases] == [
         "through_filter_10",

@@ -1,4 +1,6 @@
-"""Training: members as if alone, early stopping, checkpoints that go on to the same result, clean stops."""
+"""Training: members as if alone, early stopping, checkpoints that go on to the same result, clean
+stops.
+"""
 
 import numpy as np
 import pytest
@@ -25,6 +27,11 @@ SHAPES = [
 ]
 
 
+RUN = supervised._Run
+BATCH = supervised._Batch
+"""Classes of a training in progress, into which tests plant faults."""
+
+
 @pytest.fixture(autouse=True)
 def _looks_up_after_every_batch(monkeypatch):
     monkeypatch.setattr(supervised, "BATCHES", 1)
@@ -41,8 +48,14 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
     return members, records
 
 
+def validation_loss_of(member):
+    """Mean squared error of the lateral velocity on the validation recordings [m²/s²]."""
+    windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
+    return np.mean((member._predict(windows.series, windows.starts) - windows.targets) ** 2)
+
+
 @pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
+def test_batched_members_equal_separate_trainings_in_float64(name, config):
     settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
     together, records = _fit(name, config, [0, 1, 2, 3], settings)
     assert len({record.metrics["epochs"] for record in records}) > 1, (
@@ -67,9 +80,7 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     best = int(losses.argmin())
     assert record.metrics["best_epoch"] == best + 1
     assert len(losses) == min(best + 1 + settings.patience, settings.max_epochs)
-    windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
-    error = member._predict(windows.series, windows.starts) - windows.targets
-    assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
+    assert validation_loss_of(member) == pytest.approx(losses[best], rel=1e-9)
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
@@ -120,7 +131,7 @@ def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     assert np.array_equal(flat_weights(uninterrupted), flat_weights(resumed))
 
 
-def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error():
+def test_diverging_training_and_invalid_settings_are_clear_errors():
     for config, message in (
         ({"learning_rate": -1.0}, "learning_rate must be positive"),
         ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
@@ -137,9 +148,11 @@ def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error(
 
 
 def _plant(monkeypatch, member, bad_above, epoch=5):
-    """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger than ``bad_above``."""
-    train_epoch = supervised._Run.train_epoch
-    descend = supervised._Batch.descend
+    """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger
+    than ``bad_above``.
+    """
+    train_epoch = RUN.train_epoch
+    descend = BATCH.descend
 
     def spoilt_epoch(self):
         def spoilt_descend(batch, data, windows):
@@ -150,11 +163,11 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
             return losses
 
         with monkeypatch.context() as patch:
-            patch.setattr(supervised._Batch, "descend", spoilt_descend)
+            patch.setattr(BATCH, "descend", spoilt_descend)
             train_epoch(self)
 
-    monkeypatch.setattr(supervised._Run, "train_epoch", spoilt_epoch)
-    monkeypatch.setattr(supervised._Run, "planted", member, raising=False)
+    monkeypatch.setattr(RUN, "train_epoch", spoilt_epoch)
+    monkeypatch.setattr(RUN, "planted", member, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -179,9 +192,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     losses = np.array(records[1].history["validation_loss"])
     assert np.isnan(losses).sum() == halvings + ended
     assert metrics["best_epoch"] == np.nanargmin(losses) + 1
-    windows = windows_of(DATA.validation, spoilt[1].channels, "vy_ref", spoilt[1].settings.window)
-    error = spoilt[1]._predict(windows.series, windows.starts) - windows.targets
-    assert np.mean(error**2) == pytest.approx(np.nanmin(losses), rel=1e-5)
+    assert validation_loss_of(spoilt[1]) == pytest.approx(np.nanmin(losses), rel=1e-5)
     folders = [tmp_path / str(seed) for seed in range(3)]
     for _ in range(20):
         context = FitContext(folders, should_stop=stop_after(23))
@@ -193,7 +204,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     ):
         assert np.array_equal(flat_weights(expected), flat_weights(actual))
         np.testing.assert_equal(dict(record.history), dict(resumed_record.history))
-    monkeypatch.setattr(supervised._Run, "planted", 0)
+    monkeypatch.setattr(RUN, "planted", 0)
     (alone,), _ = _fit("ksnn", {}, [1], settings)
     assert np.array_equal(flat_weights(alone), flat_weights(spoilt[1]))
 
@@ -228,10 +239,12 @@ def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
 
 
 def _loop_with_all_its_weights(averaging):
-    """A plain loop over the same batches that keeps the weights of every step, and averages them by the closed form at each epoch's end."""
+    """A plain loop over the same batches that keeps the weights of every step, and averages them by
+    the closed form at each epoch's end.
+    """
     member = estimator_class("ksnn").from_config({"n_hidden": 1, "bias": True})
     member.seed(3)
-    network = member._seeded_network(list(DATA.train), torch.float64)
+    network = member.seeded_network(list(DATA.train), torch.float64)
     sets = [
         windows_of(part, member.channels, "vy_ref", member.settings.window)
         for part in (DATA.train, DATA.validation)
@@ -272,7 +285,7 @@ def _loop_with_all_its_weights(averaging):
     return network, losses
 
 
-def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_reach_the_optimiser():
+def test_averaged_weights_match_a_plain_loop_and_never_reach_the_optimiser():
     settings = SupervisedSettings(dtype="float64", max_epochs=4, learning_rate=1e-2, averaging=0.9)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
     network, losses = _loop_with_all_its_weights(0.9)
@@ -285,7 +298,7 @@ def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_re
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
 
 
-def test_epoch_of_some_steps_validates_after_each_of_them_and_one_of_many_is_a_pass(monkeypatch):
+def test_epochs_of_n_steps_validate_after_n_steps_within_the_pass(monkeypatch):
     steps = []
     plain_step = supervised.Adam.step
     monkeypatch.setattr(
@@ -299,8 +312,8 @@ def test_epoch_of_some_steps_validates_after_each_of_them_and_one_of_many_is_a_p
         _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=2, epoch_steps=steps_of_epoch))
         for steps_of_epoch in (0, 10_000)
     ]
-    (whole,), (many,) = (members for members, _ in passes)
-    assert np.array_equal(flat_weights(whole), flat_weights(many))
+    (full_pass,), (short_epochs,) = (members for members, _ in passes)
+    assert np.array_equal(flat_weights(full_pass), flat_weights(short_epochs))
 
 
 @pytest.mark.parametrize("compiled", [True, False])

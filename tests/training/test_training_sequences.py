@@ -1,4 +1,6 @@
-"""Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is kept, bad steps are skipped."""
+"""Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is
+kept, bad steps are skipped.
+"""
 
 import math
 from dataclasses import replace
@@ -50,7 +52,9 @@ def _phase(network, name="fit", trainable=None, loss=None, validation=None, **se
 
 
 def _two_phases(network):
-    """The read-out first, then all together, in steps so large that patience ends it after its fourth epoch, the second being the best."""
+    """The read-out first, then all together, in steps so large that patience ends it after its
+    fourth epoch, the second being the best.
+    """
     first = _phase(
         network,
         "read-out",
@@ -122,7 +126,7 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     assert torch.equal(_flat(uninterrupted), _flat(resumed))
 
 
-def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finished(tmp_path):
+def test_checkpoints_are_per_member_and_skip_finished_phases(tmp_path):
     first = _network()
     second = _network()
     records = train_phases(_two_phases(first), 3, FitContext([tmp_path]))
@@ -167,7 +171,7 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
         assert value.requires_grad
 
 
-def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
+def test_best_validation_is_selected_and_progress_counts_over_all_phases():
     network = _network()
     validated_epochs = []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
@@ -223,7 +227,9 @@ def test_adam_is_that_of_torch_bit_by_bit(decay):
 
 
 def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
-    """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
+    """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of
+    the other as it is.
+    """
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
     phase = Phase(
@@ -275,8 +281,8 @@ def test_phase_of_no_epochs_is_left_out_with_any_schedule(schedule):
     assert records[1].best_loss < records[1].start_loss
 
 
-@pytest.mark.parametrize("where", ["loss", "gradient"])
-def test_step_that_is_not_finite_is_skipped_and_counted(where):
+@pytest.mark.parametrize("fault_in", ["loss", "gradient"])
+def test_step_that_is_not_finite_is_skipped_and_counted(fault_in):
     network = _network()
     calls = 0
     parameters = []
@@ -289,7 +295,9 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
         if calls != 2:
             return good
         return (
-            good * math.nan if where == "loss" else good + torch.sqrt(network[2].bias.sum() * 0.0)
+            good * math.nan
+            if fault_in == "loss"
+            else good + torch.sqrt(network[2].bias.sum() * 0.0)
         )
 
     (record,) = train_phases([_phase(network, loss=loss, max_epochs=1)], 0, FitContext())
@@ -306,7 +314,8 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     )
     with pytest.raises(
         DataError,
-        match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate",
+        match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its "
+        r"learning_rate",
     ):
         train_phases([phase], 0, FitContext())
     network = _network()
@@ -329,18 +338,21 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
 def runs(monkeypatch):
     """Trainings that have begun, so that a planted loss can ask for the step size and the epoch."""
     begun = []
-    prepare = sequences._Run.__post_init__
+    run_type = sequences._Run
+    prepare = run_type.__post_init__
 
     def watched(self):
         begun.append(self)
         prepare(self)
 
-    monkeypatch.setattr(sequences._Run, "__post_init__", watched)
+    monkeypatch.setattr(run_type, "__post_init__", watched)
     return begun
 
 
 def _planted(network, runs, bad_above, **settings):
-    """A phase whose loss is NaN from its fifth epoch on while the step size is larger than ``bad_above``."""
+    """A phase whose loss is NaN from its fifth epoch on while the step size is larger than
+    ``bad_above``.
+    """
     phase = _phase(network, "all", max_epochs=40, learning_rate=4e-2, **settings)
 
     def loss(batch):

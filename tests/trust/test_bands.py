@@ -11,10 +11,10 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.trust.bands import (
+    CHANNEL_LEVEL,
     LEVELS,
     LOWEST_SPEED,
     OTHER_VEHICLE,
-    SHOWN_LEVEL,
     TERMS,
     Piece,
     band_inputs,
@@ -149,7 +149,7 @@ def by_numpy(bands, rows, vy, variance, *, elsewhere):
     ):
         weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
         scale = np.sqrt(np.maximum(np.square(feature) @ weights, own.floor**2))
-        half.append(scale * wider * own.factors[LEVELS.index(SHOWN_LEVEL)])
+        half.append(scale * wider * own.factors[LEVELS.index(CHANNEL_LEVEL)])
     half[1] = np.where(half[1] < math.pi, half[1], math.pi)
     return np.where(np.isfinite(vy)[:, None], np.stack(half, axis=1), np.nan)
 

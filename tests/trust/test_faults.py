@@ -203,7 +203,7 @@ def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
     [
         (("frozn", "ay"), "fault.kind 'frozn' is not there; did you mean frozen?"),
         (("bias", "yawrate"), "fault.channel 'yawrate' is not there; did you mean yaw_rate?"),
-        (("bias", "vy_ref"), "is a reference, which no estimator sees"),
+        (("bias", "vy_ref"), "is a reference, which no estimator reads"),
         (("bias", "ay", "harsh"), "fault.severity 'harsh' is not there"),
         (("sign", "vx"), "a fault 'sign' makes no sense for channel 'vx'; it is for yaw_rate, ax"),
         (("lost_wheel", "ay"), "it is for vx, wheel_speed_fl"),

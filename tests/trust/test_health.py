@@ -160,7 +160,7 @@ def test_noise_jumps_and_lost_channels_are_told():
     )
     assert (
         reason_in_words(noisy.reason[ONSET + round(RATE)])
-        == "ax jumps, or is noisier than where the model learnt"
+        == "ax jumps, or is noisier than in training"
     )
     spiky = np.array(drive["steer"])
     spiky[ONSET] += 0.1
@@ -304,7 +304,7 @@ def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_an
         HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'"
     )
     np.testing.assert_array_equal(read.packed(), model.packed())
-    assert "is sampled at 50 Hz, health is learnt at 20 Hz" in refusal(
+    assert "is sampled at 50 Hz, health was fitted at 20 Hz" in refusal(
         lambda: learn_health([measured_drive(0)], [], CHANNELS, 20.0)
     )
 

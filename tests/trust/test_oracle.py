@@ -8,7 +8,7 @@ from measured_drive import CHANNELS, RATE, measured_drive
 from refusals import refusal
 
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
-from vehest_papers.trust.oracle import filtered, known_test, learn_oracle, levels_at
+from vehest_papers.trust.oracle import filtered, learn_oracle, levels_at, signature_test
 
 COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
@@ -77,7 +77,7 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     covariance = np.array([[1.0, 0.9], [0.9, 1.0]])
     signature = np.tile([0.1, 0.0], (6000, 1))
     power = float(signature[0] @ np.linalg.solve(covariance, signature[0]))
-    test = known_test(signature, covariance)
+    test = signature_test(signature, covariance)
     delays = []
     for _ in range(200):
         above = (
@@ -102,12 +102,14 @@ def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once():
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
     seen = [
-        oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000)
+        oracle.detects(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000)
         for slope in (1e-4, 0.3, 1.0, 5.0)
     ]
-    assert [each.visible for each in seen] == [False, True, True, True]
+    assert [each.is_detectable for each in seen] == [False, True, True, True]
     assert seen[1].delay > seen[2].delay > seen[3].delay > 0.0
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     lost = np.array(drive["yaw_rate"])
     lost[2010:2020] = np.nan
-    assert oracle.sees(drive, {**drive, "yaw_rate": lost}, 2000).delay == pytest.approx(11 / RATE)
+    assert oracle.detects(drive, {**drive, "yaw_rate": lost}, 2000).delay == pytest.approx(
+        11 / RATE
+    )

@@ -1,4 +1,6 @@
-"""Dugoff's tyres and the single track on them: readable, compiled and through the filter the same, gradients finite at a slip of zero."""
+"""Dugoff's tyres and the single track on them: readable, compiled and through the filter the same,
+gradients finite at a slip of zero.
+"""
 
 import numpy as np
 import pytest
@@ -73,7 +75,7 @@ def test_braking_loads_the_front_axle():
 
 
 @BOTH_CURVES
-def test_the_compiled_track_is_the_readable_one(tyres):
+def test_compiled_track_matches_the_readable_track(tyres):
     track = dugoff_track(tyres)
     readable = TorchModel(track.transition, track.observation)
     compiled = CompiledDugoffTrack(track)
@@ -135,7 +137,10 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
 
 
 def test_a_sequence_has_the_same_digits_alone_as_beside_others():
-    """Eleven sequences fill one vector of eight and a part of another; one of them is repaired, one not measured."""
+    """Eleven sequences fill one vector of eight and a part of another.
+
+    One of them is repaired, one not measured.
+    """
     track = dugoff_track("smooth")
     count = 11
     inputs = torch.tensor([20.0, 0.05, 0.0]) + drawn(count, 6, 3) * torch.tensor([2.0, 0.03, 0.5])

@@ -1,4 +1,6 @@
-"""The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear single track."""
+"""The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear
+single track.
+"""
 
 import math
 
@@ -29,9 +31,14 @@ def car():
     )
 
 
-def rates(car, state, inputs):
+def motion_of(car, state, inputs):
+    """Rates and accelerations of the chassis on the forces of its tyres."""
     chassis, tyres = car
-    return chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads())).rates
+    return chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+
+
+def rates(car, state, inputs):
+    return motion_of(car, state, inputs).rates
 
 
 def tensor(*values):
@@ -59,7 +66,7 @@ def test_runge_kutta_is_an_independent_integrator(car):
     assert 10.0 < errors[0] / errors[1] < 24.0
 
 
-def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
+def test_rates_and_accelerations_of_a_rolling_car_match_the_equations(car):
     state = tensor(4.0, 0.0, 0.0, 4.0)
     inputs = tensor(0.0, 0.0)
     car_rates = rates(car, state, inputs)
@@ -68,10 +75,7 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     assert car_rates[1:3].abs().max() < 1e-12
     assert float(car_rates[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
     # ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1).
-    chassis, tyres = car
-    state = tensor(3.0, -0.6, 2.5, 3.4)
-    inputs = tensor(0.2, 8.0)
-    car_rates = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+    car_rates = motion_of(car, tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0))
     assert float(car_rates.ax) == pytest.approx(float(car_rates.rates[0] - 2.5 * -0.6))
     assert float(car_rates.ay) == pytest.approx(float(car_rates.rates[1] + 2.5 * 3.0))
     chassis = PlanarCar().double().requires_grad_(False)
@@ -81,7 +85,7 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     assert car_rates.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
 
 
-def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_for(car):
+def test_loads_carry_the_weight_and_curvature_parameters_are_optional(car):
     state = tensor(3.0, -0.6, 2.5, 3.4)
     inputs = tensor(0.2, 8.0)
     mirror = tensor(1.0, -1.0, -1.0, 1.0)
@@ -112,8 +116,7 @@ def test_loads_carry_the_weight_and_curvature_is_learnt_only_where_it_is_asked_f
 
 
 def test_for_small_slips_it_is_the_linear_single_track(car):
-    chassis, tyres = car
-    front, rear = (float(load) * 0.8916 * 0.8095 * 5.948 * 2.2754 for load in chassis.loads())
+    front, rear = (float(load) * 0.8916 * 0.8095 * 5.948 * 2.2754 for load in car[0].loads())
     linear = SingleTrackParameters(
         F1TENTH["mass"], 0.46, F1TENTH["wheelbase"] - 0.115, 0.115, front, rear
     )
@@ -123,9 +126,7 @@ def test_for_small_slips_it_is_the_linear_single_track(car):
     steer = 1e-3
     state = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed)
     inputs = tensor(steer, 0.0)
-    planar_motion = chassis.motion(
-        state, inputs, tyres(chassis.slips(state, inputs), chassis.loads())
-    )
+    planar_motion = motion_of(car, state, inputs)
     A, B, C, D = lateral_model(linear, np.array(speed))
     x = np.array([sideslip, yaw_rate])
     expected = A @ x + B * steer

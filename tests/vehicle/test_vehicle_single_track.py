@@ -1,4 +1,6 @@
-"""The linear single track against Newton's laws, its characteristic polynomial and the steady-state yaw gain."""
+"""The linear single track against Newton's laws, its characteristic polynomial and the steady-state
+yaw gain.
+"""
 
 import numpy as np
 import pytest
@@ -75,7 +77,7 @@ def test_forward_euler_is_first_order():
     assert lateral_model(CAR, SPEEDS.reshape(1, 3)).D.shape == (1, 3)
 
 
-def test_ferrari_is_the_published_one_and_parameters_that_make_no_car_are_refused():
+def test_ferrari_has_published_parameters_and_negative_mass_is_refused():
     assert pytest.approx(982 / 12 * (1.7**2 + 4.09**2), rel=1e-7) == CAR.yaw_inertia
     assert CAR.cg_to_front_axle + CAR.cg_to_rear_axle == pytest.approx(2.40)
     with pytest.raises(ValueError, match="mass must be positive, not -1"):

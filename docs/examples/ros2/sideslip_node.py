@@ -4,7 +4,7 @@
 
 Subscribes to ``imu`` (sensor_msgs/msg/Imu, of which yaw rate and accelerations are read, x ahead and y to the left) and ``speed``
 (geometry_msgs/msg/TwistStamped, of which linear.x is read), publishes ``sideslip`` (vehest_msgs/msg/SideslipEstimate, beside this file).
-All that knows ROS is `main`; `Samples` and `fields_of` take whatever has the fields of the messages.
+Only `main` depends on ROS; `Samples` and `fields_of` take whatever has the fields of the messages.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def fields_of(said: Mapping[str, float]) -> dict[str, Any]:
 
 
 def ahead_of(stepper: Any) -> float:
-    """How long after its sample an estimate holds [s]; negative where the filter from the bus's rate takes longer."""
+    """How long after its sample an estimate applies [s]; negative where the filter from the bus's rate takes longer."""
     return float(stepper.horizon_steps / stepper.estimator.settings.rate_hz - stepper.delay)
 
 

@@ -1,1 +1,3 @@
-"""Channels held against each other: lever arms, mounting angles, delays and offsets between them, and checks of a recording."""
+"""Channels held against each other: lever arms, mounting angles, delays and offsets between them,
+and checks of a recording.
+"""

@@ -1,14 +1,18 @@
-"""Aligns a measuring set-up with its reference: lever arm, mounting rotation, delay and offsets of the sensors, steering ratio.
+"""Aligns a measuring set-up with its reference: lever arm, mounting rotation, delay and offsets of
+the sensors, steering ratio.
 
-Only quantities that are asked for are estimated, the others count as zero. Nothing is applied: the outcome names the transforms that would.
+Only quantities that are asked for are estimated, the others count as zero. Nothing is applied: the
+outcome names the transforms that would.
 
-In the plane, with velocities v = vx + i·vy and accelerations a = ax + i·ay as complex numbers, an accelerometer at the lever l from
-the reference point, turned by ψ, late by τ and with the offset b reads
+In the plane, with velocities v = vx + i·vy and accelerations a = ax + i·ay as complex numbers, an
+accelerometer at the lever l from the reference point, turned by ψ, late by τ and with the offset b
+reads
 
-    a(t) = exp(-iψ)·(v' + i·r·v + (i·r' - r²)·l + gravity by tilt) + b,    velocities and yaw rate r taken at t - τ,
+    a(t) = exp(-iψ)·(v' + i·r·v + (i·r' - r²)·l + gravity by tilt) + b,    velocities and yaw rate r
+    taken at t - τ,
 
-and the yaw rate sensor r(t - τ) + b_r. Both sides go through the same low-pass filter, which therefore cancels. ``docs/alignment.md``
-derives it and lists its limits.
+and the yaw rate sensor r(t - τ) + b_r. Both sides go through the same low-pass filter, which
+therefore cancels. ``docs/alignment.md`` derives it and lists its limits.
 """
 
 from __future__ import annotations
@@ -66,12 +70,16 @@ READ_AS = {"rad": (180.0 / math.pi, "deg"), "s": (1e3, "ms")}
 # rad s²/m of the understeer gradient, by which real cars depart from a constant one
 UNDERSTEER_CHANGE = 3e-4
 LINKAGE_CHANGE = 0.06
-"""Standard deviation of the ratio from linkage, wheelbase and gain of the yaw rate, as a share of it.
+"""Standard deviation of the ratio from linkage, wheelbase and gain of the yaw rate, as a share of
+it.
 
-Five recordings of two cars whose slow corners determine the ratio best (DevBot, Audi TTS) are 8 to 9 % off.
+Five recordings of two cars whose slow corners determine the ratio best (DevBot, Audi TTS) are 8 to
+9 % off.
 """
 STEERING_CUTOFF = 0.25
-"""Cut-off of the steering's regression as a part of the other one: only slow steering obeys the steady-state relation."""
+"""Cut-off of the steering's regression as a part of the other one: only slow steering obeys the
+steady-state relation.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +107,8 @@ class Residual:
 
     channel: str
     unit: str
-    # ``before`` as recorded, ``after`` once the transforms have been applied, ``rest`` without the part that follows the accelerations, as
+    # ``before`` as recorded, ``after`` once the transforms have been applied, ``rest`` without the
+    # part that follows the accelerations, as
     # roll and pitch do, NaN where not fitted
     rms: Mapping[str, float]
 
@@ -138,8 +147,8 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     Parameters
     ----------
     recording : Recording
-        With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio; with
-        ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
+        With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio;
+        with ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
     settings : AlignmentSettings
 
     Raises
@@ -192,7 +201,9 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
 def _parameter(
     name: str, value: float, scatter: float, tilt: float, freedom: int, model: float = 0.0
 ) -> Parameter:
-    """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch and Satterthwaite (GUM, G.4.1)."""
+    """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch
+    and Satterthwaite (GUM, G.4.1).
+    """
     uncertainty = math.hypot(scatter, tilt, model)
     effective = freedom * (uncertainty / scatter) ** 4 if scatter > 0 else math.inf
     half = uncertainty * float(
@@ -265,18 +276,21 @@ def _imu_notes(
         )
         notes.append(
             "The residuals suggest values other than zero for quantities that were not requested, "
-            f"each fitted alone: {suspected}. If they are requested too, the other estimates may change."
+            f"each fitted alone: {suspected}. If they are requested too, the other estimates may "
+            "change."
         )
     unproven = [
         parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high
     ]
     if unproven:
         notes.append(
-            f"The 95 % interval of {listed(unproven)} contains zero: this drive does not justify a correction."
+            f"The 95 % interval of {listed(unproven)} contains zero: this drive does not justify a "
+            "correction."
         )
     if signals.speed == "vx":
         notes.append(
-            "No vx_ref: vx is used as the reference's forward velocity and assumed to be synchronous with it."
+            "No vx_ref: vx is used as the reference's forward velocity and assumed to be "
+            "synchronous with it."
         )
     if signals.reference_rate is None:
         notes.append(
@@ -289,13 +303,13 @@ def _imu_notes(
             for name in ("offset_ax", "offset_ay")
         )
         notes.append(
-            "The offsets of ax and ay cannot be distinguished from a mounting pitch of {:.2f}° and roll of {:.2f}°.".format(
-                *angles
-            )
+            "The offsets of ax and ay cannot be distinguished from a mounting pitch of {:.2f}° and "
+            "roll of {:.2f}°.".format(*angles)
         )
     if signals.gravity is not None:
         notes.append(
-            "For this estimate, gravity is subtracted from the accelerations by the measured roll and pitch."
+            "For this estimate, gravity is subtracted from the accelerations by the measured roll "
+            "and pitch."
         )
     if settings.tilt > 0:
         gains = (
@@ -303,7 +317,8 @@ def _imu_notes(
         )
         notes.append(
             f"Gain error relative to the reference's acceleration: {gains}, from gravity in the "
-            "pitching and rolling body (1 % is 0.57° at 1 g) or a scale error. No transform corrects it."
+            "pitching and rolling body (1 % is 0.57° at 1 g) or a scale error. No transform "
+            "corrects it."
         )
     return notes
 
@@ -311,7 +326,8 @@ def _imu_notes(
 def _align_steering(
     recording: Recording, settings: AlignmentSettings
 ) -> tuple[list[Parameter], dict[str, Any], str]:
-    """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives calmly.
+    """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives
+    calmly.
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
     """
@@ -381,7 +397,10 @@ def _align_steering(
     ]
     by_scatter = _parameter(names[0], ratio, float(scatter[0]), 0.0, blocks - 1)
     if by_scatter.low <= 0.0 <= by_scatter.high:
-        problem = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
+        problem = (
+            f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± "
+            f"{scatter[0]:.2g})"
+        )
         raise DataError(
             f"recording '{recording.id}': {problem}; check its sign, or use a drive with slow turns"
         )
@@ -391,7 +410,10 @@ def _align_steering(
         "offset": _rounded(offset),
         "channel": source,
     }
-    ratio_of = f"Steering ratio of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
+    ratio_of = (
+        f"Steering ratio of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase "
+        f"{settings.wheelbase:g} m"
+    )
     limits = f"vx ≥ {settings.min_speed:g} m/s, |ay| ≤ {settings.max_ay:g} m/s²"
     note = f"{ratio_of}, from {seconds:.0f} s ({limits}); residual {rms(error):.2g} rad RMS."
     return estimates, transform, note
@@ -400,8 +422,9 @@ def _align_steering(
 def _error_of_constant_understeer(columns: FloatArray, speed: FloatArray, ratio: float) -> float:
     """Standard error of a ratio whose fit takes the understeer gradient as constant.
 
-    Curvature and lateral acceleration are nearly proportional at one speed, so that an understeer gradient
-    that changes by `UNDERSTEER_CHANGE` with a standard deviation of the speed, or of |ay|, passes for a ratio.
+    Curvature and lateral acceleration are nearly proportional at one speed, so that an understeer
+    gradient that changes by `UNDERSTEER_CHANGE` with a standard deviation of the speed, or of |ay|,
+    passes for a ratio.
 
     Parameters
     ----------

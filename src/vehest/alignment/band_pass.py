@@ -1,4 +1,6 @@
-"""A Butterworth band-pass without phase: the design and the recursion of scipy.signal, which takes a second to import."""
+"""A Butterworth band-pass without phase: the design and the recursion of scipy.signal, which takes
+a second to import.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,11 @@ EXTENSION = 15  # samples added at both ends by odd reflection
 
 
 def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArray:
-    """Sections of a band-pass of order 2 x 2, (2, 5): b₀, b₁, b₂, a₁, a₂ each, the lower poles last.
+    """Sections of a band-pass of order 2 x 2, (2, 5): b₀, b₁, b₂, a₁, a₂ each, the lower poles
+    last.
 
-    Source: Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.3 (bilinear transformation).
+    Source: Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.3 (bilinear
+    transformation).
     """
     low, high = 4.0 * np.tan(np.pi * np.array([low_hz, high_hz]) / rate_hz)
     half = (
@@ -33,7 +37,7 @@ def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArra
 
 
 def without_phase(sections: FloatArray, samples: FloatArray) -> FloatArray:
-    """Samples (T,), T > 15, filtered forwards, then backwards, from a steady state at either end."""
+    """Samples (T,), T > 15, filtered forwards, then backwards, from a steady state each."""
     extended = np.pad(samples, EXTENSION, mode="reflect", reflect_type="odd")
     for _ in range(2):
         extended = _filtered(sections, extended)[::-1].copy()

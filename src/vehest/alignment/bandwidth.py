@@ -24,10 +24,11 @@ MAX_SINGLE_STEP_SHARE = 0.5
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
-    """Channels that follow others as a first-order low-pass does: name -> signal that it was compared with, lag.
+    """Channels that follow others as a first-order low-pass does: name -> signal that it was
+    compared with, lag.
 
-    Where ay and yaw rate are held against each other, one that is low-passed makes the other lead; the one whose phase is explained better
-    is named.
+    Where ay and yaw rate are held against each other, one that is low-passed makes the other lead;
+    the one whose phase is explained better is named.
     """
     lateral = f"d({motion.velocity})/dt"
     together = {"ay": {"ay": 1.0}, "lateral": {"turning": 1.0, "sliding": 1.0}}
@@ -67,12 +68,15 @@ def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | Non
 def low_pass_findings(
     motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]
 ) -> list[Finding]:
-    """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held against."""
+    """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held
+    against.
+    """
     findings = []
     for channel, (text, lag) in slow.items():
         message = (
             f"low-passed: it lags {text} like a first-order low-pass with a time constant of "
-            f"{_seconds(lag.time_constant)}; use it only with an estimator trained on it, or leave it out"
+            f"{_seconds(lag.time_constant)}; use it only with an estimator trained on it, or leave "
+            "it out"
         )
         findings.append(Finding("warning", "bandwidth", channel, message))
     steered = (
@@ -99,7 +103,9 @@ def _seconds(measured: Measured) -> str:
 
 
 def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
-    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate make one finding."""
+    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of
+    one rate make one finding.
+    """
     names_by_rate: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
         rate = update_rate_hz(samples[moving], recording.rate_hz)
@@ -128,8 +134,8 @@ def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding
 def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:
     """How often a held channel, (T,), really changes [1/s]; None if it is not held.
 
-    A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does so too while it moves slowly, but
-    by one quantum at a time.
+    A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does
+    so too while it moves slowly, but by one quantum at a time.
     """
     steps = np.diff(samples[np.isfinite(samples)])
     changes = np.flatnonzero(steps)

@@ -85,7 +85,9 @@ def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
 
 
 def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
-    """Findings in the parts of a drive, the gravest first: of each level, check and channel those of the first part that has any."""
+    """Findings in the parts of a drive, the gravest first: of each level, check and channel those
+    of the first part that has any.
+    """
     merged: list[Finding] = []
     for part in parts:
         earlier = {(finding.level, finding.check, finding.channel) for finding in merged}
@@ -118,7 +120,8 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
     for finding in findings:
         if finding.level == "error" and finding.check not in accepted:
             raise DataError(
-                f"{place}: channel '{finding.channel}': {finding.message} (to accept it: dataset.accept=[{finding.check}])"
+                f"{place}: channel '{finding.channel}': {finding.message} (to accept it: "
+                f"dataset.accept=[{finding.check}])"
             )
     return findings
 
@@ -146,7 +149,9 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
-    """Channels that planar motion ties together: signs and units first, the rest with these put right."""
+    """Channels that planar motion ties together: signs and units first, the rest with these put
+    right.
+    """
     motion = motion_of(recording, moving)
     if not motion.moving.any():
         return []
@@ -225,7 +230,9 @@ def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
-    """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
+    """Values that stay the same for long while the car moves; at standstill nothing needs to
+    change.
+    """
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
         measured = np.flatnonzero(~np.isnan(samples))
@@ -260,12 +267,15 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
                 "stuck",
                 name,
                 f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s "
-                f"from t = {time:.12g} s while the car moves; check the sensor, or exclude this range",
+                f"from t = {time:.12g} s while the car moves; check the sensor, or exclude this "
+                "range",
             )
 
 
 def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
-    """Samples that pile up at the highest or lowest value, again and again, far more often than at the value next to it."""
+    """Samples that pile up at the highest or lowest value, again and again, far more often than at
+    the value next to it.
+    """
     for name, samples in recording.channels.items():
         measured = samples[np.isfinite(samples) & moving]
         lowest, highest = (
@@ -334,7 +344,8 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             unit = CHANNELS[name].unit
             message = (
                 f"{len(spikes)} spike{'s' if len(spikes) > 1 else ''} of at most "
-                f"{SPIKE_SECONDS:g} s far outside the usual range ({low:.4g} to {high:.4g} {unit}), "
+                f"{SPIKE_SECONDS:g} s far outside the usual range ({low:.4g} to {high:.4g} "
+                f"{unit}), "
                 f"the largest {samples[at]:.4g} {unit} at t = {recording.time[at]:.12g} s; "
                 "mark these samples as missing, or exclude them"
             )
@@ -342,7 +353,9 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Straight ahead the steering angle must be about zero: its median where a moving car hardly turns."""
+    """Straight ahead the steering angle must be about zero: its median where a moving car hardly
+    turns.
+    """
     if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
         return
     straight = (
@@ -369,9 +382,11 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard.
+    """A wheel that shows next to nothing beside the other three while the car neither stands nor
+    brakes hard.
 
-    On slippery roads wheels lock under gentle braking too; without a channel of the brakes that looks like a dropout.
+    On slippery roads wheels lock under gentle braking too; without a channel of the brakes that
+    looks like a dropout.
     """
     if not {"vx", *WHEELS} <= set(recording.channels):
         return
@@ -409,15 +424,19 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         message = (
             f"reversing in {len(runs)} segment{'s' if len(runs) > 1 else ''} "
             f"(below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
-            f"{_longest(runs, recording)}, minimum {lowest:.3g} m/s; most estimators assume forward "
-            "driving: exclude the range (start and stop in the split), or set sign: -1 for the speed "
+            f"{_longest(runs, recording)}, minimum {lowest:.3g} m/s; most estimators assume "
+            "forward "
+            "driving: exclude the range (start and stop in the split), or set sign: -1 for the "
+            "speed "
             "if the car drove forwards"
         )
         yield Finding("note", "reverse", speed, message)
 
 
 def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """A positive speed while the reference goes backwards, or while ay and steering both oppose the yaw rate for a part of the drive."""
+    """A positive speed while the reference goes backwards, or while ay and steering both oppose the
+    yaw rate for a part of the drive.
+    """
     angle = next((name for name in ("steer", "handwheel") if name in recording), "")
     if "vx" not in recording or (
         "vx_ref" not in recording and not {"yaw_rate", "ay", angle} <= set(recording.channels)

@@ -1,7 +1,8 @@
 """Delays between channels that must agree: which is late, by how much, and how surely.
 
-Three accelerations are tied together, ay = vx·yaw_rate + d(vy)/dt, and two by two: ax and d(vx)/dt, a channel and its reference,
-wheels and the speed. A delay is reported where its whole 95 % interval lies beyond 15 ms.
+Three accelerations are tied together, ay = vx·yaw_rate + d(vy)/dt, and two by two: ax and d(vx)/dt,
+a channel and its reference, wheels and the speed. A delay is reported where its whole 95 % interval
+lies beyond 15 ms.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from vehest.data.recording import Recording
 
 MIN_PHASE_SHARE = 0.97  # share of the phase that a delay must explain
 SPEEDS_WITH_SLIP = frozenset({"vx", "motor_speed", "wheel speeds"})
-"""Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead and never lag."""
+"""Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead
+and never lag.
+"""
 MAX_HALF_WIDTH_SECONDS = 0.05  # s; a delay that is known no better is not known
 CHANNELS_OF_SIGNAL = {"wheel speeds": WHEELS}
 
@@ -105,7 +108,9 @@ def spectra_of(motion: Motion) -> CrossSpectra | None:
 def delays_of(
     motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()
 ) -> list[Delay]:
-    """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed channels."""
+    """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed
+    channels.
+    """
     delays: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
         delays += _lateral(motion)
@@ -190,7 +195,8 @@ def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
 def _late(delays: Sequence[Delay]) -> list[Late]:
     """Channels that are later than another; what lags is taken to be late, not the other early.
 
-    The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
+    The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref
+    is not late behind vy_ref.
     """
     reported = [
         delay
@@ -232,8 +238,8 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
             for name, ms, low, high in intervals
         )
         text = (
-            f"delayed{', like the other wheels,' if channel in CHANNELS_OF_SIGNAL else ''} by {figures}"
-            + (f" (from {signals})" if signals else "")
+            f"delayed{', like the other wheels,' if channel in CHANNELS_OF_SIGNAL else ''} by "
+            f"{figures}" + (f" (from {signals})" if signals else "")
         )
         if [delay.against for delay in delays_of_channel] == ["vx"]:
             text += ", unless vx is a wheel speed, which leads by its slip"

@@ -1,6 +1,7 @@
 """Estimates lever arm, mounting, delay and offsets of the inertial unit.
 
-recording -> Signals, low-passed -> ImuModel: prediction and derivatives -> most likely Fit -> uncertainties -> ImuFit
+recording -> Signals, low-passed -> ImuModel: prediction and derivatives -> most likely Fit ->
+uncertainties -> ImuFit
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ ComplexArray = NDArray[np.complex128]
 IMU_CHANNELS = ("ax", "ay", "yaw_rate")
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
-TILT_GAIN = 0.1  # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g
+# prior standard deviation of the part of an acceleration that gravity adds through roll or pitch;
+# 0.1 is 5.8° at 1 g
+TILT_GAIN = 0.1
 # assumed correlation of the remaining tilt of body and road with the effect of a parameter
 TILT_LIKENESS = 0.3
 
@@ -91,7 +94,9 @@ class ImuFit:
 
 
 def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
-    """Fit some of `IMU_PARAMETERS` to a drive; the others are zero. Needs and errors are those of `vehest.alignment.align.align`."""
+    """Fit some of `IMU_PARAMETERS` to a drive; the others are zero. Needs and errors are those of
+    `vehest.alignment.align.align`.
+    """
     signals = signals_of(recording, settings)
     model = ImuModel(signals)
     start = dict(NOTHING)
@@ -118,7 +123,8 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     _require_identified(signals, fit, names, noise)
     if "delay" in names and abs(fit.values["delay"]) > settings.max_delay:
         raise DataError(
-            f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay"
+            f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise "
+            "max_delay"
         )
     blocks = n_blocks(signals.duration)
     columns = model(fit.values)[1]
@@ -149,9 +155,8 @@ class Signals:
     velocity: ComplexArray  # vx + i·vy of the reference, (T,)
     gyro: FloatArray  # yaw rate of the sensor, (T,)
     reference_rate: FloatArray | None  # yaw rate of the reference if there is one, (T,)
-    gravity: (
-        ComplexArray | None
-    )  # in the accelerometer by measured roll and pitch; None where they are not measured or not used, (T,)
+    # in the accelerometer by roll and pitch; None where they are not measured or not used, (T,)
+    gravity: ComplexArray | None
     smoothing: Smoothing
     margin: int  # samples at either end that serve filtering and shifting only
 
@@ -175,7 +180,9 @@ class Signals:
         return self.smoothing(samples, order, margin=self.margin)
 
     def as_rows(self, plane: ComplexArray, turn: FloatArray | None = None) -> FloatArray:
-        """A complex signal, and a real one where the yaw rate is compared too, as rows of shape (C, T)."""
+        """A complex signal, and a real one where the yaw rate is compared too, as rows of shape (C,
+        T).
+        """
         rows = [plane.real, plane.imag]
         if self.reference_rate is not None:
             rows.append(np.zeros(len(plane)) if turn is None else turn)
@@ -183,11 +190,14 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Signals of a recording; raises `DataError` where one is missing, short or has gaps, `ConfigurationError` for too high a cut-off."""
+    """Signals of a recording; raises `DataError` where one is missing, short or has gaps,
+    `ConfigurationError` for too high a cut-off.
+    """
     quantities = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
         raise DataError(
-            f"recording '{recording.id}' has no channel 'vy_ref', the reference that {quantities} require"
+            f"recording '{recording.id}' has no channel 'vy_ref', the reference that {quantities} "
+            "require"
         )
     speed = "vx_ref" if "vx_ref" in recording else "vx"
     optional = [name for name in ("yaw_rate_ref", "roll", "pitch") if name in recording]
@@ -348,7 +358,9 @@ class Fit:
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
-    """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no delay of its own."""
+    """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no
+    delay of its own.
+    """
     v = signals.velocity
     gyro = signals.gyro
 
@@ -392,13 +404,18 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
 def _require_peak(
     recording: Recording, correlation: Correlation, settings: AlignmentSettings
 ) -> None:
-    """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that are searched."""
+    """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that
+    are searched.
+    """
     if correlation.highest < MIN_CORRELATION:
         problem = (
             f"the {correlation.signal} of sensor and reference has a correlation of at most "
             f"{correlation.highest:.2f} (required: {MIN_CORRELATION:g})"
         )
-        fix = f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
+        fix = (
+            "check units, signs and channels (vehest data check), or raise max_delay "
+            f"({settings.max_delay:g} s)"
+        )
         raise DataError(f"recording '{recording.id}': {problem}; {fix}")
     if correlation.at_end:
         raise DataError(
@@ -410,7 +427,9 @@ def _require_peak(
 def _most_likely(
     model: ImuModel, start: Mapping[str, float], names: Sequence[str], requested: Sequence[str]
 ) -> Fit:
-    """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the mean square of its own residuals."""
+    """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the
+    mean square of its own residuals.
+    """
     prior = np.diag([TILT_PRIOR[name] ** -2 if name in TILT_PRIOR else 0.0 for name in names])
 
     def fit_at(values: Mapping[str, float]) -> Fit:
@@ -438,19 +457,23 @@ def _most_likely(
             return fit
     fix = f"request fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
     raise DataError(
-        f"recording '{model.signals.recording.id}': the estimate of {listed(requested)} does not converge; {fix}"
+        f"recording '{model.signals.recording.id}': the estimate of {listed(requested)} does not "
+        f"converge; {fix}"
     )
 
 
 def require_condition(
     recording: Recording, information: FloatArray, names: Sequence[str], requested: Sequence[str]
 ) -> None:
-    """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number of the scaled problem is too large."""
+    """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number
+    of the scaled problem is too large.
+    """
     scale = np.sqrt(np.diag(information))
     silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
     if silent:
         raise DataError(
-            f"recording '{recording.id}': no signal depends on {listed(silent)}; the drive needs turning and accelerating"
+            f"recording '{recording.id}': no signal depends on {listed(silent)}; the drive needs "
+            "turning and accelerating"
         )
     condition = condition_of(information)
     if condition <= MAX_CONDITION:
@@ -470,7 +493,9 @@ def require_condition(
 
 
 def condition_of(information: FloatArray) -> float:
-    """Condition number of a least-squares problem whose columns are scaled to length 1; infinite where one is zero."""
+    """Condition number of a least-squares problem whose columns are scaled to length 1; infinite
+    where one is zero.
+    """
     scale = np.sqrt(np.diag(information))
     values = (
         np.linalg.eigvalsh(information / scale / scale[:, None]) if scale.all() else np.zeros(1)
@@ -479,7 +504,8 @@ def condition_of(information: FloatArray) -> float:
 
 
 def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]:
-    """Standard deviation of the noise in the derivatives by each parameter, for ax, ay and yaw rate.
+    """Standard deviation of the noise in the derivatives by each parameter, for ax, ay and yaw
+    rate.
 
     It is that of the reference and of the yaw rate, taken as white.
     """
@@ -513,7 +539,9 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
 
 
 def _is_above_noise(column: FloatArray, noise: tuple[float, float, float]) -> bool:
-    """Whether an effect varies enough to be separated from noise; where it does not, it counts as an uncertainty only."""
+    """Whether an effect varies enough to be separated from noise; where it does not, it counts as
+    an uncertainty only.
+    """
     return sum(size**2 for size in noise) <= MAX_NOISE_SHARE * float(column.var(axis=1).sum())
 
 
@@ -523,7 +551,9 @@ def _require_identified(
     requested: Sequence[str],
     noise: Mapping[str, tuple[float, float, float]],
 ) -> None:
-    """Refuse parameters whose column, without the share of the others, does not stand well above the noise of yaw rate and reference."""
+    """Refuse parameters whose column, without the share of the others, does not stand well above
+    the noise of yaw rate and reference.
+    """
     unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(requested), : len(requested)]))
     for index, name in enumerate(requested):
         share = (
@@ -532,7 +562,10 @@ def _require_identified(
             / unique[index]
         )
         if share > MAX_NOISE_SHARE:
-            problem = f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most {100 * MAX_NOISE_SHARE:g} %)"
+            problem = (
+                f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most "
+                f"{100 * MAX_NOISE_SHARE:g} %)"
+            )
             fix = f"lower the cut-off, or use a drive with {MORE_MOTION}"
             raise DataError(
                 f"recording '{signals.recording.id}': {name} cannot be estimated: {problem}; {fix}"
@@ -548,7 +581,10 @@ def require_length(recording: Recording, usable: float, lost: float) -> None:
     """Refuse, by a `DataError`, what is too short for an uncertainty."""
     min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
     if usable < min_seconds:
-        requirement = f"an uncertainty needs at least {min_seconds + lost:.3g} s, of which {lost:.2g} s for filtering and shifting"
+        requirement = (
+            f"an uncertainty needs at least {min_seconds + lost:.3g} s, of which {lost:.2g} s for "
+            "filtering and shifting"
+        )
         raise DataError(
             f"recording '{recording.id}' lasts {recording.duration:.3g} s; {requirement}"
         )
@@ -562,11 +598,12 @@ def n_blocks(seconds: float) -> int:
 def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     """Covariance of the parameters (P, P), from leaving out one block of time after another.
 
-    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. Parameters
-    with a prior vary as the prior does.
+    Residuals remember for seconds; blocks that are longer than that are nearly independent,
+    whatever the residuals' spectrum. Parameters with a prior vary as the prior does.
 
-    Source: Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
-    232 (2), 2023, section 3; blocks of a time series as clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
+    Source: Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to
+    empirical practice, Journal of Econometrics 232 (2), 2023, section 3; blocks of a time series as
+    clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
     """
     information = fit.information
     edges = np.linspace(0, fit.error.shape[1], blocks + 1).astype(int)
@@ -587,9 +624,10 @@ def _uncertainties(
 ) -> tuple[FloatArray, FloatArray]:
     """Standard uncertainties of the parameters by scatter and by tilt, (P,) each.
 
-    Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving, or following the accelerations where
-    that is not fitted, and of the road. The slow part of the residuals shows how much the road tilts; that it looks like the
-    effect of a parameter is assumed.
+    Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving,
+    or following the accelerations where that is not fitted, and of the road. The slow part of the
+    residuals shows how much the road tilts; that it looks like the effect of a parameter is
+    assumed.
     """
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
     if tilt == 0.0:
@@ -623,7 +661,9 @@ def _suspects(
     columns: Mapping[str, FloatArray],
     uncertainties: Callable[[Fit], tuple[FloatArray, FloatArray]],
 ) -> dict[str, tuple[float, float]]:
-    """Parameters that are no part of the fit and that one more step would move by more than three standard uncertainties."""
+    """Parameters that are no part of the fit and that one more step would move by more than three
+    standard uncertainties.
+    """
     suspects = {}
     for name in [name for name in IMU_PARAMETERS if name not in fit.names]:
         names = [*fit.names, name]
@@ -644,13 +684,17 @@ def _suspects(
 
 
 def _likened(pull: FloatArray, size: float | FloatArray) -> FloatArray:
-    """Variance of each parameter (P, axes) by an error of that size that resembles its effect to the assumed degree."""
+    """Variance of each parameter (P, axes) by an error of that size that resembles its effect to
+    the assumed degree.
+    """
     return pull.shape[2] * np.square(pull).sum(axis=2) * np.square(TILT_LIKENESS * size)
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Low-passing by a Gaussian kernel, whose derivatives differentiate; of the output as many samples are kept as its band needs."""
+    """Low-passing by a Gaussian kernel, whose derivatives differentiate; of the output as many
+    samples are kept as its band needs.
+    """
 
     deviation: float  # of the kernel [samples]
     rate_hz: float  # of the input
@@ -668,7 +712,9 @@ class Smoothing:
     def __call__(
         self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0
     ) -> NDArray[Any]:
-        """A derivative of the low-passed samples (T,), real or complex, from ``margin`` (at least the reach) to as many before the end."""
+        """A derivative of the low-passed samples (T,), real or complex, from ``margin`` (at least
+        the reach) to as many before the end.
+        """
         if np.iscomplexobj(samples):  # faster than a real kernel on complex samples
             ahead, aside = (
                 self(part, order, margin=margin, step=step) for part in (samples.real, samples.imag)
@@ -687,7 +733,9 @@ class Smoothing:
         return smooth[first : first + count]
 
     def kernel(self, order: int) -> FloatArray:
-        """Impulse response of a derivative of the low-pass; its norm is the deviation that white noise of deviation 1 has after it."""
+        """Impulse response of a derivative of the low-pass; its norm is the deviation that white
+        noise of deviation 1 has after it.
+        """
         impulse = np.zeros(2 * self.reach + 1)
         impulse[self.reach] = 1.0
         kernel = gaussian_filter1d(
@@ -697,15 +745,21 @@ class Smoothing:
 
 
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
-    """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to be sampled, or longer than the limit."""
+    """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to
+    be sampled, or longer than the limit.
+    """
     length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
-    subject = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
+    subject = (
+        f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} "
+        "samples"
+    )
     check_limit("filter_samples", length, subject, ConfigurationError)
     limit = MAX_CUTOFF_SHARE * recording.rate_hz
     if cutoff_hz > limit:
         fix = f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
         raise ConfigurationError(
-            f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for {recording.rate_hz:g} Hz; {fix}"
+            f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for "
+            f"{recording.rate_hz:g} Hz; {fix}"
         )
     return Smoothing(_deviation(cutoff_hz, recording.rate_hz), recording.rate_hz)
 
@@ -715,7 +769,8 @@ def require_complete(recording: Recording, names: Sequence[str], quantities: str
     for name in names:
         if np.isnan(recording[name]).any():
             raise DataError(
-                f"recording '{recording.id}': channel '{name}' has gaps; select a range without gaps to estimate {quantities}"
+                f"recording '{recording.id}': channel '{name}' has gaps; select a range without "
+                f"gaps to estimate {quantities}"
             )
 
 

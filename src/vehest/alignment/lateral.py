@@ -34,14 +34,18 @@ MIN_RESIDUAL_SHARE = 1e-6  # of the power of ay; nothing is known better
 
 
 def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | None:
-    """Lateness of yaw rate and of lateral velocity against ay, and of the former against the latter [s].
+    """Lateness of yaw rate and of lateral velocity against ay, and of the former against the latter
+    [s].
 
-        ay(t) = g·(vx·yaw_rate(t + τ₁) + d(vy)/dt(t + τ₂)) + x·d(yaw_rate)/dt(t + τ₁) + y·d(vx)/dt·yaw_rate(t + τ₁)
+        ay(t) = g·(vx·yaw_rate(t + τ₁) + d(vy)/dt(t + τ₂)) + x·d(yaw_rate)/dt(t + τ₁) +
+        y·d(vx)/dt·yaw_rate(t + τ₁)
 
-    Delays, the gain g that roll lets in, the lever arm x and the lateness y of vx are fitted together. At one speed a lever arm looks as a
-    delay of the yaw rate does; varying speed tells them apart. One gain serves both accelerations, so that noise of the differentiated
-    velocity shrinks neither. Bins have the weight that the residual leaves them. Channels are shifted and fitted again until
-    next to nothing is left, since turning the phase of a segment does not shift its ends.
+    Delays, the gain g that roll lets in, the lever arm x and the lateness y of vx are fitted
+    together. At one speed a lever arm looks as a delay of the yaw rate does; varying speed tells
+    them apart. One gain serves both accelerations, so that noise of the differentiated velocity
+    shrinks neither. Bins have the weight that the residual leaves them. Channels are shifted and
+    fitted again until next to nothing is left, since turning the phase of a segment does not shift
+    its ends.
 
     Returns
     -------
@@ -128,7 +132,9 @@ def _weighted(
 def _fit(
     spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, start: tuple[float, float]
 ) -> tuple[tuple[float, float], FloatArray, float] | None:
-    """Gauss-Newton: both delays, the power of the residual (F,), and the share of it that d(vy)/dt took away."""
+    """Gauss-Newton: both delays, the power of the residual (F,), and the share of it that d(vy)/dt
+    took away.
+    """
     turning, sliding = start
     for _ in range(N_STEPS):
         p = np.exp(1j * omega * turning)

@@ -21,10 +21,12 @@ MIN_BLOCKS = 6
 
 
 def lateral_offset(motion: Motion) -> Measured | None:
-    """The constant c of ay - d(vy)/dt = c + g·vx·yaw_rate over the drive [m/s²], with its interval from blocks of time.
+    """The constant c of ay - d(vy)/dt = c + g·vx·yaw_rate over the drive [m/s²], with its interval
+    from blocks of time.
 
-    The gain g holds the gravity that roll lets in, which is no offset in a drive of left turns only. Without a lateral velocity its
-    derivative counts as nil, which its mean is in any drive that is not short.
+    The gain g holds the gravity that roll lets in, which is no offset in a drive of left turns
+    only. Without a lateral velocity its derivative counts as nil, which its mean is in any drive
+    that is not short.
     """
     settled = settled_samples(motion)
     if settled is None or not motion.speed or not {"ay", "yaw_rate"} <= set(motion.channels):

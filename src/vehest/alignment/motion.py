@@ -22,7 +22,9 @@ class Motion:
 
     rate_hz: float  # sampling rate
     channels: dict[str, FloatArray]  # name -> samples without gaps, (T,)
-    speed: str  # channel of the forward velocity: the reference's own before one that wheels slip; empty if there is none
+    # channel of the forward velocity: the reference's own before one that wheels slip; empty if
+    # there is none
+    speed: str
     velocity: str  # channel of the lateral velocity; empty if there is none
     moving: BoolArray  # where the car does not stand, (T,)
 
@@ -64,7 +66,7 @@ class Motion:
 
     @property
     def forward(self) -> FloatArray:
-        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
+        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, this where it is known [m/s²], (T,)."""
         gained = self.derivative(self.vx)
         return (
             gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
@@ -108,7 +110,9 @@ class Motion:
 
 
 def motion_of(recording: Recording, moving: BoolArray) -> Motion:
-    """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``: where the car does not stand."""
+    """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``:
+    where the car does not stand.
+    """
     channels = {
         name: complete
         for name in recording.channels

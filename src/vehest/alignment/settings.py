@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from vehest.data.errors import ConfigurationError
 
 TILT_LAG_GAIN = 0.005
-"""Prior standard deviation of the part of an acceleration's derivative that gravity adds through roll or pitch [s].
+"""Prior standard deviation of the part of an acceleration's derivative that gravity adds through
+roll or pitch [s].
 
 The body follows late, say 0.1 times 50 ms.
 """
@@ -29,12 +30,16 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Quantities to estimate, and how. Raises `ConfigurationError`: nothing or something unknown is asked for, or a value is wrong."""
+    """Quantities to estimate, and how. Raises `ConfigurationError`: nothing or something unknown is
+    asked for, or a value is wrong.
+    """
 
     estimate: tuple[str, ...]  # names in `QUANTITIES`
     cutoff_hz: float | None = None  # of the low-pass that both sides go through [Hz]; `cutoff_at`
     max_delay: float = 0.5  # largest delay that is looked for, either way [s]
-    tilt: float = 0.001  # standard deviation of roll and pitch beside those that follow the accelerations [rad]; 0: levelled
+    # standard deviation of roll and pitch beside those that follow the accelerations [rad]; 0:
+    # levelled
+    tilt: float = 0.001
     wheelbase: float | None = None  # needed for the steering ratio [m]
     steering_channel: str | None = (
         None  # of the steering ratio; by default ``handwheel``, or ``steer`` where there is none
@@ -59,7 +64,7 @@ class AlignmentSettings:
             )
 
     def cutoff_at(self, rate_hz: float) -> float:
-        """-3 dB frequency of the low-pass [Hz]: as set, or 2 Hz, or what a rate below 23 Hz allows."""
+        """-3 dB frequency of the low-pass [Hz]: as set, 2 Hz, or what a rate below 23 Hz allows."""
         if self.cutoff_hz is not None:
             return self.cutoff_hz
         return min(DEFAULT_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz)

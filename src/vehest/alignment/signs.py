@@ -1,4 +1,4 @@
-"""Signs and units: products of channels that contradict each other, and the channel that is wrong."""
+"""Signs and units: products of channels that contradict each other, and which one is wrong."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ ALTERNATIVE_UNITS = {
     **dict.fromkeys(("yaw_rate", "yaw_rate_ref"), (DEGREES_PER_RADIAN, "deg/s", "rad/s")),
     "sideslip_ref": (DEGREES_PER_RADIAN, "deg", "rad"),
 }
-"""Channel -> factor by which its values are too large in a wrong unit, that unit, and the SI unit."""
+"""Channel -> factor by which its values are too large in a wrong unit, that unit, and the SI unit.
+"""
 # units that stop an ingest: no estimator survives them
 UNSAFE = {
     "yaw_rate": "deg/s",
@@ -59,7 +60,8 @@ class Relation:
     powers: tuple[int, ...]  # of each channel in left over right, 1 or -1
     scale: float  # left over right
     correlation: float
-    tolerance: float = SCALE_TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
+    # factor within which they must be equal; infinite where only the sign counts
+    tolerance: float = SCALE_TOLERANCE
     least_correlation: float = MIN_SCALE_CORRELATION  # below which the scale is unknown
 
     @property
@@ -97,9 +99,11 @@ def relations_of(motion: Motion) -> list[Relation]:
 
 
 def _lateral(motion: Motion) -> Iterator[Relation]:
-    """ay against vx·yaw_rate as it is, and d(vy)/dt against ay - vx·yaw_rate, both without vx·yaw_rate and its derivative.
+    """ay against vx·yaw_rate as it is, and d(vy)/dt against ay - vx·yaw_rate, both without
+    vx·yaw_rate and its derivative.
 
-    The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass for one of the other sign.
+    The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass
+    for one of the other sign.
     """
     if not (motion.speed and "yaw_rate" in motion and "ay" in motion):
         return
@@ -238,7 +242,9 @@ def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
 
 
 def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
-    """The band-pass of all comparisons with a derivative, which keeps moving samples away from the ends; None for a short drive."""
+    """The band-pass of all comparisons with a derivative, which keeps moving samples away from the
+    ends; None for a short drive.
+    """
     settled = settled_samples(motion)
     if settled is None:
         return None
@@ -247,7 +253,9 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:
-    """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or the rate too low."""
+    """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or
+    the rate too low.
+    """
     if motion.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
         return None
     settled = motion.moving.copy()
@@ -256,14 +264,16 @@ def settled_samples(motion: Motion) -> BoolArray | None:
     return settled if np.count_nonzero(settled) >= MIN_SETTLED_SECONDS * motion.rate_hz else None
 
 
-# --- signs -------------------------------------------------------------------------------------------------------------------------
+# --- signs ----------------------------------------------------------------------------------------
 
 
 def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple[str, ...]]:
-    """Sets of channels whose reversal would make all relations agree, the smallest first; none if all agree or nothing explains it.
+    """Sets of channels whose reversal would make all relations agree, the smallest first; none if
+    all agree or nothing explains it.
 
-    The lateral velocity and the sideslip angle come from one sensor: reversed together they count once. A forward speed is only
-    suspected where it is negative, which the check ``reverse`` speaks of.
+    The lateral velocity and the sideslip angle come from one sensor: reversed together they count
+    once. A forward speed is only suspected where it is negative, which the check ``reverse`` speaks
+    of.
     """
     if all(relation.correlation > 0.0 for relation in relations):
         return []
@@ -290,7 +300,9 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
 def sign_findings(
     relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]
 ) -> list[Finding]:
-    """Contradictions in sign, with `turned_channels`, and the channel that points the other way where steering or heading decides."""
+    """Contradictions in sign, with `turned_channels`, and the channel that points the other way
+    where steering or heading decides.
+    """
     against = [relation for relation in relations if relation.correlation < 0.0]
     if not against:
         return []
@@ -338,7 +350,7 @@ def _number(names: Sequence[str]) -> int:
     return len(names) - ({"vy_ref", "sideslip_ref"} <= set(names))
 
 
-# --- units -------------------------------------------------------------------------------------------------------------------------
+# --- units ----------------------------------------------------------------------------------------
 
 
 class UnitMistake(NamedTuple):
@@ -392,7 +404,9 @@ class WrongUnit:
 
 
 def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
-    """The wrong unit that explains most of the scales that are wrong and breaks none that is right; None if all are right."""
+    """The wrong unit that explains most of the scales that are wrong and breaks none that is right;
+    None if all are right.
+    """
     wrong = [relation for relation in relations if not relation.holds(relation.scale)]
     if not wrong:
         return None

@@ -39,7 +39,9 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class CrossSpectra:
-    """Cross-spectra of N signals in F bins of the band, in G groups of segments that follow one another."""
+    """Cross-spectra of N signals in F bins of the band, in G groups of segments that follow one
+    another.
+    """
 
     names: tuple[str, ...]  # of the signals
     frequency: FloatArray  # of the bins [Hz], (F,)
@@ -150,7 +152,9 @@ class Measured:
 
 
 def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
-    """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after another (Student's)."""
+    """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after
+    another (Student's).
+    """
     total = groups.sum(axis=0)
     number = len(groups)
     left_out = np.stack([fit(total - group) for group in groups])
@@ -171,7 +175,9 @@ def student(freedom: float) -> float:
 
 @dataclass(frozen=True)
 class Lag:
-    """How one signal follows another: a delay and a first-order low-pass, of which either may be held at zero."""
+    """How one signal follows another: a delay and a first-order low-pass, of which either may be
+    held at zero.
+    """
 
     delay: Measured  # [s]
     time_constant: Measured  # [s]
@@ -182,8 +188,9 @@ class Lag:
 def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool) -> Lag | None:
     """The lag of a signal behind another from the phase of their cross-spectrum, -ωτ - atan(ωT).
 
-    The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not the mean phase. Each bin has the
-    weight of maximum likelihood, coherence² / (1 - coherence²) (Hannan & Thomson, Biometrika 60 (3), 1973).
+    The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not
+    the mean phase. Each bin has the weight of maximum likelihood, coherence² / (1 - coherence²)
+    (Hannan & Thomson, Biometrika 60 (3), 1973).
 
     Parameters
     ----------

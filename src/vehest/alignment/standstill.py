@@ -17,7 +17,9 @@ MAX_STANDSTILL_SHAKING = 0.3  # m/s²
 
 
 def standstill(recording: Recording) -> BoolArray:
-    """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
+    """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate
+    nor accelerations speak of motion.
+    """
     is_standing = np.zeros(len(recording), dtype=bool)
     if "vx" not in recording:
         return is_standing

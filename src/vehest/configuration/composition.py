@@ -1,6 +1,6 @@
 """Composes configurations with Hydra; its errors become one line each.
 
-command and overrides -> Hydra over ./conf, conf/ and the papers' conf/ -> checked by `Root` -> Config, plain values
+command and overrides -> Hydra over ./conf, conf/, the papers' conf/ -> `Root` checks -> Config
 """
 
 from __future__ import annotations
@@ -52,23 +52,31 @@ Config = dict[str, Any]
 COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "name", "out", "quiet")
 """Options of commands that are easily mistaken for keys of the configuration."""
 
-GIVEN = "given"  # key of a configuration: the rates that overrides set; only a default may be lowered to the rate of the recordings
+# key of a configuration: the rates that overrides set, which are not lowered to the rate of the
+# recordings, as a default is
+OVERRIDDEN_RATES_KEY = "given"
 
 RATES = ("estimator.rate_hz", "evaluation.rate_hz")
 LOCAL_SCHEME = "vehest"  # of the search path, for ./conf
-MAX_CONFIG_VALUES = (
-    20_000  # of a file of ./conf, and of what references stand for; OmegaConf takes 0.1 ms for each
-)
+# of a file of ./conf, and of what references stand for; OmegaConf takes 0.1 ms for each
+MAX_CONFIG_VALUES = 20_000
 OPEN_GROUPS = {"estimate": "estimator"}
-"""Command -> group to which overrides may add any key: settings of a model that is opened later, which are checked there."""
+"""Command -> group to which overrides may add any key.
+
+These are settings of a model that is opened later, which checks them.
+"""
 VALUES_PER_REFERENCE = 10  # as which the work for a reference counts
 CHARACTERS_PER_VALUE = 100  # as which long text counts
-OWN_SEARCH_PATH = "hydra.searchpath=[]"  # the first one counts; a package named by another, in a file or an override, would be imported
+# the first one counts; a package named by another, in a file or an override, would be imported
+NO_SEARCH_PATH = "hydra.searchpath=[]"
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """``tracking``: server or store of runs (None: a local one in the output root), and the experiment there."""
+    """``tracking``: store of runs, and the experiment there.
+
+    ``uri`` is that of a server or a store; None is a local store in the output root.
+    """
 
     name: Literal["mlflow", "none"]
     uri: str | None = None
@@ -85,7 +93,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Root:
-    """What every command's configuration has; groups that a command does not have are None."""
+    """Groups of every command's configuration; those that a command does not have are None."""
 
     __pydantic_config__ = FURTHER_KEYS
     output: str
@@ -105,19 +113,21 @@ class Root:
 
 
 class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
-    """Makes Hydra search ./conf before the packaged folder, and the folder of the papers' studies last."""
+    """Makes Hydra search ./conf before the packaged folder, and the papers' folder last."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         *local, _, papers = conf_folders()
         for folder in local:
-            search_path.prepend(
-                "local", f"{LOCAL_SCHEME}://{folder.resolve()}"
-            )  # Hydra takes it literally, spaces too
+            # Hydra takes it literally, spaces too
+            search_path.prepend("local", f"{LOCAL_SCHEME}://{folder.resolve()}")
         search_path.append("papers", f"file://{papers}")
 
 
 class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
-    """The files of ./conf: each is read within the limits on text and values before OmegaConf copies what its aliases repeat."""
+    """The files of ./conf, each read within the limits on text and values.
+
+    The limits are checked before OmegaConf copies what the aliases of a file repeat.
+    """
 
     with_defaults: ClassVar[list[Path]] = []  # files with a list of defaults, in their order
 
@@ -136,10 +146,13 @@ class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
 
 @contextmanager
 def _limited_references() -> Iterator[None]:
-    """Bound what references (``${…}``) stand for in one configuration, each counted as often as others repeat it.
+    """Bound the number of values that references (``${…}``) of a configuration resolve to.
 
-    OmegaConf resolves a reference anew wherever it is met, so that a chain of n references to two each takes 2ⁿ steps, and has no
-    bound itself; all of its ways to resolve one go through ``Container.resolve_parse_tree``.
+    A value counts as often as references repeat it.
+
+    OmegaConf resolves a reference anew wherever it is met, so that a chain of n references to two
+    each takes 2ⁿ steps, and has no bound itself; all of its ways to resolve one go through
+    ``Container.resolve_parse_tree``.
     """
     resolve = Container.resolve_parse_tree
     sizes: dict[int, int] = {}  # of collections that references name
@@ -148,7 +161,8 @@ def _limited_references() -> Iterator[None]:
     def check() -> None:
         if total > MAX_CONFIG_VALUES:
             raise InterpolationResolutionError(
-                f"the references (${{…}}) of the configuration stand for more than {MAX_CONFIG_VALUES} values, "
+                f"the references (${{…}}) of the configuration stand for more than "
+                f"{MAX_CONFIG_VALUES} values, "
                 "repeated ones included; let them repeat each other less"
             )
 
@@ -181,18 +195,33 @@ def _count_values(content: Any) -> int:
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
-    """The resolved configuration of a command, a root file in conf/, with overrides in Hydra's grammar, but no sweeps.
+    """The resolved configuration of a command.
 
-    Raises `ConfigurationError` for an unknown key or choice, a wrong value or bad syntax.
+    Parameters
+    ----------
+    command : str
+        Name of a root file in conf/.
+    overrides : sequence
+        In Hydra's grammar, without sweeps.
 
-    Returns:
-        Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
+    Returns
+    -------
+    dict
+        Plain dicts, lists, strings and numbers; under `OVERRIDDEN_RATES_KEY` the rates that
+        overrides set, if any.
+
+    Raises
+    ------
+    ConfigurationError
+        A key or choice is unknown, a value is wrong, or an override cannot be parsed.
     """
     read = [parsed(text) for text in overrides]
     for override in read:
         _check(override)
-    of_groups = tuple(str(one.input_line) for one in read if _is_group(str(one.key_or_group)))
-    values = [one for one in read if one.input_line not in of_groups]
+    of_groups = tuple(
+        str(override.input_line) for override in read if _is_group(str(override.key_or_group))
+    )
+    values = [override for override in read if override.input_line not in of_groups]
     composed: DictConfig | None = None
     try:
         with _limited_references():
@@ -212,11 +241,11 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
                 f"the defaults of {names} lead back to themselves; remove an entry of them"
             ) from None
         composed_keys = OmegaConf.to_container(composed) if composed is not None else {}
-        raise ConfigurationError(_one_line(error, command, composed_keys)) from None
+        raise ConfigurationError(_error_line(error, command, composed_keys)) from None
     validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]
     return {str(key): value for key, value in resolved.items()} | (
-        {GIVEN: chosen} if chosen else {}
+        {OVERRIDDEN_RATES_KEY: chosen} if chosen else {}
     )
 
 
@@ -229,15 +258,16 @@ def _is_group(key: str) -> bool:
 def _composed(command: str, of_groups: tuple[str, ...], stamp: str) -> DictConfig:
     """A configuration as Hydra composes it from choices of groups, before any value is set.
 
-    Hydra reads and merges the same files for all jobs with the same choices, which takes 0.1 s; values it sets afterwards, with
-    `ConfigLoaderImpl._apply_overrides_to_config`. ``stamp`` is that of the files, so that changed files are read anew.
+    Hydra reads and merges the same files for all jobs with the same choices, which takes 0.1 s;
+    values it sets afterwards, with `ConfigLoaderImpl._apply_overrides_to_config`. ``stamp`` is that
+    of the files, so that changed files are read anew.
     """
     if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(_LocalFirst)
     SourcesRegistry.instance().register(_LimitedFiles)
     _LimitedFiles.with_defaults.clear()
     with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
-        return compose(command, overrides=[OWN_SEARCH_PATH, *of_groups])
+        return compose(command, overrides=[NO_SEARCH_PATH, *of_groups])
 
 
 def _check(override: Override) -> None:
@@ -246,11 +276,13 @@ def _check(override: Override) -> None:
     text = _shortened(override.input_line)
     if override.is_sweep_override():
         raise ConfigurationError(
-            f"'{text}' names several values; one is required here (pipelines and sweeps take several)"
+            f"'{text}' names several values; one is required here (pipelines and sweeps take "
+            "several)"
         )
     if override.is_delete() and "." not in group:
         raise ConfigurationError(
-            f"'{text}': only keys inside a group can be removed, for example ~dataset.channels.steer"
+            f"'{text}': only keys inside a group can be removed, for example "
+            "~dataset.channels.steer"
         )
     if re.match(r"hydra\b", group):
         raise ConfigurationError(
@@ -259,17 +291,20 @@ def _check(override: Override) -> None:
     if (
         group in GROUPS
         and not override.is_delete()
-        and str(override.value()) not in (known := choices(group))
+        and str(override.value()) not in (offered := choices(group))
     ):
-        close = difflib.get_close_matches(str(override.value()), known, n=1)
+        close = difflib.get_close_matches(str(override.value()), offered, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise ConfigurationError(
-            f"{group}={override.value()} is not there; {hint}choices: {', '.join(known)}"
+            f"{group}={override.value()} is not there; {hint}choices: {', '.join(offered)}"
         )
 
 
-def _one_line(error: Exception, command: str, composed: Any) -> str:
-    """An error of Hydra in one line, with the next step where it is known; ``composed``: the configuration before values were set."""
+def _error_line(error: Exception, command: str, composed: Any) -> str:
+    """An error of Hydra in one line, with the next step where it is known.
+
+    ``composed``: the configuration before values were set.
+    """
     if not isinstance(error, HydraException | OmegaConfBaseException):
         return f"the configuration of '{command}' cannot be read ({first_line(error)})"
     text = str(error).strip()
@@ -285,7 +320,10 @@ def _one_line(error: Exception, command: str, composed: Any) -> str:
             hint = f"; did you mean '{meant}'? {listing}"
         return f"unknown option '{unknown[1]}'{hint or f'; {listing}; +{unknown[1]}=… adds one'}"
     if missing := re.search(r"You must specify '([^']+)'", text):
-        return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
+        return (
+            f"{missing[1]} is not chosen; {missing[1]}=… (choices: "
+            f"{', '.join(choices(missing[1]))})"
+        )
     key = getattr(error, "full_key", None)
     return (
         f"{key}: {text.splitlines()[0]}"
@@ -295,7 +333,7 @@ def _one_line(error: Exception, command: str, composed: Any) -> str:
 
 
 def _option_names() -> dict[str, list[str]]:
-    """Names of the options of each estimator by its file in conf/estimator, without ``estimator.``."""
+    """Option names of each estimator by its file in conf/estimator, without ``estimator.``."""
     names: dict[str, list[str]] = {}
     for folder in conf_folders():
         for file in sorted((folder / "estimator").glob("*.yaml")):
@@ -315,9 +353,8 @@ def parsed(text: str) -> Override:
     """An override, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
     try:
         override = OverridesParser.create().parse_override(text)
-        if override.key_or_group in GROUPS and isinstance(
-            override.value(), float
-        ):  # a choice called nan or inf
+        # a choice called nan or inf
+        if override.key_or_group in GROUPS and isinstance(override.value(), float):
             return OverridesParser.create().parse_override(
                 f"{override.get_key_element()}='{override.value()}'"
             )
@@ -328,17 +365,24 @@ def parsed(text: str) -> Override:
                 f"'{text}' is not an override; write key=value, for example estimator=ksnn"
             ) from None
         raise ConfigurationError(
-            f"override '{_shortened(text)}' cannot be read ({first_line(error)}); quote special characters"
+            f"override '{_shortened(text)}' cannot be read ({first_line(error)}); quote special "
+            "characters"
         ) from None
 
 
 def count(overrides: Sequence[str]) -> int:
-    """Number of combinations that `expand` gives; of one override at most ``limits.jobs`` + 1 values count."""
+    """Number of combinations that `expand` gives.
+
+    Of one override at most ``limits.jobs`` + 1 values count.
+    """
     return math.prod(map(len, map(_values, map(parsed, overrides))))
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """All combinations of overrides with several values, the last one varying fastest; `ConfigurationError` above ``limits.jobs``."""
+    """All combinations of overrides with several values, the last one varying fastest.
+
+    `ConfigurationError` above ``limits.jobs``.
+    """
     check_jobs(count(overrides), "these overrides stand")
     return [list(job) for job in product(*map(_values, map(parsed, overrides)))]
 
@@ -350,12 +394,12 @@ def _values(override: Override) -> list[str]:
     text = _shortened(override.input_line)
     value = override.value()
     try:
-        found = (
+        value_texts = (
             value.filter(choices(override.key_or_group))
             if isinstance(value, Glob)
             else override.sweep_string_iterator()
         )
-        values = list(islice(found, current_limits().jobs + 1))
+        values = list(islice(value_texts, current_limits().jobs + 1))
     except (HydraException, ValueError, ArithmeticError, TypeError) as error:
         raise ConfigurationError(
             f"override '{text}' cannot be read ({first_line(error)})"
@@ -365,15 +409,17 @@ def _values(override: Override) -> list[str]:
     return [f"{override.get_key_element()}={value}" for value in values]
 
 
-def check_jobs(number: int, what: str) -> None:
+def check_jobs(number: int, subject: str) -> None:
     """Refuse more jobs than ``limits.jobs``."""
-    check_limit("jobs", number, f"{what} for at least {number} jobs", ConfigurationError)
+    check_limit("jobs", number, f"{subject} for at least {number} jobs", ConfigurationError)
 
 
 def limits_of(overrides: Sequence[str]) -> Limits:
     """The limits of conf/common.yaml, changed by overrides."""
-    own = list(dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits"))
-    return limits_from_config(compose_config("eval", own)["limits"])
+    overrides_of_limits = list(
+        dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits")
+    )
+    return limits_from_config(compose_config("eval", overrides_of_limits)["limits"])
 
 
 def value_of(override: str) -> Any:
@@ -387,44 +433,51 @@ def key_of(override: str) -> str:
 
 
 def option_hint(key: str) -> str:
-    """A hint where a key is an option of the command rather than of the configuration; else nothing."""
+    """A hint for a key that is an option of the command, not of the configuration; else empty."""
     option = key.replace("_", "-")
     return f"; an option is written --{option}" if option in COMMAND_OPTIONS else ""
 
 
 def close_key(key: str, config: Any) -> str:
-    """The dotted key of a configuration that is spelt most like an unknown one; empty if none is close.
+    """The dotted key of a configuration that is spelt most like an unknown one; empty if none.
 
-    A key that is given without its group, such as ``n_local``, is looked for in all groups.
+    A key without its group, such as ``n_local``, is looked for in all groups.
     """
-    group, _, rest = key.partition(".")
+    group, _, subkey = key.partition(".")
     if not isinstance(config, dict):
         return ""
-    names = [str(name) for name in config if name != GIVEN]
+    names = [str(name) for name in config if name != OVERRIDDEN_RATES_KEY]
     name = group if group in names else closest(group, names)
-    if name and not rest:
+    if name and not subkey:
         return name
-    inner = close_key(rest, config[name]) if name else ""
+    inner = close_key(subkey, config[name]) if name else ""
     if inner:
         return f"{name}.{inner}"
     dotted = (
-        [] if rest else [f"{name}.{group}" for name in names if has_key(config, f"{name}.{group}")]
+        []
+        if subkey
+        else [f"{name}.{group}" for name in names if has_key(config, f"{name}.{group}")]
     )
     return next(iter(dotted), "")
 
 
 def has_key(config: Config, key: str) -> bool:
     """Whether a dotted key is in a configuration."""
-    first, _, rest = key.partition(".")
+    first, _, subkey = key.partition(".")
     return (
-        isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
+        isinstance(config, dict)
+        and first in config
+        and (not subkey or has_key(config[first], subkey))
     )
 
 
 def quoted(text: Any) -> str:
-    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
+    """A value in quotes as Hydra's grammar reads it back.
+
+    Only quotes, and backslashes before them, are escaped.
+    """
     escaped = re.sub(
-        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text)
+        r"(\\*)('|$)", lambda quote: quote[1] * 2 + ("\\'" if quote[2] else ""), str(text)
     )
     return f"'{escaped}'"
 
@@ -440,7 +493,10 @@ def as_yaml(config: Config) -> str:
 
 
 def positive_rate(value: Any, name: str) -> float:
-    """A rate [Hz] of a configuration; raises `ConfigurationError` unless it is a positive number."""
+    """A rate [Hz] of a configuration.
+
+    Raises `ConfigurationError` unless it is a positive number.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
         raise ConfigurationError(
             f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20"
@@ -452,9 +508,9 @@ def missing_keys(config: Any, prefix: str = "") -> list[str]:
     """Dotted keys that still hold ``???``."""
     if isinstance(config, dict):
         return [
-            found
+            missing_key
             for key, value in config.items()
-            for found in missing_keys(value, f"{prefix}{key}.")
+            for missing_key in missing_keys(value, f"{prefix}{key}.")
         ]
     return [prefix.rstrip(".")] if config == "???" else []
 

@@ -1,4 +1,7 @@
-"""Options of `vehest estimate` and of commands that open a model for a car: conf/estimate.yaml and overrides."""
+"""Options of `vehest estimate` and of other commands that open a model for a car.
+
+conf/estimate.yaml and overrides -> `compose_config` -> `EstimateOptions`
+"""
 
 from __future__ import annotations
 

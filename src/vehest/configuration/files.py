@@ -8,18 +8,21 @@ GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "trac
 
 
 def packaged(name: str) -> Path:
-    """A folder that came with vehest, ``conf`` or ``pipelines``: inside the installed package, or beside src in a checkout."""
+    """The folder ``conf`` or ``pipelines`` of vehest, in the installed package or beside src."""
     package = Path(__file__).resolve().parents[1]
     inside = package / name
     return inside if inside.is_dir() else package.parents[1] / name
 
 
 def conf_folders() -> list[Path]:
-    """Folders of configuration, the first one searched first: ./conf, if there is one, the packaged folder, that of the papers' studies."""
+    """Folders of configuration in the order of their search.
+
+    ./conf, if there is one; the packaged folder; that of the papers' studies.
+    """
     local = Path("conf")
     ours = packaged("conf")
-    own = [local] if local.is_dir() and local.resolve() != ours.resolve() else []
-    return [*own, ours, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
+    local_folders = [local] if local.is_dir() and local.resolve() != ours.resolve() else []
+    return [*local_folders, ours, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
 
 
 def choices(group: str) -> list[str]:
@@ -36,16 +39,9 @@ def is_file_name(word: str) -> bool:
 
 def find_pipeline(name: str) -> Path | None:
     """A pipeline by path or by name: as given, then ./pipelines, then the packaged ones."""
-    given = Path(name)
-    file = f"{given.name.removesuffix('.yaml')}.yaml"
-    return next(
-        (
-            path
-            for path in (given, Path("pipelines") / file, packaged("pipelines") / file)
-            if path.is_file()
-        ),
-        None,
-    )
+    file = f"{Path(name).name.removesuffix('.yaml')}.yaml"
+    candidates = (Path(name), Path("pipelines") / file, packaged("pipelines") / file)
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def pipeline_names() -> list[str]:

@@ -88,7 +88,7 @@ def fold_of(
         _joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3)
     )
     if not (train and validation):
-        problem = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from"
+        problem = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to train on"
         raise ConfigurationError(f"{subject}: {problem}; set folds.gap_seconds lower")
     return train, validation, test
 

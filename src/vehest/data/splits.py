@@ -64,7 +64,7 @@ class Span:
     def __post_init__(self) -> None:
         if not self.start < self.stop:
             raise ConfigurationError(
-                f"span of recording '{self.recording}': start {self.start} s is not before stop "
+                f"range of recording '{self.recording}': start {self.start} s is not before stop "
                 f"{self.stop} s"
             )
 

@@ -172,7 +172,7 @@ class LowPass:
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError(
-                "a low-pass of design fir sees as far ahead as back; use design=butterworth for a "
+                "a low-pass of design fir needs as many later samples as earlier ones; use design=butterworth for a "
                 "causal one"
             )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Estimate
+from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.data.schema import settings_from_config
 from vehest.declared import Declaration, Group, setting
@@ -50,20 +50,39 @@ def require_learnable(
     skippable: Collection[str] = (),
     hints: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise `DataError` where recordings lack a channel that an estimator learns from, or have gaps in one that is not skippable.
+    """Check that recordings have the channels that an estimator learns from.
 
-    ``hints``: channel -> what to do where it is missing.
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        To learn from.
+    channels : sequence of str
+        Channels that they must have.
+    estimator : str
+        Its name, for errors.
+    skippable : collection of str
+        Channels that may have gaps.
+    hints : mapping or None
+        Channel -> remedy where it is missing.
+
+    Raises
+    ------
+    DataError
+        A channel is missing, or has gaps and is not skippable.
     """
     for recording in recordings:
         for name in channels:
             if name not in recording:
                 hint = (hints or {}).get(name, "")
                 raise DataError(
-                    f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}"
+                    f"recording '{recording.id}' has no channel '{name}', on which estimator "
+                    f"'{estimator}' is trained{hint}"
                 )
             if name not in skippable and np.isnan(recording[name]).any():
-                what = f"channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; cut them out in conf/split"
-                raise DataError(f"recording '{recording.id}': {what}")
+                raise DataError(
+                    f"recording '{recording.id}': channel '{name}' has gaps, on which estimator "
+                    f"'{estimator}' cannot be trained; cut them out in conf/split"
+                )
 
 
 def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: str) -> float:
@@ -72,8 +91,8 @@ def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: s
     if not largest > 0.0:
         names = ", ".join(f"'{recording.id}'" for recording in recordings)
         raise DataError(
-            f"recordings {names}: channel '{channel}' is 0 throughout, which estimator '{estimator}' "
-            "cannot be trained on; train it on drives with bends"
+            f"recordings {names}: channel '{channel}' is 0 throughout, which estimator "
+            f"'{estimator}' cannot be trained on; train it on drives with bends"
         )
     return largest
 
@@ -81,38 +100,45 @@ def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: s
 class Trial(NamedTuple):
     """A family in the first comparison on a car without a trained model (`vehest new`)."""
 
-    place: float  # among the trials of all families, the promising and cheap first; those that differ in place alone are one sweep
+    # among the trials of all families, the promising and cheap first; those that differ in place
+    # alone are one sweep
+    place: float
     about: str  # text for people
-    # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the settings have
+    # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all
+    # of its parameters that the settings have
     overrides: str = ""
-    samples: int = (
-        0  # that some range for training, and each for validation, has to have at the family's rate
-    )
+    # that some range for training, and each for validation, has to have at the family's rate
+    samples: int = 0
 
 
 class Stepper(ABC):
     """An estimator that runs along with the drive, one sample after another."""
 
-    horizon_steps: int = (
-        0  # sampling intervals after the sample for which the returned estimate holds
-    )
+    # sampling intervals after the sample for which the returned estimate holds
+    horizon_steps: int = 0
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Take the measurements of one instant [SI], return ``vy`` [m/s]; NaN while there is none yet.
+        """Take the measurements of one instant [SI], return ``vy`` [m/s].
+
+        NaN while there is none yet.
 
         A method that has a covariance also returns ``vy_variance`` [m²/s²].
 
-        Raises `DataError`: a channel is missing.
+        Raises
+        ------
+        DataError
+            A channel is missing.
         """
 
 
 class Estimator(ABC):
     """A method that estimates lateral velocity and sideslip from measured channels.
 
-    A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
-    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is
-    how recordings are brought to its rate before it sees them (method, transforms), ``trust`` its calibration
+    A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and
+    what follows. Settings are then an attribute of the estimator each, and together ``settings``,
+    of the dataclass ``settings_type`` that is made of them. ``preparation`` is how recordings are
+    brought to its rate before it sees them (method, transforms), ``trust`` its calibration
     (`vehest.trust.record.Trust`), None without one.
     """
 
@@ -122,73 +148,64 @@ class Estimator(ABC):
     settings_type: ClassVar[Any] = EstimatorSettings
     training_type: ClassVar[type]  # dataclass of the settings of its fit
     learns_from: tuple[str, ...] = ("vy_ref",)  # reference channels that its fit reads
-    skippable: ClassVar[
-        tuple[str, ...]
-    ] = ()  # channels of ``channels`` that may have gaps, because the method does without a sample
-    refuses: ClassVar[
-        tuple[str, ...]
-    ] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
-    may_be_nan: ClassVar[
-        tuple[str, ...]
-    ] = ()  # weights that may stay NaN, because each recording tells them
+    # channels of ``channels`` that may have gaps, because the method does without a sample
+    skippable: ClassVar[tuple[str, ...]] = ()
+    # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
+    refuses: ClassVar[tuple[str, ...]] = ()
+    # weights that may stay NaN, because each recording tells them
+    may_be_nan: ClassVar[tuple[str, ...]] = ()
     covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
-    horizon_steps: ClassVar[int] = (
-        0  # sampling intervals after a sample for which the estimate made with it holds
-    )
-    ignores_initial_state: ClassVar[bool] = (
-        False  # whether an initial state is left aside; else it is used, or refused as an error
-    )
-    fits_seeds_together: ClassVar[bool] = (
-        True  # whether a fit of several seeds is one computation; else each is a training by itself
-    )
-    slow_kernel: ClassVar[str] = (
-        ""  # ``module:function`` that takes tens of seconds to compile; empty: none
-    )
+    # sampling intervals after a sample for which the estimate made with it holds
+    horizon_steps: ClassVar[int] = 0
+    # whether an initial state is left aside; else it is used, or refused as an error
+    ignores_initial_state: ClassVar[bool] = False
+    # whether a fit of several seeds is one computation; else each is a training by itself
+    fits_seeds_together: ClassVar[bool] = True
+    # ``module:function`` that takes tens of seconds to compile; empty: none
+    slow_kernel: ClassVar[str] = ""
     # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    trials: ClassVar[
-        tuple[Trial, ...]
-    ] = ()  # in the first comparison on a new car; none: it is left out
+    # in the first comparison on a new car; none: it is left out
+    trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
     style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
-    template: ClassVar[str] = (
-        ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
-    )
-    version: ClassVar[str] = (
-        "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
-    )
+    # C template of a step, in ``export/templates/methods`` or beside the family's module; or empty
+    template: ClassVar[str] = ""
+    # raised when weights or estimates change; a version of ``training_type`` alone when the fit
+    # does
+    version: ClassVar[str] = "1"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        own = {name: value for name, value in vars(cls).items() if isinstance(value, Field)}
+        declared = {name: value for name, value in vars(cls).items() if isinstance(value, Field)}
         of_bases = dict.fromkeys(
             base.settings_type for base in cls.__bases__ if issubclass(base, Estimator)
         )
         bases = [
-            one
-            for one in of_bases
-            if not any(other is not one and issubclass(other, one) for other in of_bases)
+            base
+            for base in of_bases
+            if not any(derived is not base and issubclass(derived, base) for derived in of_bases)
         ]
-        if not own and len(bases) == 1:
+        if not declared and len(bases) == 1:
             return
-        kinds = {name: cls.__annotations__[name] for name in own}
-        optional = [name for name, value in own.items() if value.default is None]
+        kinds = {name: cls.__annotations__[name] for name in declared}
+        optional = [name for name, value in declared.items() if value.default is None]
         kinds |= {
             name: f"{kind} | None" if isinstance(kind := kinds[name], str) else kind | None
             for name in optional
         }
-        described = [(name, kind, own[name]) for name, kind in kinds.items()]
+        described = [(name, kind, declared[name]) for name, kind in kinds.items()]
         cls.settings_type = make_dataclass(
             "settings_type", described, bases=tuple(bases), frozen=True
         )
         cls.settings_type.__module__ = cls.__module__
         cls.settings_type.__qualname__ = f"{cls.__qualname__}.settings_type"
-        for name in own:
+        for name in declared:
             setattr(cls, name, property(attrgetter(f"settings.{name}")))
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
-        self._seed = 0
+        self.fit_seed = 0
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
         self.trust: Any = None
         self.check()
@@ -203,12 +220,21 @@ class Estimator(ABC):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:
-        """Build one from plain values; raises `ConfigurationError`: an unknown setting or a value out of range."""
+        """Build an estimator from plain values.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown setting or a value out of range.
+        """
         return cls(settings_from_config(cls.settings_type, config, "estimator"))
 
     @property
     def causal(self) -> bool:
-        """Whether an estimate uses measurements up to its own time only; if so, it also runs online."""
+        """Whether an estimate uses measurements up to its own time only.
+
+        If so, it also runs online.
+        """
         return True
 
     @property
@@ -218,7 +244,7 @@ class Estimator(ABC):
 
     @property
     def adapts(self) -> bool:
-        """Whether parameters of the car or its sensors are states, which a fault may lead astray."""
+        """Whether parameters of the car or its sensors are states, which a fault may corrupt."""
         return False
 
     @property
@@ -228,7 +254,7 @@ class Estimator(ABC):
 
     @property
     def variant(self) -> str:
-        """What the paper calls this configuration."""
+        """The paper's name of this configuration."""
         return self.name
 
     @property
@@ -238,7 +264,10 @@ class Estimator(ABC):
 
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str] | None:
-        """Colour, dash and marker of its lines in figures; none: a colour that follows from its name."""
+        """Colour, dash and marker of its lines in figures.
+
+        None: a colour that follows from its name.
+        """
         return cls.style
 
     @property
@@ -247,25 +276,34 @@ class Estimator(ABC):
         return (self.name, self.settings)
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """Reference channels that a fit with these settings reads, of recordings with these channels."""
+        """Reference channels that a fit with settings ``training`` reads of recordings.
+
+        ``channels`` are those of the recordings.
+        """
         return self.learns_from
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Overrides that a fit needs because its settings name recordings by a pattern that none of these matches."""
+        """Overrides that a fit needs where a pattern in its settings matches none of these ids."""
         return ()
 
     def c_values(self) -> Mapping[str, Any]:
-        """Values that ``template`` needs of the fitted estimator; raises `ConfigurationError`: these settings have no C."""
+        """Values that ``template`` needs of the fitted estimator.
+
+        Raises
+        ------
+        ConfigurationError
+            These settings have no C.
+        """
         raise NotImplementedError(f"{type(self).__name__} has a template and no method 'c_values'")
 
     @property
     @abstractmethod
     def n_parameters(self) -> int:
-        """How many numbers the fit determines."""
+        """Number of values that the fit determines."""
 
     def seed(self, seed: int) -> None:
-        """Say which random numbers the next fit starts from and uses."""
-        self._seed = seed
+        """Set the seed of the next fit."""
+        self.fit_seed = seed
 
     @classmethod
     @abstractmethod
@@ -274,21 +312,29 @@ class Estimator(ABC):
     ) -> list[FitRecord]:
         """Fit estimators of one ``batch_key`` together, each with the result it would have alone.
 
-        Args:
-            members: seeded estimators, changed in place.
-            data: recordings at the estimator's rate.
-            training: of ``training_type``.
-            context: checkpoints, progress, the wish to stop.
+        Parameters
+        ----------
+        members : sequence
+            Seeded estimators, changed in place.
+        data : FitData
+            Recordings at the estimator's rate.
+        training : any
+            Of ``training_type``.
+        context : FitContext
+            Checkpoints, progress, the wish to stop.
 
-        Raises `DataError`: a channel is missing or the recordings are too short.
+        Raises
+        ------
+        DataError
+            A channel is missing or the recordings are too short.
         """
 
-    def fewest_weights(self) -> int:
-        """How many numbers its settings ask for at least."""
+    def min_weights(self) -> int:
+        """Lower bound of the number of weights with these settings."""
         return self.n_parameters
 
     def fit(self, data: FitData, training: Any, context: FitContext | None = None) -> FitRecord:
-        """Fit this one alone."""
+        """Fit this estimator alone."""
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
     def estimate(
@@ -296,13 +342,29 @@ class Estimator(ABC):
         recordings: Sequence[Recording],
         initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
     ) -> list[Estimate]:
-        """Estimate the lateral velocity of recordings, at the estimator's rate, that carry no reference channels.
+        """Estimate the lateral velocity of recordings.
 
-        Where a protocol hands it over openly, ``initial_state`` is the state at the first sample to start from, for all recordings or one a
-        recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
+        Parameters
+        ----------
+        recordings : sequence
+            At the estimator's rate; their reference channels are not used.
+        initial_state : mapping, sequence of mappings or None
+            State at the first sample to start from, for all recordings or one a recording, where a
+            protocol provides it: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method
+            takes those that it has.
 
-        Raises `DataError`: a channel is missing, the rate is another, or there are not as many states as recordings. Raises
-        `ConfigurationError`: a state is given and the method cannot start from one.
+        Returns
+        -------
+        list of Estimate
+            One a recording.
+
+        Raises
+        ------
+        DataError
+            A channel is missing, the rate is another, or there are not as many states as
+            recordings.
+        ConfigurationError
+            A state is given and the method cannot start from one.
         """
         if initial_state is None or self.ignores_initial_state:
             states: list[Mapping[str, float] | None] = [None] * len(recordings)
@@ -312,20 +374,22 @@ class Estimator(ABC):
             states = list(initial_state)
         if len(states) != len(recordings):
             raise DataError(
-                f"there are {len(states)} initial states for {len(recordings)} recordings; give one a recording, or one for all"
+                f"there are {len(states)} initial states for {len(recordings)} recordings; give "
+                "one a recording, or one for all"
             )
         return self._estimate_all([self._checked(recording) for recording in recordings], states)
 
     def _checked(self, recording: Recording) -> Recording:
         if abs(recording.rate_hz / self.settings.rate_hz - 1.0) > 1e-9:
             raise DataError(
-                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, estimator '{self.name}' works at "
-                f"{self.settings.rate_hz:g} Hz; resample it first"
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, estimator "
+                f"'{self.name}' works at {self.settings.rate_hz:g} Hz; resample it first"
             )
         for name in self.channels:
             if name not in recording:
                 raise DataError(
-                    f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' needs"
+                    f"recording '{recording.id}' has no channel '{name}', which estimator "
+                    f"'{self.name}' needs"
                 )
             if (
                 name in recording.gappy
@@ -333,12 +397,19 @@ class Estimator(ABC):
                 and np.isnan(recording[name]).any()
             ):
                 raise DataError(
-                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip"
+                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator "
+                    f"'{self.name}' cannot skip"
                 )
         return recording.select(self.channels)
 
     def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
-        """Values of ``channels`` at one instant, (C,); raises `DataError`: one is missing, or is refused."""
+        """Values of ``channels`` at one instant, (C,).
+
+        Raises
+        ------
+        DataError
+            One is missing, or is refused.
+        """
         try:
             values = [float(sample[name]) for name in self.channels]
         except KeyError as error:
@@ -347,14 +418,15 @@ class Estimator(ABC):
             ) from None
         if not all(map(math.isfinite, values)):
             for name, value in zip(self.channels, values, strict=True):
-                what = "infinite" if math.isinf(value) else "NaN"
+                defect = "infinite" if math.isinf(value) else "NaN"
                 if (
                     not math.isfinite(value)
-                    and what in self.refuses
-                    and not (what == "NaN" and name in self.skippable)
+                    and defect in self.refuses
+                    and not (defect == "NaN" and name in self.skippable)
                 ):
                     raise DataError(
-                        f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take"
+                        f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot "
+                        "take"
                     )
         return np.array(values)
 
@@ -364,58 +436,76 @@ class Estimator(ABC):
         vy: FloatArray,
         covariance: FloatArray | None = None,
         covariance_of: tuple[str, ...] = (),
-        **others: FloatArray,
+        **quantities: FloatArray,
     ) -> Estimate:
-        """An `Estimate` on the recording's clock; sideslip is atan2(vy, vx) with the measured vx."""
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"]), **others}
-        mode = "causal" if self.causal else "offline"
+        """An `Estimate` on the recording's clock.
+
+        Sideslip is atan2(vy, vx) with the measured vx.
+        """
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"]), **quantities}
+        mode: Mode = "causal" if self.causal else "offline"
         clock = (recording.rate_hz, recording.start_time)
-        return Estimate(recording.id, self.name, *clock, channels, mode, covariance, covariance_of)  # type: ignore[arg-type]
+        return Estimate(recording.id, self.name, *clock, channels, mode, covariance, covariance_of)
 
     def _estimate_all(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
     ) -> list[Estimate]:
-        """Estimate checked recordings, each from its state; one after another, unless a method can do better."""
+        """Estimate checked recordings, each from its state.
+
+        One after another, unless a method can do better.
+        """
         return [
-            self._estimate_one(recording, state)
+            self.estimate_recording(recording, state)
             for recording, state in zip(recordings, states, strict=True)
         ]
 
-    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
+    def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
         """The state before the first sample; none where the method has no state.
 
-        Args:
-            sample: values of ``channels``, (C,).
-            given: what a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty otherwise.
+        Parameters
+        ----------
+        sample : array
+            Values of ``channels``, (C,).
+        initial_state : mapping
+            What a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
+            otherwise.
         """
         return None
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
         """Go on from a state.
 
-        Args:
-            samples: values of ``channels``, (T, C), T ≥ 1.
-            state: that before the first of them.
+        Parameters
+        ----------
+        samples : array
+            Values of ``channels``, (T, C), T ≥ 1.
+        state : any
+            That before the first of them.
 
-        Returns:
-            Quantities of an `Estimate` at the time of each sample, (T,), ``vy`` [m/s] among them; perhaps ``covariance``, (T, n, n), of
-            ``covariance_of``, and ``innovations``, a function that returns ``nis`` and ``nis_dof``. And the state after the last sample.
+        Returns
+        -------
+        tuple
+            Quantities of an `Estimate` at the time of each sample, (T,), ``vy`` [m/s] among
+            them; perhaps ``covariance``, (T, n, n), of ``covariance_of``, and ``innovations``,
+            a function that returns ``nis`` and ``nis_dof``. And the state after the last
+            sample.
         """
         raise NotImplementedError(f"{type(self).__name__} has no method 'run'")
 
     def require_fitted(self) -> None:  # noqa: B027 (most networks are complete when they are made)
         """Raises `ConfigurationError`: a number is neither given nor fitted."""
 
-    def _estimate_one(
+    def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
+        """Estimate a checked recording from a state, or from its first sample."""
         self.require_fitted()
         sample = np.array([recording[name][0] for name in self.channels])
         return self._run_over(recording, self.first_state(sample, dict(initial_state or {})))[0]
 
     @property
     def continues(self) -> bool:
-        """Whether an estimate may continue from the state after the last sample (`continue_from`)."""
+        """Whether an estimate may continue from the state after the last sample."""
         return self.causal and self._overrides("run") and not self._overrides("_estimate_all")
 
     def continue_from(self, recording: Recording, state: Any) -> tuple[Estimate, Any]:
@@ -465,7 +555,13 @@ class Estimator(ABC):
         return getattr(type(self), method) is not getattr(Estimator, method)
 
     def online(self) -> Stepper:
-        """A stepper in its initial state; raises `ConfigurationError`: it has not been fitted, or is not causal."""
+        """A stepper in its initial state.
+
+        Raises
+        ------
+        ConfigurationError
+            It has not been fitted, or is not causal.
+        """
         if not self.causal:
             raise ConfigurationError(self.offline)
         self.require_fitted()
@@ -485,20 +581,24 @@ def require_shapes(
     weights: Mapping[str, np.ndarray[Any, Any]],
     expected: Mapping[str, tuple[int, ...]],
 ) -> None:
-    """Raise `DataError` for weights of other names or shapes than an estimator's settings ask for."""
+    """Raise `DataError` for weights whose names or shapes differ from those of the settings."""
     differing = sorted(
         {(name, values.shape) for name, values in weights.items()} ^ set(expected.items())
     )
     if differing:
         raise DataError(
-            f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape"
+            f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, "
+            "unknown or of another shape"
         )
 
 
 def require_within_bounds(
     values: Mapping[str, float], declarations: Mapping[str, Declaration], array: str = ""
 ) -> None:
-    """Raise `DataError` for a loaded number, perhaps of an ``array``, that its setting could not have; NaN is not checked."""
+    """Raise `DataError` for a loaded number that its setting could not have.
+
+    ``array`` names the tensor that has the numbers, if any; NaN is not checked.
+    """
     for name, value in values.items():
         problem = (
             declarations[name].problem(value)
@@ -525,15 +625,18 @@ class RunStepper(Stepper):
         self._started = False
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Every quantity at the time of the sample, ``vy`` [m/s] among them; NaN in skippable channels was not measured."""
+        """Every quantity at the time of the sample, ``vy`` [m/s] among them.
+
+        NaN in skippable channels was not measured.
+        """
         estimator = self._estimator
         row = estimator.checked_sample(sample)
         state = self._state if self._started else estimator.first_state(row, {})
-        found, self._state = estimator.run(row[None], state)
+        quantities, self._state = estimator.run(row[None], state)
         self._started = True
-        covariance = found.pop("covariance", None)
-        _ = found.pop("innovations", None)
-        values = {name: quantity.item(0) for name, quantity in found.items()}
+        covariance = quantities.pop("covariance", None)
+        _ = quantities.pop("innovations", None)
+        values = {name: quantity.item(0) for name, quantity in quantities.items()}
         if covariance is not None:
             row_of_vy = estimator.covariance_of.index("vy")
             values["vy_variance"] = float(covariance[0, row_of_vy, row_of_vy])

@@ -1,4 +1,7 @@
-"""UKF-informed neural network: a network and the unscented filter behind it, trained end to end (CNN-UKF)."""
+"""UKF-informed neural network.
+
+A network and the unscented filter behind it, trained end to end (CNN-UKF).
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.sample_network import (
@@ -39,15 +42,19 @@ from vehest.training.sequences import (
     train_phases,
 )
 
+# m/s, rad/s: standard deviations of the true state that a training sequence starts from
 START = (
     0.1,
     0.02,
-)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
-MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
+)
+# m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is
+# pre-trained
+MAX_NOISE = 0.5
 SATURATED = 20.0  # of which the logistic function is 1
 DISTRUST = 1
 PROCESS = [2, 3]  # which outputs they are
-MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
+# share of the sequences of a batch beyond which training stops instead of going on without them
+MAX_LOST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -69,13 +76,15 @@ class EndToEndSettings(Group):
     batch_size: int = setting(32, "sequences in a batch", least=1)
     loss_unit: Literal["rad", "deg"] = setting(
         "rad",
-        "of the angles in the loss of Eq. 7; the optimum is the same, but gradients in rad² are about as small as the number that AdamW "
-        "adds to their size, 1e-8, so that it takes steps far below its rate",
+        "of the angles in the loss of Eq. 7; the optimum is the same, but gradients in rad² are "
+        "about as small as the number that AdamW adds to their size, 1e-8, so that it takes "
+        "steps far below its rate",
     )
     loss_limit: float = setting(
         0.0,
-        "error of either angle beyond which its square in the loss of Eq. 7 is continued by its tangent (Huber's loss), so that skids do not "
-        "decide the training; 0: none, as in the paper",
+        "error of either angle beyond which its square in the loss of Eq. 7 is continued by its "
+        "tangent (Huber's loss), so that skids do not decide the training; 0: none, as in the "
+        "paper",
         unit="deg",
         least=0.0,
     )
@@ -96,7 +105,7 @@ class NetworkOutput(NamedTuple):
 
     @property
     def variance(self) -> Tensor:
-        """Of the sideslip angle as a measurement [rad²]."""
+        """Variance of the sideslip angle as a measurement [rad²]."""
         return self.distrust.square() + self.least_variance
 
 
@@ -114,14 +123,16 @@ class Cuts(NamedTuple):
 
 
 class CnnUkf(NetworkUkf):
-    """A network gives the filter a sideslip angle, how little to trust it, and the process noise, sample by sample.
+    """Filter with a sideslip angle, its variance and process noise by a network, at each sample.
 
-    Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy and σ_ψ̇ come out of logistic functions;
-    all three are standard deviations here, in pre-training too, where Eq. 6 has σ_DD as a variance: R = σ_DD² + ε, and ε is added rather
-    than a bound, so that it has a gradient everywhere.
+    Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy
+    and σ_ψ̇ come out of logistic functions; all three are standard deviations here, in pre-training
+    too, where Eq. 6 has σ_DD as a variance: R = σ_DD² + ε, and ε is added rather than a bound, so
+    that it has a gradient everywhere.
 
-    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural network for vehicle sideslip angle
-    estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
+    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural
+    network for vehicle sideslip angle estimation, IEEE Transactions on Vehicular Technology 73 (9),
+    2024, Section III.
     """
 
     name = "cnn_ukf"
@@ -130,7 +141,8 @@ class CnnUkf(NetworkUkf):
         Trial(
             13,
             "network trained through its filter; ten minutes and more",
-            "estimator.inputs=imu {car} training.identification.method=nelder_mead training.identification.grid=1 "
+            "estimator.inputs=imu {car} training.identification.method=nelder_mead "
+            "training.identification.grid=1 "
             "training.identification.max_evaluations=40 training.identification.tyres_from='*' "
             "training.identification.restarts=1 training.identification.generations=60 "
             "training.end_to_end.max_epochs=20",
@@ -164,7 +176,7 @@ class CnnUkf(NetworkUkf):
 
     @property
     def variant(self) -> str:
-        """With the tyres, where they are not the smooth ones, and what is taken away."""
+        """Name with tyres that are not smooth and with the parts that are switched off."""
         tyres = "" if self.curve == "smooth" else "_plain"
         return super().variant + tyres + "".join(f"_no_{name}" for name in self.without)
 
@@ -180,11 +192,11 @@ class CnnUkf(NetworkUkf):
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
         """Angle, its variance and the process noise."""
-        found = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
+        output = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
         return PseudoMeasurement(
-            clip_sideslip(found.sideslip.numpy()),
-            found.variance.numpy(),
-            found.process.square().numpy(),
+            clip_sideslip(output.sideslip.numpy()),
+            output.variance.numpy(),
+            output.process.square().numpy(),
         )
 
     def fit_network(
@@ -192,21 +204,21 @@ class CnnUkf(NetworkUkf):
     ) -> FitRecord:
         """Pre-training, then training through the filter."""
         network, train, judged = self.prepare_network(
-            data, training, [self._seed], self.minimum_speed
+            data, training, [self.fit_seed], self.minimum_speed
         )
         levels = torch.tensor(
             [self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64
         )
-        levels = levels.clamp(
-            max=MOST_NOISE
-        )  # a logistic function that is to say 1 or more saturates, and learns no more
-        with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
-            start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
+        # a logistic function that is to say 1 or more saturates, and learns no more
+        levels = levels.clamp(max=MAX_NOISE)
+        # logistic functions start where the filter alone has its levels, and as unsure as a network
+        # that says 0
+        with torch.no_grad():
+            start = torch.cat([network.unit.double().reshape(1).clamp(max=MAX_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
-        handles = self._hold(network)
-        driven = network.samples(
-            *learnt_samples(data.train, self.network_inputs, self.name)
-        )  # sequences are cut from all that was driven
+        handles = self._fix_heads(network)
+        # sequences are cut from all that was driven
+        driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
             self._pre_training(train, judged, levels, training),
@@ -225,7 +237,7 @@ class CnnUkf(NetworkUkf):
             ),
         ]
         record = record_of_phases(
-            train_phases(phases, self._seed, context, index, training.checkpoint_seconds)
+            train_phases(phases, self.fit_seed, context, index, training.checkpoint_seconds)
         )
         for handle in handles:
             handle.remove()
@@ -235,30 +247,33 @@ class CnnUkf(NetworkUkf):
             record.interrupted,
         )
 
-    def _hold(self, network: SampleNetwork) -> list[RemovableHandle]:
-        """Take heads away: what is held has no weights and no gradient, so that the network is of the usual shape and says constants."""
+    def _fix_heads(self, network: SampleNetwork) -> list[RemovableHandle]:
+        """Make outputs that settings switch off constant, and return the hooks that do.
+
+        Their weights are 0 and have no gradient, so that the network keeps its shape.
+        """
         s = self
-        held_weights = []
-        held_biases = []
+        fixed_weights = []
+        fixed_biases = []
         if not (s.adaptive_distrust and s.pseudo_measurement):
-            held_weights.append(DISTRUST)
+            fixed_weights.append(DISTRUST)
         if not s.pseudo_measurement:
-            held_biases.append(DISTRUST)
+            fixed_biases.append(DISTRUST)
         if not s.adaptive_process:
-            held_weights += PROCESS
-            held_biases += PROCESS
+            fixed_weights += PROCESS
+            fixed_biases += PROCESS
         handles = []
-        for name, held in (("weight_3", held_weights), ("bias_3", held_biases)):
-            if held:
-                kept = torch.ones(4, dtype=network.unit.dtype)
-                kept[held] = 0.0
+        for name, fixed in (("weight_3", fixed_weights), ("bias_3", fixed_biases)):
+            if fixed:
+                mask = torch.ones(4, dtype=network.unit.dtype)
+                mask[fixed] = 0.0
                 handles.append(
                     network.get_parameter(name).register_hook(
-                        lambda gradient, kept=kept: gradient * kept
+                        lambda gradient, mask=mask: gradient * mask
                     )
                 )
         with torch.no_grad():
-            network.get_parameter("weight_3")[..., held_weights] = 0.0
+            network.get_parameter("weight_3")[..., fixed_weights] = 0.0
             if not s.pseudo_measurement:
                 network.get_parameter("bias_3")[..., DISTRUST] = SATURATED
         return handles
@@ -266,15 +281,18 @@ class CnnUkf(NetworkUkf):
     def _pre_training(
         self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
     ) -> Phase:
-        """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
+        """Phase of the network alone (Eqs. 5 and 6).
+
+        Its loss is a likelihood of angle and distrust; process noise is at the filter's levels.
+        """
         network = self.network
         dropout = self.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
-            found = self.output_of(outputs)
-            error = found.sideslip - targets.double() * network.unit.double()
-            likelihood = 0.5 * (found.variance.log() + error.square() / found.variance).mean(-1)
-            return likelihood + (found.process - levels).square().sum(-1).mean(-1)
+            output = self.output_of(outputs)
+            error = output.sideslip - targets.double() * network.unit.double()
+            likelihood = 0.5 * (output.variance.log() + error.square() / output.variance).mean(-1)
+            return likelihood + (output.process - levels).square().sum(-1).mean(-1)
 
         def losses(draw: Draw) -> Tensor:
             return loss_of(
@@ -316,17 +334,18 @@ class EndToEnd:
         self.offsets = np.concatenate([[0], np.cumsum(self.lengths)])
         if max(self.lengths) < training.steps:
             raise DataError(
-                f"no training recording is {training.steps} samples long, as a sequence for training through the filter is "
-                f"(the longest has {max(self.lengths)}); lower training.steps"
+                f"no training recording is {training.steps} samples long, as a sequence for "
+                f"training through the filter is (the longest has {max(self.lengths)}); lower "
+                "training.steps"
             )
-        taken = [
+        split = [
             estimator.split_samples(recording.stack(estimator.channels)) for recording in recordings
         ]
         self.measured, self.driven = (
-            torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True)
+            torch.as_tensor(np.concatenate(part)) for part in zip(*split, strict=True)
         )
         self.trusted = torch.as_tensor(
-            np.concatenate([estimator.trusts_forces(part[0][:, 0]) for part in taken])
+            np.concatenate([estimator.trusts_forces(part[0][:, 0]) for part in split])
         )
         self.sideslip = torch.as_tensor(
             np.concatenate([reference_sideslip(recording) for recording in recordings])
@@ -338,7 +357,7 @@ class EndToEnd:
         self.lost = 0
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
-        """As many sequences of each recording as fit into it, from an offset that is drawn, in random order."""
+        """Sequences of each recording from a random offset on, as many as fit, in random order."""
         for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(
             self.training.batch_size
         ):
@@ -359,13 +378,18 @@ class EndToEnd:
         )
 
     def loss(self, batch: Cuts) -> Tensor:
-        """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad², or deg² if the settings say so].
+        """Sum of the mean squared errors of the network's angle and of the filter's (Eq. 7).
+
+        It is in rad², or in deg² if the settings say so.
 
         Beyond ``training.loss_limit`` squares are continued by their tangents (`robust_squares`).
 
         Cuts whose covariance or gradient is not finite are left out and counted.
 
-        Raises `DivergenceError`: that is more than half of the batch.
+        Raises
+        ------
+        DivergenceError
+            That is more than half of the batch.
         """
         estimator = self.estimator
         count, steps = batch.sideslip.shape
@@ -376,11 +400,11 @@ class EndToEnd:
         lost = torch.zeros(count, dtype=torch.bool)
         if outputs.requires_grad:
             outputs.register_hook(lambda gradient: self._cleaned(gradient, batch, lost))
-        found = estimator.output_of(outputs)
+        output = estimator.output_of(outputs)
         initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
-        measurements = torch.cat([batch.measured, found.sideslip.unsqueeze(-1)], -1)
-        process = torch.diag_embed(found.process.square())
-        noise = with_variance(self.sensors[batch.trusted.long()], found.variance)
+        measurements = torch.cat([batch.measured, output.sideslip.unsqueeze(-1)], -1)
+        process = torch.diag_embed(output.process.square())
+        noise = with_variance(self.sensors[batch.trusted.long()], output.variance)
         filtered = self.filter.filtered(
             measurements, batch.driven, process, noise, initial
         ).steps.filtered
@@ -392,36 +416,37 @@ class EndToEnd:
         limit = math.radians(self.training.loss_limit)
         errors = [
             robust_squares((batch.sideslip - angle)[~lost], limit).mean()
-            for angle in (found.sideslip, sideslip)
+            for angle in (output.sideslip, sideslip)
         ]
         return (errors[0] + errors[1]) * (
             math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0
         )
 
     def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
-        """A gradient, (B, T, 4), that is zero for sequences that are lost, or for which it is not finite."""
+        """A gradient, (B, T, 4), that is zero for lost sequences and where it is not finite."""
         bad = ~torch.isfinite(gradient).all(-1)
         bad[lost] = False
         lost = lost | self._account(bad, batch, "gradient")
         return torch.where(lost[:, None, None], 0.0, gradient)
 
-    def _account(self, bad: Tensor, batch: Cuts, what: str) -> Tensor:
-        """Which sequences are lost, (B,), of where something is not finite, (B, T); counts them, and stops if they are too many."""
+    def _account(self, bad: Tensor, batch: Cuts, quantity: str) -> Tensor:
+        """Count the sequences with samples that are not finite, ``bad`` (B, T); return them."""
         lost = bad.any(1)
         number = int(lost.sum())
         self.lost += number
-        if number > MOST_LOST * len(lost):
+        if number > MAX_LOST_SHARE * len(lost):
             row = int(lost.int().argmax())
             step = int(bad[row].int().argmax())
             raise DivergenceError(
-                f"training: phase 'end_to_end': the filter's {what} is not finite at {self.place(int(batch.firsts[row]) + step)} "
-                f"(step {step + 1} of a sequence), nor in {number} of the batch's {len(lost)} sequences; "
-                f"lower training.end_to_end.learning_rate or check the data with 'vehest data check'"
+                f"training: phase 'end_to_end': the filter's {quantity} is not finite at "
+                f"{self.place(int(batch.firsts[row]) + step)} (step {step + 1} of a sequence), "
+                f"nor in {number} of the batch's {len(lost)} sequences; lower "
+                "training.end_to_end.learning_rate or check the data with 'vehest data check'"
             )
         return lost
 
     def place(self, sample: int) -> str:
-        """Which sample of which recording one of all training samples is."""
+        """Recording and time of one of all training samples, for messages."""
         number = int(np.searchsorted(self.offsets, sample, side="right")) - 1
         recording = self.recordings[number]
         time = recording.start_time + (sample - int(self.offsets[number])) / recording.rate_hz

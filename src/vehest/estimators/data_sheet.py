@@ -14,11 +14,12 @@ from vehest.estimators.recursive import Recursive
 
 
 class DataSheet(Recursive):
-    """v = r (l_r - u² / (c g)): the static map of a car on linear tyres whose stiffness is c times their load.
+    """v = r (l_r - u² / (c g)), for a car on linear tyres whose stiffness is c times their load.
 
-    From the steady cornering of a linear single track, v = r (l_r - m l_f u² / (l C_r)): the rear axle carries m g l_f / l, and with
-    C_r = c m g l_f / l mass and load cancel. Tyres of road and race cars have c of 6 to 15 per rad (Milliken & Milliken, Race Car Vehicle
-    Dynamics, 1995); 10 is assumed where nothing better is known.
+    From the steady cornering of a linear single track, v = r (l_r - m l_f u² / (l C_r)): the rear
+    axle carries m g l_f / l, and with C_r = c m g l_f / l mass and load cancel. Tyres of road and
+    race cars have c of 6 to 15 per rad (Milliken & Milliken, Race Car Vehicle Dynamics, 1995); 10
+    is assumed where nothing better is known.
     """
 
     name = "data_sheet"
@@ -55,7 +56,8 @@ class DataSheet(Recursive):
             )
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
-                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+                "estimator.cg_to_rear_axle must lie between 0 and the wheelbase "
+                f"({self.wheelbase} m), not at {self.cg_to_rear_axle}"
             )
 
     @property
@@ -71,7 +73,7 @@ class DataSheet(Recursive):
         }, state
 
     def c_values(self) -> dict[str, Any]:
-        """What the data sheet says."""
+        """Numbers of the data sheet for the C template."""
         about = "Steady cornering of a linear single track from a data sheet."
         return {
             "about": about,

@@ -1,5 +1,6 @@
-"""Unscented Kalman filter on a single track with Dugoff tyres: the model-based part of Bertipaglia
-et al. 2024.
+"""Unscented Kalman filter on a single track with Dugoff tyres.
+
+Source: the model-based part of Bertipaglia et al. 2024.
 
     training recordings --identify--> tyres of both axles, noise levels
     ay, yaw_rate, tyre forces --`DugoffFilter`--> vy, yaw rate
@@ -29,19 +30,11 @@ from vehest.estimators.base import (
     require_within_bounds,
 )
 from vehest.estimators.filtering.dugoff_filter import (
-    CHANNELS as CHANNELS,
-)
-from vehest.estimators.filtering.dugoff_filter import (
+    CHANNELS,
     INERTIAL,
     Curve,
     DugoffFilter,
     Inputs,
-)
-from vehest.estimators.filtering.dugoff_filter import (
-    PseudoMeasurement as PseudoMeasurement,
-)
-from vehest.estimators.filtering.dugoff_filter import (
-    with_variance as with_variance,
 )
 from vehest.estimators.filtering.dugoff_identification import (
     identify_tyres,
@@ -111,7 +104,10 @@ LEVELS = tuple(entry.name for entry in fields(TrackLevels))
 
 @dataclass(frozen=True)
 class AxleTyres(Group):
-    """Dugoff's parameters of both axles, all or none; where they are not given, the fit finds them."""
+    """Dugoff's parameters of both axles, all or none.
+
+    Where they are not given, the fit finds them.
+    """
 
     group = "estimator.tyres"
     cornering_stiffness_front: float | None = setting(
@@ -162,7 +158,8 @@ class DugoffUkf(DugoffFilter):
         Trial(
             9,
             "unscented filter with Dugoff tyres; minutes",
-            "estimator.inputs=imu {car} training.method=nelder_mead training.grid=1 training.max_evaluations=40 "
+            "estimator.inputs=imu {car} training.method=nelder_mead training.grid=1 "
+            "training.max_evaluations=40 "
             "training.tyres_from='*' training.restarts=1 training.generations=60",
         ),
     )
@@ -172,7 +169,8 @@ class DugoffUkf(DugoffFilter):
     skippable: ClassVar[tuple[str, ...]] = ("yaw_rate", "ay", *CHANNELS["full"][len(INERTIAL) :])
     inputs: Inputs = setting(
         "full",
-        "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car",
+        "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on "
+        "any car",
     )
     curve: Curve = setting(
         "plain", "tyres of Eq. 9 (plain) or 10 (smooth), as in training through the filter"
@@ -191,8 +189,8 @@ class DugoffUkf(DugoffFilter):
     )
     correlated_samples: float = setting(
         1.0,
-        "samples over which errors of sensors are alike, by which their variance is larger; about rate_hz / (2 f) of white noise behind a "
-        "low-pass of f Hz",
+        "samples over which errors of sensors are alike, by which their variance is larger; "
+        "about rate_hz / (2 f) of white noise behind a low-pass of f Hz",
         positive=True,
     )
     noise: TrackLevels = setting(TrackLevels(), "standard deviations; null: found by the training")
@@ -221,7 +219,8 @@ class DugoffUkf(DugoffFilter):
         """
         if not self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
-                f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
+                "estimator.linear_below must lie between 0 and nonlinear_from "
+                f"({self.nonlinear_from:g}), not at {self.linear_below:g}"
             )
 
     @property
@@ -231,14 +230,17 @@ class DugoffUkf(DugoffFilter):
 
     @property
     def variant(self) -> str:
-        """What is measured, the curve, and the gate."""
+        """Name with what is measured, the curve, and the gate."""
         s = self.settings
         return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
         """Title with what is measured, and the gate."""
-        return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{self.gate_title}"
+        return (
+            f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre "
+            f"forces{self.gate_title}"
+        )
 
     @property
     def n_parameters(self) -> int:
@@ -255,8 +257,9 @@ class DugoffUkf(DugoffFilter):
     def fit_members(
         cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
     ) -> list[FitRecord]:
-        """Identify tyres, read sensors' levels, find the process noise, each where it is not given;
-        see `IdentificationSettings`.
+        """Identify tyres, levels of sensors and process noise, each where it is not given.
+
+        See `IdentificationSettings`.
         """
         return [member.identify(data, training, context) for member in members]
 
@@ -280,7 +283,7 @@ class DugoffUkf(DugoffFilter):
         if training.method == "data":
             self.levels |= {name: ASSUMED_LEVELS[name] for name in searched}
         elif searched:
-            search = search_levels(self, searched, data.train, training, self._seed, context)
+            search = search_levels(self, searched, data.train, training, self.fit_seed, context)
             history = search.history(searched)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
@@ -297,8 +300,9 @@ class DugoffUkf(DugoffFilter):
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
 
     def _identify_tyres(self, data: FitData, training: IdentificationSettings) -> dict[str, float]:
-        """Set the tyres; returns them with half of the range over restarts and the rms of residual
-        forces [N].
+        """Set the tyres.
+
+        Returns them with half of the range over restarts and the rms of residual forces [N].
         """
         fit = identify_tyres(
             data.train,
@@ -307,7 +311,7 @@ class DugoffUkf(DugoffFilter):
             training,
             minimum_speed=self.minimum_speed,
             has_forces=self.inputs == "full",
-            seed=self._seed,
+            seed=self.fit_seed,
         )
         self.axle_tyres = fit.parameters.ravel()
         return {
@@ -321,17 +325,19 @@ class DugoffUkf(DugoffFilter):
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Tyre parameters in the order of `AxleTyres`, and levels of noise in that of
-        `level_names`.
-        """
+        """Tyre parameters in the order of `AxleTyres`, levels in that of `level_names`."""
         return {
             "tyres": self.axle_tyres.copy(),
             "levels": np.array([self.levels[name] for name in self.level_names]),
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take tyres and levels back; raises `DataError`: they do not fit, or are out of their
-        settings' bounds.
+        """Take tyres and levels back.
+
+        Raises
+        ------
+        DataError
+            They do not fit, or are out of their settings' bounds.
         """
         require_shapes(
             self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()}
@@ -346,13 +352,13 @@ class DugoffUkf(DugoffFilter):
         self.levels = levels
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` where a level is searched, or tyres are identified without a sideslip angle."""
+        """``vy_ref`` for a searched level, or for tyres without a reference of sideslip."""
         if training.method != "data" and self.noise.unknown(SEARCHED[self.inputs]):
             return ("vy_ref",)
         return () if self.tyres.has_values or "sideslip_ref" in channels else ("vy_ref",)
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Where no recording matches the pattern that names those to identify tyres on."""
+        """An override for tyres where no recording matches ``training.tyres_from``."""
         if self.tyres.has_values or any(
             fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings
         ):

@@ -1,4 +1,4 @@
-"""Unscented filter with a deep ensemble's mean and variance as a measurement of the sideslip angle (DE-UKF)."""
+"""Unscented filter that measures the sideslip angle by a deep ensemble (DE-UKF)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import MAX_WIDTH, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
+from vehest.estimators.network_ukf import MIN_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import IdentificationSettings
@@ -27,7 +27,7 @@ BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
 STARTS = ((-2.0, 2.0), (0.5, 1.5))
 ROUNDING = 1e-9  # by which a search may end beyond the box
-LEAST_SPREAD = 1e-12  # rad², of models that agree to the last digit
+MIN_SPREAD = 1e-12  # rad², of models that agree to the last digit
 MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
 
 
@@ -40,7 +40,8 @@ class EnsembleSettings(SampleSettings):
     )
     scaling_trials: int = setting(
         60,
-        "evaluations of Optuna for p₁ and p₂ of Eq. 11; Nelder-Mead has its limits in identification",
+        "evaluations of Optuna for p₁ and p₂ of Eq. 11; Nelder-Mead has its limits in "
+        "identification",
     )
     identification: IdentificationSettings = setting(
         IdentificationSettings(),
@@ -51,22 +52,27 @@ class EnsembleSettings(SampleSettings):
         super().__post_init__()
         if self.scaling_trials < self.identification.stages:
             raise ConfigurationError(
-                f"training.scaling_trials must be at least training.identification.stages, not {self.scaling_trials}"
+                "training.scaling_trials must be at least training.identification.stages, not "
+                f"{self.scaling_trials}"
             )
         if self.loss_limit:
             raise ConfigurationError(
-                "training.loss_limit is of squared errors, and the ensemble learns by a likelihood; set training.identification.error_limit"
+                "training.loss_limit is of squared errors, and the ensemble learns by a "
+                "likelihood; set training.identification.error_limit"
             )
 
 
 class EnsembleUkf(NetworkUkf):
-    """Networks that differ in initial weights, order of samples and dropout; the filter takes their mean for measured.
+    """Networks that differ in initial weights, order of samples and dropout.
 
-    Its variance is scaled, σ² → 10^p₁ (σ²)^p₂ [rad²] (Eq. 11), with p₁ and p₂ of the smallest error of the filter on the validation
-    recordings, since on those of the training the networks err less than elsewhere.
+    The filter takes their mean for measured.
 
-    Source: Bertipaglia et al. 2024, Section IV-C, after its reference 11; Lakshminarayanan, Pritzel & Blundell, Simple and scalable
-    predictive uncertainty estimation using deep ensembles, 2017.
+    Its variance is scaled, σ² → 10^p₁ (σ²)^p₂ [rad²] (Eq. 11), with p₁ and p₂ of the smallest
+    error of the filter on the validation recordings, since on those of the training the networks
+    err less than elsewhere.
+
+    Source: Bertipaglia et al. 2024, Section IV-C, after its reference 11; Lakshminarayanan, Pritzel
+    & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017.
     """
 
     name = "ensemble_ukf"
@@ -75,7 +81,8 @@ class EnsembleUkf(NetworkUkf):
         Trial(
             12,
             "filter with an ensemble's angle; minutes",
-            "estimator.inputs=imu estimator.members=5 {car} training.identification.method=nelder_mead "
+            "estimator.inputs=imu estimator.members=5 {car} "
+            "training.identification.method=nelder_mead "
             "training.identification.grid=1 training.identification.max_evaluations=40 "
             "training.identification.tyres_from='*' training.identification.restarts=1 "
             "training.identification.generations=60",
@@ -87,7 +94,8 @@ class EnsembleUkf(NetworkUkf):
     )
     variance: Literal["models", "mixture"] = setting(
         "models",
-        "that of the networks' angles, as in the paper, or with the mean of their own variances on top",
+        "that of the networks' angles, as in the paper, or with the mean of their own variances "
+        "on top",
     )
 
     def __init__(self, settings: Any) -> None:
@@ -96,7 +104,7 @@ class EnsembleUkf(NetworkUkf):
 
     @property
     def n_parameters(self) -> int:
-        """With p₁ and p₂."""
+        """Parameters of the networks, and p₁ and p₂."""
         return super().n_parameters + len(self.scaling)
 
     def new_network(self) -> SampleNetwork:
@@ -107,7 +115,7 @@ class EnsembleUkf(NetworkUkf):
         self, data: FitData, training: EnsembleSettings, context: FitContext, index: int
     ) -> FitRecord:
         """Networks, then the scaling of their variance."""
-        streams = np.random.SeedSequence([self._seed, 2]).generate_state(
+        streams = np.random.SeedSequence([self.fit_seed, 2]).generate_state(
             self.members, np.uint64
         ) >> np.uint64(1)
         record = self.fit_samples(
@@ -123,38 +131,38 @@ class EnsembleUkf(NetworkUkf):
             return record
         search = self._search(data.validation, training, context)
         self.scaling = search.best
-        found = {
+        metrics = {
             "scaling_p1": float(search.best[0]),
             "scaling_p2": float(search.best[1]),
             "best_validation_likelihood": record.metrics["best_validation_loss"],
             "best_validation_loss": search.cost,
         }
-        return FitRecord(record.history, {**record.metrics, **found}, search.interrupted)
+        return FitRecord(record.history, {**record.metrics, **metrics}, search.interrupted)
 
     def _search(
         self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext
     ) -> SearchRecord:
-        found = [
+        moments = [
             self._mean_and_variance(recording.stack(self.network_inputs))
             for recording in recordings
         ]
-        how = training.identification
+        search = training.identification
         quiet = FitContext(should_stop=context.should_stop)
 
         def cost(scaling: FloatArray) -> float:
             pseudo = [
                 PseudoMeasurement(sideslip, scaled_variance(variance, scaling, self.least_variance))
-                for sideslip, variance in found
+                for sideslip, variance in moments
             ]
             return self.mean_squared_error(
                 recordings,
-                how.skip_seconds,
-                over=how.error,
+                search.skip_seconds,
+                over=search.error,
                 pseudo=pseudo,
-                limit=how.error_limit,
+                limit=search.error_limit,
             )
 
-        return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)
+        return search.search(cost, BOX, STARTS, self.fit_seed, quiet, training.scaling_trials)
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""
@@ -172,20 +180,32 @@ class EnsembleUkf(NetworkUkf):
         return PseudoMeasurement(sideslip, scaled)
 
     def c_values(self) -> dict[str, Any]:
-        """With the scaling of the variance."""
-        own = {"scaling": self.scaling, "mixture": self.variance == "mixture"}
-        return {**super().c_values(), **own, "least_spread": LEAST_SPREAD, "most_size": MOST_SIZE}
+        """Values of filter, networks and scaling for the C template."""
+        ensemble = {"scaling": self.scaling, "mixture": self.variance == "mixture"}
+        return {
+            **super().c_values(),
+            **ensemble,
+            "least_spread": MIN_SPREAD,
+            "most_size": MOST_SIZE,
+        }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Those of filter and networks, and p₁ and p₂."""
+        """Weights of filter and networks, and p₁ and p₂."""
         return {**super().weights(), "scaling": self.scaling.copy()}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back; raises `DataError`: they do not fit, or p₁ or p₂ is outside the box that is searched."""
+        """Set weights of filter and networks, and p₁ and p₂.
+
+        Raises
+        ------
+        DataError
+            They do not fit, or p₁ or p₂ is outside the box that is searched.
+        """
         scaling = np.array(weights.get("scaling", ()), dtype=np.float64)
         if scaling.shape != (2,):
             raise DataError(
-                f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of another shape"
+                f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of "
+                "another shape"
             )
         for name, value, (low, high) in zip(("p1", "p2"), scaling.tolist(), BOX, strict=True):
             if not low - ROUNDING <= value <= high + ROUNDING:
@@ -199,10 +219,10 @@ class EnsembleUkf(NetworkUkf):
 
 
 def scaled_variance(
-    variance: FloatArray, scaling: FloatArray, least_variance: float = LEAST_VARIANCE
+    variance: FloatArray, scaling: FloatArray, least_variance: float = MIN_VARIANCE
 ) -> FloatArray:
     """10^p₁ (σ²)^p₂, and ε on top so that no filter takes it for exact; (T,) [rad²] (Eq. 11)."""
-    size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, LEAST_SPREAD))
+    size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, MIN_SPREAD))
     return least_variance + 10.0 ** np.clip(size, *MOST_SIZE)
 
 

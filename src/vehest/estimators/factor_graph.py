@@ -1,4 +1,7 @@
-"""Factor graph over the linear single track: the FG of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023."""
+"""Factor graph over the linear single track.
+
+Source: the FG of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ class FactorNoise(Group):
 
 
 class WindowState(NamedTuple):
-    """Samples of the window behind the next one, (N, 4), the first state before its measurement, and refused measurements (`Gate`)."""
+    """Samples (N, 4) before the next one, the first state before its measurement, refusals."""
 
     samples: FloatArray
     start: Gaussian[FloatArray]
@@ -57,13 +60,15 @@ class WindowState(NamedTuple):
 
 
 class FactorGraph(SideslipFilter):
-    """Factor graph of sideslip angle and yaw rate, solved as a whole or over a window that moves along.
+    """Factor graph of sideslip angle and yaw rate, solved as a whole or over a moving window.
 
-    At each sample a factor on a_y and one on r; between samples one factor for β and one for r. Given the speed the model is linear and
-    the graph a chain, so a Kalman filter and a Rauch-Tung-Striebel smoother solve it exactly.
+    At each sample a factor on a_y and one on r; between samples one factor for β and one for r.
+    Given the speed the model is linear and the graph a chain, so a Kalman filter and a
+    Rauch-Tung-Striebel smoother solve it exactly.
 
-    Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public code, from which the standard
-    deviations are. The window's estimate here is that of its newest sample, with that sample's measurements.
+    Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public
+    code, from which the standard deviations are. The window's estimate here is that of its newest
+    sample, with that sample's measurements.
     """
 
     name = "factor_graph"
@@ -71,11 +76,14 @@ class FactorGraph(SideslipFilter):
     trials = (
         Trial(
             10,
-            "factor graph over half a second, causal; nothing is learnt",
+            "factor graph over half a second, causal; nothing is fitted",
             "estimator.window=0.5 {car}",
         ),
     )
-    offline = "a factor graph over a whole recording cannot run along with a drive; set estimator.window=0.05 [s]"
+    offline = (
+        "a factor graph over a whole recording cannot run along with a drive; set "
+        "estimator.window=0.05 [s]"
+    )
     window: float | None = setting(
         None,
         "how far the graph of a causal estimate reaches back; null: one graph, offline",
@@ -86,14 +94,16 @@ class FactorGraph(SideslipFilter):
     )
 
     def check(self) -> None:
-        """Raises `ConfigurationError`: a window shorter than a sampling interval, or a gate without a window."""
+        """Raise `ConfigurationError` for a window below a sample, or a gate without a window."""
         if self.window is not None and self.intervals < 1:
             raise ConfigurationError(
-                f"estimator.window must be null or at least one sampling interval, {1 / self.rate_hz:g} s, not {self.window} s"
+                "estimator.window must be null or at least one sampling interval, "
+                f"{1 / self.rate_hz:g} s, not {self.window} s"
             )
         if self.gate is not None and self.window is None:
             raise ConfigurationError(
-                "estimator.gate needs estimator.window: one graph over a whole recording has no sample to predict"
+                "estimator.gate needs estimator.window: one graph over a whole recording has no "
+                "sample to predict"
             )
 
     @property
@@ -103,7 +113,7 @@ class FactorGraph(SideslipFilter):
 
     @property
     def causal(self) -> bool:
-        """With a window."""
+        """Whether there is a window."""
         return self.window is not None
 
     @property
@@ -118,25 +128,32 @@ class FactorGraph(SideslipFilter):
     @property
     def full_title(self) -> str:
         """Title with how it is solved."""
-        own = f"fixed lag of {self.window:g} s{self.gate_title}" if self.causal else "batch"
-        return f"{self.title}, {own}"
+        mode = f"fixed lag of {self.window:g} s{self.gate_title}" if self.causal else "batch"
+        return f"{self.title}, {mode}"
 
     def first_gaussian(
-        self, sample: FloatArray, given: Mapping[str, float]
+        self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
         """Straight ahead and unknown, or what a protocol hands over."""
-        return self.first_motion(sample, np.full(2, self.noise.first_state), given)
+        return self.first_motion(sample, np.full(2, self.noise.first_state), initial_state)
 
-    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> WindowState:  # type: ignore[override]
+    def first_state(  # type: ignore[override]
+        self, sample: FloatArray, initial_state: Mapping[str, float]
+    ) -> WindowState:
         """An empty window."""
         return WindowState(
             np.empty((0, len(self.channels))),
-            self.first_gaussian(sample, given),
+            self.first_gaussian(sample, initial_state),
             np.zeros(2, np.int64),
         )
 
-    def run(self, samples: FloatArray, state: WindowState) -> tuple[dict[str, Any], WindowState]:  # type: ignore[override]
-        """Lateral velocity [m/s] and yaw rate [rad/s]: of all samples together, or window by window."""
+    def run(  # type: ignore[override]
+        self, samples: FloatArray, state: WindowState
+    ) -> tuple[dict[str, Any], WindowState]:
+        """Lateral velocity [m/s] and yaw rate [rad/s].
+
+        Of all samples together, or window by window.
+        """
         rows = np.vstack([state.samples, samples])
         start = state.start
         refused = state.refused.copy()
@@ -181,10 +198,12 @@ class FactorGraph(SideslipFilter):
         start: Gaussian[FloatArray],
         refused: NDArray[np.int64],
     ) -> FloatArray:
-        """States of a window's samples given all of them, (N, 2), of their model and ``start``, the first state before its measurement.
+        """Smoothed states of a window's samples, (N, 2).
 
-        Samples are of ``channels``, (N, 4). Measurements of the newest that the gate refuses become NaN in them; ``refused`` is changed in
-        place, too (see `Gate`).
+        ``start`` is the first state before its measurement.
+
+        Samples are of ``channels``, (N, 4). Measurements of the newest that the gate refuses become
+        NaN in them; ``refused`` is changed in place, too (see `Gate`).
         """
         filtered = kalman_scan(model, samples[:, MEASURED], start)
         gate = self.gate_in_use()

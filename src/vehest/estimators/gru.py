@@ -1,4 +1,7 @@
-"""Gated recurrent unit, the benchmark of Gräber et al. 2019 (estimator E1) with the inputs of the KS-NN."""
+"""Gated recurrent unit with the inputs of the KS-NN.
+
+Source: the benchmark E1 of Gräber et al. 2019.
+"""
 
 from __future__ import annotations
 

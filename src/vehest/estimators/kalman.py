@@ -1,5 +1,6 @@
-"""Kalman filter over the linear single track: the KF of Leanza et al. 2021, as in Table VI of Da
-Lio et al. 2023.
+"""Kalman filter over the linear single track.
+
+Source: the KF of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
 """
 
 from __future__ import annotations
@@ -31,9 +32,7 @@ MIN_LEVEL = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
 
 @dataclass(frozen=True)
 class SensorNoise(Group):
-    """Standard deviations of the sensors' noise, given, or else read off measured signals above a
-    frequency.
-    """
+    """Standard deviations of the sensors' noise, given or read off high-passed signals."""
 
     group = "estimator.noise"
     read_from: Literal["training", "recording"] = setting(
@@ -60,8 +59,9 @@ class SensorNoise(Group):
 
 @dataclass(frozen=True)
 class SensorOffsets(Group):
-    """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within
-    a manoeuvre is in the covariance.
+    """Offsets that are states, first-order Gauss-Markov processes.
+
+    An error that is constant within a manoeuvre is in the covariance.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
     """
@@ -82,13 +82,14 @@ class SensorOffsets(Group):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Which there are."""
+        """Channels whose offset is a state."""
         return tuple(name for name in ("ay", "steer") if getattr(self, name) is not None)
 
 
 class KalmanFilter(SideslipFilter):
-    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is
-    a noisy input.
+    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r.
+
+    The steering angle is a noisy input.
 
     Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels, which
     are `values`, are standard deviations of the high-passed signals; no reference is looked at.
@@ -99,13 +100,17 @@ class KalmanFilter(SideslipFilter):
 
     name = "kalman"
     title = "Kalman filter"
-    trials = (Trial(5, "Kalman filter over a single track; only noise levels are learnt", "{car}"),)
+    trials = (
+        Trial(
+            5, "single-track (bicycle-model) Kalman filter; only noise levels are fitted", "{car}"
+        ),
+    )
     learns_from = ()
     may_be_nan = LEVELS
     template = "kalman"
     offline = (
-        "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
-        "set estimator.noise.read_from=training, or give the levels"
+        "a Kalman filter that reads its noise levels off the whole recording cannot run along "
+        "with a drive; set estimator.noise.read_from=training, or give the levels"
     )
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
     offsets: SensorOffsets = setting(
@@ -136,7 +141,7 @@ class KalmanFilter(SideslipFilter):
 
     @property
     def variant(self) -> str:
-        """Where the noise levels come from, unless it is the training; offsets and the gate."""
+        """Name with the source of noise levels, unless it is the training, offsets and gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
         offsets = "".join(f"_{name}_offset" for name in self.offsets.names)
         return self.name + noise + offsets + self.gate_suffix
@@ -154,7 +159,7 @@ class KalmanFilter(SideslipFilter):
         return self.title + noise + offsets + self.gate_title
 
     def declarations_of_values(self) -> Mapping[str, Declaration]:
-        """Those of the sensors' noise."""
+        """Declarations of the sensors' noise."""
         return self.noise.declarations()
 
     def find_numbers(
@@ -168,14 +173,15 @@ class KalmanFilter(SideslipFilter):
             recordings, self.noise.unknown, self.noise.cutoff, MIN_LEVEL
         )
 
-    def _estimate_one(
+    def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
+        """Estimate a recording, with noise levels of its own where nothing else provides them."""
         fitted = self
         if not self.causal:
             fitted = copy(self)
             fitted.values = self._levels_of([recording])
-        return super(KalmanFilter, fitted)._estimate_one(recording, initial_state)
+        return super(KalmanFilter, fitted).estimate_recording(recording, initial_state)
 
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
@@ -195,8 +201,10 @@ class KalmanFilter(SideslipFilter):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y +
-        b_ay, and wheels stand at δ - b_δ.
+        """Filter by `kalman_scan`.
+
+        a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ -
+        b_δ.
         """
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
@@ -237,7 +245,7 @@ class KalmanFilter(SideslipFilter):
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Its car, levels of noise, offsets and gate."""
+        """Car, noise levels, offsets and gate for the C template."""
         car = self.car
         decay = math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
         offsets = [

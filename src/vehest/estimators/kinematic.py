@@ -74,7 +74,7 @@ class Kinematic(Recursive):
         return {"vy": vy}, (float(vy[-1]),)
 
     def c_values(self) -> dict[str, Any]:
-        """Its time constant, and what follows from it."""
+        """Time constant, decay and gain for the C template."""
         return {
             "time_constant": self.time_constant,
             "kept": self.decay,

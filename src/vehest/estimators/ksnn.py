@@ -31,7 +31,8 @@ class Ksnn(WindowedEstimator):
         Trial(
             2,
             "the network that comes with vehest, trained on; half a minute",
-            "estimator.n_local=2 estimator.n_hidden=2 training.start_from=pretrained training.max_epochs=100 seed=range(2)",
+            "estimator.n_local=2 estimator.n_hidden=2 training.start_from=pretrained "
+            "training.max_epochs=100 seed=range(2)",
         ),
         Trial(
             3,
@@ -41,7 +42,8 @@ class Ksnn(WindowedEstimator):
     )
     template = "ksnn"
     notice = (
-        "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence;",
+        "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may "
+        "need their licence;",
         "the licence of this software grants none.",
     )
     n_local: int = setting(2, "local models P along |yaw rate|", least=1, most=MAX_WIDTH)
@@ -51,14 +53,18 @@ class Ksnn(WindowedEstimator):
     bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
     kinematic_gain: float = setting(
         0.0,
-        "lower bound of γ₁ and β₁, and 2 less it the upper bound of β₁, so that the estimate integrates a_y - ωu; not in the paper; 0: none",
+        "lower bound of γ₁ and β₁, and 2 less it the upper bound of β₁, so that the estimate "
+        "integrates a_y - ωu; not in the paper; 0: none",
         least=0.0,
         most=1.0,
     )
 
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str]:
-        """Blue with linear feedback, orange with nonlinear; darker and solid with biases (Da Lio et al. 2023, Fig. 6)."""
+        """Blue with linear feedback, orange with nonlinear.
+
+        Darker and solid with biases (Da Lio et al. 2023, Fig. 6).
+        """
         nonlinear = "nonlinear" in variant
         bias = "bias" in variant and "no_bias" not in variant
         shades = ("#f59a23", "#b8480b") if nonlinear else ("#4aa5e0", "#0b4f9c")
@@ -66,7 +72,7 @@ class Ksnn(WindowedEstimator):
 
     @property
     def kind(self) -> str:
-        """Of the feedback functions."""
+        """Whether the feedback functions are linear or nonlinear."""
         return "nonlinear" if self.n_hidden else "linear"
 
     @property
@@ -97,32 +103,34 @@ class Ksnn(WindowedEstimator):
         return KinematicsStructuredNetwork(self.settings, yaw_rate_max)
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of parameters, and of the buffer ``yaw_rate_max``."""
+        """Shapes of parameters and of the buffer ``yaw_rate_max``."""
         return kernel.shapes_of(self.n_local, self.n_hidden, bias=self.bias) | {"yaw_rate_max": ()}
 
-    def fewest_weights(self) -> int:
+    def min_weights(self) -> int:
         """All of `weight_shapes`."""
         return sum(math.prod(shape) for shape in self.weight_shapes().values())
 
-    def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
+    def predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
         """By the compiled recursion alone."""
         weights = self.weights()
-        own = self.settings
+        settings = self.settings
         flat = np.concatenate(
             [
                 weights[name].ravel()
-                for name in kernel.shapes_of(own.n_local, own.n_hidden, bias=own.bias)
+                for name in kernel.shapes_of(
+                    settings.n_local, settings.n_hidden, bias=settings.bias
+                )
             ]
         )
         samples = np.ascontiguousarray(series, dtype=flat.dtype)
         return (
-            kernel.recursion_of(own, float(weights["yaw_rate_max"]))
+            kernel.recursion_of(settings, float(weights["yaw_rate_max"]))
             .values(flat[None], samples, starts[None])[0]
             .astype(np.float64)
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Its local models and their neurons."""
+        """Local models and their neurons for the C template."""
         weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
         return kernel.c_tables(
             kernel.packed(weights),

@@ -1,5 +1,6 @@
-"""Kinematic Luenberger observer with reset: Farrelly & Wellstead 1996, as in Da Lio et al. 2023,
-Appendix A.
+"""Kinematic Luenberger observer with reset.
+
+Source: Farrelly & Wellstead 1996, as in Da Lio et al. 2023, Appendix A.
 """
 
 from __future__ import annotations
@@ -27,8 +28,7 @@ def implicit_euler_observer(
     vy: FloatArray,
     vx: FloatArray,
 ) -> None:
-    """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the
-    time of each sample, (T,).
+    """Run the observer over a recording, writing ``vy`` and ``vx`` [m/s] of each sample, (T,).
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
@@ -97,8 +97,7 @@ def observe(
 
 
 class Luenberger(Recursive):
-    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small to observe
-    anything.
+    """Kinematic observer with both poles at -α|ω|, reset where the yaw rate is too small.
 
     Source: Da Lio et al. 2023, Appendix A (gains in the order that its Appendix B implies).
     """
@@ -124,7 +123,7 @@ class Luenberger(Recursive):
         box=(0.0, 0.5),
         of_largest="yaw_rate",
     )
-    style = "#767676", "solid", "s"
+    style = "#5b8c00", "solid", "s"
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Lateral and forward velocity [m/s]."""
@@ -132,7 +131,7 @@ class Luenberger(Recursive):
         return {"vy": vy, "vx": vx}, (float(vy[-1]), float(vx[-1]))
 
     def c_values(self) -> dict[str, Any]:
-        """Its gain and threshold."""
+        """Gain and threshold for the C template."""
         return {**self.values, "step": 1.0 / self.rate_hz}
 
 

@@ -1,4 +1,7 @@
-"""Fitted estimators on disk: weights as safetensors, settings as YAML; loading executes no code from the files."""
+"""Fitted estimators on disk.
+
+Weights as safetensors, settings as YAML; loading executes no code from the files.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +29,12 @@ WEIGHTS = "model.safetensors"
 DESCRIPTION = "model.yaml"
 FORMAT = 1
 DTYPES = ("F32", "F64")
-RENAMED = {
-    "learned_ukf_variant": "learned_ukf"
-}  # former name of a family in files of a model -> name
-USUAL_SIZE = 4096
-"""A whole number among the settings that is larger than this and than the number of weights is no layer's width."""
+# former name of a family in files of a model -> name
+RENAMED = {"learned_ukf_variant": "learned_ukf"}
+MIN_CHECKED_SIZE = 4096
+"""A whole number among the settings that is larger than this and than the number of weights is no
+layer's width.
+"""
 
 
 def current_name(estimator: str) -> str:
@@ -48,16 +52,15 @@ class About:
     trained_on: tuple[str, ...] = ()  # ranges
     validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
     n_parameters: int | None = None
-    downsample: Preparation = field(
-        default_factory=Preparation
-    )  # how recordings were brought to its rate
+    # how recordings were brought to its rate
+    downsample: Preparation = field(default_factory=Preparation)
     interrupted: bool = False
     note: str = ""  # what people should know of its estimates
 
 
 @dataclass(frozen=True)
 class Description:
-    """What model.yaml says."""
+    """Content of model.yaml."""
 
     format: int  # version of the layout
     estimator: str  # name in the registry, never an import path
@@ -69,9 +72,16 @@ class Description:
 
 
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
-    """Write a fitted estimator into an existing folder; ``about`` are plain values of `About`, and others for people.
+    """Write a fitted estimator into an existing folder.
 
-    Raises `DataError`: a weight is not finite, before anything is written. Raises `OSError`: it cannot be written.
+    ``about`` are plain values of `About`, and others for people.
+
+    Raises
+    ------
+    DataError
+        A weight is not finite, before anything is written.
+    OSError
+        It cannot be written.
     """
     weights = estimator.weights()
     trained_on = ", ".join((about or {}).get("trained_on", ())) or "its recordings"
@@ -79,8 +89,9 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
         n_bad = _count_not_finite(estimator, name, values)
         if n_bad:
             raise DataError(
-                f"estimator '{estimator.name}': {n_bad} of the {values.size} numbers of '{name}' are not finite "
-                f"after the training on {trained_on}, which does not determine them; train it on other drives"
+                f"estimator '{estimator.name}': {n_bad} of the {values.size} numbers of '{name}' "
+                f"are not finite after the training on {trained_on}, which does not determine "
+                "them; train it on other drives"
             )
     description = {
         "format": FORMAT,
@@ -103,8 +114,13 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
 def load_model(folder: Path) -> Estimator:
     """Read a fitted estimator back.
 
-    Raises `MissingError`: there is no model. Raises `DataError`: a file is damaged or of another format, the estimator is unknown, a weight
-    is not finite, or the weights do not fit the settings.
+    Raises
+    ------
+    MissingError
+        There is no model.
+    DataError
+        A file is damaged or of another format, the estimator is unknown, a weight is not
+        finite, or the weights do not fit the settings.
     """
     description = read_description(folder)
     path = folder / DESCRIPTION
@@ -114,8 +130,9 @@ def load_model(folder: Path) -> Estimator:
         raise DataError(f"'{path}': {error}") from None
     if description.version != kind.version:
         raise DataError(
-            f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates differ from those of version {kind.version} "
-            f"here; train it again, or use the vehest that trained it"
+            f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates "
+            f"differ from those of version {kind.version} here; train it again, or use the vehest "
+            "that trained it"
         )
     weights = _read_weights(folder, kind)
     estimator = _built(
@@ -133,9 +150,14 @@ def load_model(folder: Path) -> Estimator:
 
 
 def read_description(folder: Path) -> Description:
-    """What a model folder says about itself.
+    """Read the description of a model folder.
 
-    Raises `MissingError`: there is no model. Raises `DataError`: the description is damaged, or of another format.
+    Raises
+    ------
+    MissingError
+        There is no model.
+    DataError
+        The description is damaged, or of another format.
     """
     path = folder / DESCRIPTION
     try:
@@ -151,7 +173,9 @@ def read_description(folder: Path) -> Description:
 
 
 def model_digest(folder: Path) -> str:
-    """SHA-256 of what determines a model's estimates: its weights, and of its description all but words for people.
+    """SHA-256 of what determines a model's estimates.
+
+    Its weights, and of its description all but words for people.
 
     Raises `MissingError` or `DataError`: a file is missing or damaged.
     """
@@ -170,41 +194,48 @@ def model_digest(folder: Path) -> str:
 def _built(
     kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path
 ) -> Estimator:
-    """An estimator of these settings, once they are known to ask for no more parameters than there are weights.
+    """Build an estimator, unless its settings need more parameters than there are weights.
 
-    Raises `DataError`: they ask for more, or make no sense.
+    Raises
+    ------
+    DataError
+        They ask for more, or make no sense.
     """
-    for name, number in _whole_numbers(settings, "settings"):
-        if number > max(USUAL_SIZE, n_weights):
+    for name, number in _integers(settings, "settings"):
+        if number > max(MIN_CHECKED_SIZE, n_weights):
             raise DataError(
-                f"'{path}': {name} is {number:.4g}, and {WEIGHTS} holds {n_weights} numbers; the two do not belong together"
+                f"'{path}': {name} is {number:.4g}, and {WEIGHTS} holds {n_weights} numbers; the "
+                "two do not belong together"
             )
     try:
-        own = validated(kind.settings_type, dict(settings), f"'{path}'", group="settings")
+        validated_settings = validated(
+            kind.settings_type, dict(settings), f"'{path}'", group="settings"
+        )
         try:
-            needed = kind(own).fewest_weights()
+            n_required = kind(validated_settings).min_weights()
         except NotImplementedError:  # of torch, where building it needs values of tensors
-            needed = 0
+            n_required = 0
         except (RuntimeError, TypeError, ValueError, OverflowError) as error:
             raise DataError(
                 f"'{path}': no estimator can be built with these settings ({first_line(error)})"
             ) from error
-        if needed > n_weights:
+        if n_required > n_weights:
             raise DataError(
-                f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its settings: they need {needed}"
+                f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its "
+                f"settings: they need {n_required}"
             )
-        return kind(own)
+        return kind(validated_settings)
     except ConfigurationError as error:
         raise DataError(f"'{path}': {error}") from None
 
 
-def _whole_numbers(content: Any, name: str) -> Iterator[tuple[str, int]]:
+def _integers(content: Any, name: str) -> Iterator[tuple[str, int]]:
     """Dotted names and values of the whole numbers in plain values."""
     if isinstance(content, int) and not isinstance(content, bool):
         yield name, content
     elif isinstance(content, Mapping | list):
         for key, inner in content.items() if isinstance(content, Mapping) else enumerate(content):
-            yield from _whole_numbers(inner, f"{name}.{key}")
+            yield from _integers(inner, f"{name}.{key}")
 
 
 def _count_not_finite(
@@ -217,7 +248,12 @@ def _count_not_finite(
 def _read_weights(folder: Path, kind: type[Estimator]) -> dict[str, np.ndarray[Any, Any]]:
     """Weights by name; what a tensor takes in memory is in the file.
 
-    Raises `MissingError`: there are none. Raises `DataError`: the file is damaged, or holds other numbers than finite float32 and float64.
+    Raises
+    ------
+    MissingError
+        There are none.
+    DataError
+        The file is damaged, or holds other numbers than finite float32 and float64.
     """
     path = folder / WEIGHTS
     try:
@@ -231,7 +267,8 @@ def _read_weights(folder: Path, kind: type[Estimator]) -> dict[str, np.ndarray[A
                 dtype = file.get_slice(name).get_dtype()
                 if dtype not in DTYPES:
                     raise DataError(
-                        f"'{path}': tensor '{name}' is of type {dtype}, not one of: {', '.join(DTYPES)}"
+                        f"'{path}': tensor '{name}' is of type {dtype}, not one of: "
+                        f"{', '.join(DTYPES)}"
                     )
                 weights[name] = file.get_tensor(name)
     except (SafetensorError, OSError, ValueError) as error:
@@ -242,6 +279,7 @@ def _read_weights(folder: Path, kind: type[Estimator]) -> dict[str, np.ndarray[A
         n_bad = _count_not_finite(kind, name, values)
         if n_bad:
             raise DataError(
-                f"'{path}': {n_bad} of the {values.size} numbers of tensor '{name}' are not finite; train the model again"
+                f"'{path}': {n_bad} of the {values.size} numbers of tensor '{name}' are not "
+                "finite; train the model again"
             )
     return weights

@@ -1,4 +1,7 @@
-"""Base of estimators whose weights are those of a network: initial weights, parameters, saving, training member by member."""
+"""Base of estimators whose weights are those of a network.
+
+Initial weights, parameters, saving, training member by member.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ SCALES = ("input_scale", "output_scale", "input_span", "unit", "yaw_rate_max")
 class Network(Estimator):
     """An estimator with a ``network``, any ``nn.Module``.
 
-    A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
+    A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its
+    own `fit_members`.
     """
 
     learns = True  # always
@@ -37,7 +41,7 @@ class Network(Estimator):
 
     @cached_property
     def network(self) -> Any:
-        """Its network, built and loaded when it is first asked for, since it needs torch."""
+        """The network, built and loaded when it is first used, since it needs torch."""
         import torch
 
         from vehest.training.members import random_numbers
@@ -57,7 +61,7 @@ class Network(Estimator):
     def fit_member(
         self, data: FitData, training: Any, context: FitContext, index: int
     ) -> FitRecord:
-        """Train this one, whose place among the members is ``index``; see `fit_members`."""
+        """Train one estimator; ``index`` is its place among the members, see `fit_members`."""
         raise NotImplementedError(f"{type(self).__name__} has no method 'fit_member'")
 
     @classmethod
@@ -77,8 +81,8 @@ class Network(Estimator):
             parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad
         )
 
-    def fewest_weights(self) -> int:
-        """Its parameters, found without room for them."""
+    def min_weights(self) -> int:
+        """Number of parameters, without memory for them."""
         import torch
 
         with torch.device("meta"):

@@ -1,4 +1,7 @@
-"""Unscented filter of a single track with a network's sideslip angle among its measurements: base of such methods."""
+"""Unscented filter of a single track with a network's sideslip angle among its measurements.
+
+Base of such methods.
+"""
 
 from __future__ import annotations
 
@@ -13,25 +16,29 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.dugoff_ukf import CHANNELS, DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.dugoff_filter import CHANNELS, PseudoMeasurement
 from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetworkEstimator
 from vehest.training.context import FitContext
 
-LEAST_VARIANCE = 1e-6
+MIN_VARIANCE = 1e-6
 """Usual ε of Bertipaglia et al. 2024, Eq. 6 [rad²]: a deviation of 0.057°."""
 
 
 class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
-    """A `DugoffUkf` that also measures the sideslip angle that a network derives from the same sample (Bertipaglia et al. 2024, Eq. 4).
+    """A `DugoffUkf` that also measures a network's sideslip angle of the same sample.
 
-    Filter and network are fitted in one training: the filter first, as it would be alone with the same seed. A network needs every sample,
-    so that gaps are refused.
+    Source: Bertipaglia et al. 2024, Eq. 4.
+
+    Filter and network are fitted in one training: the filter first, as it would be alone with the
+    same seed. A network needs every sample, so that gaps are refused.
     """
 
     skippable = ()
     least_variance: float = setting(
-        LEAST_VARIANCE,
-        "added to the variance of the network's angle, so that no filter takes it for exact; ε of Eq. 6",
+        MIN_VARIANCE,
+        "added to the variance of the network's angle, so that no filter assumes it to be exact; "
+        "ε of Eq. 6",
         unit="rad²",
         positive=True,
     )
@@ -43,7 +50,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @abstractmethod
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """What the network adds to samples (T, C) of ``network_inputs``."""
+        """Sideslip angle, variance and process noise by the network, of samples (T, C)."""
 
     @abstractmethod
     def fit_network(
@@ -53,7 +60,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @property
     def variant(self) -> str:
-        """Which inputs it sees, and the gate."""
+        """Name of the family with the network's inputs and the gate."""
         return self.inputs + self.gate_suffix + NAMED[self.normalisation]
 
     @property
@@ -68,34 +75,34 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         of_filter = self.identify(
             data, training.identification, FitContext(should_stop=context.should_stop)
         )
-        if (
-            of_filter.interrupted
-        ):  # the network must see the filter that the whole identification finds
+        # the network must see the filter that the whole identification finds
+        if of_filter.interrupted:
             return FitRecord({}, {"best_epoch": 0}, True)
         record = self.fit_network(data, training, context, index)
         seconds = of_filter.metrics["train_seconds"]
-        found = {
+        levels = {
             name: value for name, value in of_filter.metrics.items() if name.startswith("noise_")
         }
-        metrics = {**record.metrics, **found, "identification_seconds": seconds}
+        metrics = {**record.metrics, **levels, "identification_seconds": seconds}
         metrics["train_seconds"] = record.metrics["train_seconds"] + seconds
         return FitRecord(record.history, metrics, record.interrupted)
 
-    def seen(self, samples: FloatArray) -> FloatArray:
-        """What the network sees of samples (T, n) of ``channels``, (T, C)."""
+    def network_samples(self, samples: FloatArray) -> FloatArray:
+        """Columns of samples (T, n) of ``channels`` that the network reads, (T, C)."""
         return samples[:, [self.channels.index(name) for name in self.network_inputs]]
 
     def pseudo_measurements(self, recordings: Sequence[Recording]) -> list[PseudoMeasurement]:
-        """Of each recording."""
+        """Angle and variance of each recording by the network."""
         return [
-            self.pseudo_of(self.seen(recording.stack(self.channels))) for recording in recordings
+            self.pseudo_of(self.network_samples(recording.stack(self.channels)))
+            for recording in recordings
         ]
 
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """With the network's angle and its variance; its process noise holds for the next step."""
-        added = self.pseudo_of(self.seen(sample[None]))
+        """Add the network's angle and its variance; its process noise is that of the next step."""
+        added = self.pseudo_of(self.network_samples(sample[None]))
         if added.process is not None:
             memory["noise"] = np.diag(added.process[0])
         return np.append(measurement, added.sideslip), np.diag(
@@ -103,22 +110,24 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         )
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Those of the filter and of the network."""
+        """Weights of the filter, ``filter.…``, and of the network, ``network.…``."""
         parts = {"filter": DugoffUkf.weights(self), "network": SampleNetworkEstimator.weights(self)}
         return {
-            f"{part}.{name}": values for part, own in parts.items() for name, values in own.items()
+            f"{part}.{name}": values
+            for part, weights_of_part in parts.items()
+            for name, values in weights_of_part.items()
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back."""
+        """Set weights of the filter and of the network."""
         parts: dict[str, dict[str, np.ndarray[Any, Any]]] = {"filter": {}, "network": {}}
         for name, values in weights.items():
-            part, _, own = name.partition(".")
+            part, _, weight_name = name.partition(".")
             if part not in parts:
                 raise DataError(
                     f"weights of '{self.name}' do not fit its settings: '{name}' is unknown"
                 )
-            parts[part][own] = values
+            parts[part][weight_name] = values
         DugoffUkf.load_weights(self, parts["filter"])
         SampleNetworkEstimator.load_weights(self, parts["network"])
 
@@ -127,12 +136,14 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         return self.learns_from
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Those of the filter's identification."""
-        found = super().unmatched_patterns(training.identification, recordings)
-        return tuple(one.replace("training.", "training.identification.", 1) for one in found)
+        """Overrides that the filter's identification needs."""
+        patterns = super().unmatched_patterns(training.identification, recordings)
+        return tuple(
+            pattern.replace("training.", "training.identification.", 1) for pattern in patterns
+        )
 
     def c_values(self) -> dict[str, Any]:
-        """Filter and network."""
+        """Values of filter and network for the C template."""
         values = {**super().c_values(), **self.network.c_values()}
         return values | {
             "network": True,

@@ -1,4 +1,4 @@
-"""Baseline: steady cornering with the priors of the self-calibrating filter; nothing is learnt and nothing is identified."""
+"""Baseline: steady cornering with the priors of the self-calibrating filter, without a fit."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from vehest.estimators.self_calibrating import SCALED, TYPICAL_REAR, TYPICAL_WHE
 
 
 class PriorMap(Recursive):
-    """v = r (b - C u²) with the prior means of b and C: what an estimate for a car that nobody has trained on has to beat.
+    """v = r (b - C u²) with the prior means of b and C.
 
-    It is the steady cornering of a linear single track (Mitschke & Wallentowitz, Dynamik der Kraftfahrzeuge), with the compliance C
-    of a typical rear axle. `SelfCalibrating` starts from the same numbers; `StaticMap` fits its two to a reference.
+    What an estimate for a car that nobody has trained on has to beat.
+
+    It is the steady cornering of a linear single track (Mitschke & Wallentowitz, Dynamik der
+    Kraftfahrzeuge), with the compliance C of a typical rear axle. `SelfCalibrating` starts from the
+    same numbers; `StaticMap` fits its two to a reference.
     """
 
     name = "prior_map"
@@ -26,7 +29,7 @@ class PriorMap(Recursive):
     trials = (
         Trial(
             1.2,
-            "baseline: steady cornering of a typical car; nothing is learnt",
+            "baseline: steady cornering of a typical car; nothing is fitted",
             "estimator.wheelbase={wheelbase}",
         ),
     )
@@ -37,7 +40,7 @@ class PriorMap(Recursive):
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(
         UNSET,
-        "distance b of the point where v holds from the rear axle; null: 0.48 wheelbases",
+        "distance b from the rear axle to the point at which v is estimated; null: 0.48 wheelbases",
         unit="m",
     )
     compliance: float = setting(
@@ -48,7 +51,8 @@ class PriorMap(Recursive):
         """Raises `ConfigurationError`: a point outside of the wheelbase."""
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
-                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+                "estimator.cg_to_rear_axle must lie between 0 and the wheelbase "
+                f"({self.wheelbase} m), not at {self.cg_to_rear_axle}"
             )
 
     @property
@@ -71,7 +75,7 @@ class PriorMap(Recursive):
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its two numbers."""
+        """The numbers b and k of the C template."""
         about = "Steady cornering of a linear single track with typical numbers."
         return {"about": about, "b": self.b, "k": self.k}
 

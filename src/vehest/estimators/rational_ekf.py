@@ -1,8 +1,10 @@
-"""Kalman filter of a single track whose tyre model adapts: Di Biase, Lenzo & Timpone, IEEE Access
-8, 2020.
+"""Kalman filter of a single track whose tyre model adapts.
+
+Di Biase, Lenzo & Timpone, IEEE Access 8, 2020.
 
     training recordings --fit--> axle curves, their covariance, noise levels
-    yaw_rate, vx, ay, steer --filter_samples--> β, r and tyre parameters --run--> vy, cornering stiffnesses
+    yaw_rate, vx, ay, steer --filter_samples--> β, r, tyre parameters
+    --run--> vy, cornering stiffnesses
 
 This module declares the estimator: settings, fitted numbers, names, files. The filters are in
 `filtering.rational_model`, the fit in `filtering.rational_fit`, values for C in
@@ -71,8 +73,9 @@ COVARIANCE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class TrackNoise(Group):
-    """Standard deviations, those of the three sensors all or none; where they are not given, the
-    fit finds them.
+    """Standard deviations, those of the three sensors all or none.
+
+    Where they are not given, the fit finds them.
     """
 
     group = "estimator.noise"
@@ -85,7 +88,8 @@ class TrackNoise(Group):
     )
     tyres: float | None = setting(
         None,
-        "by which logarithms of tyre parameters wander; training drives on one set of tyres and one road say little of it",
+        "by which logarithms of tyre parameters wander; training drives on one set of tyres and "
+        "one road say little of it",
         unit="1/√s",
         positive=True,
     )
@@ -93,8 +97,9 @@ class TrackNoise(Group):
 
 @dataclass(frozen=True)
 class AxleCurves(Group):
-    """Axle curves at friction 1, all that the tyres need or none; where they are not given, the fit
-    finds them.
+    """Axle curves at friction 1, all that the tyres need or none.
+
+    Where they are not given, the fit finds them.
     """
 
     group = "estimator.curves"
@@ -108,7 +113,8 @@ class AxleCurves(Group):
     c2_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
     deviation: float | None = setting(
         None,
-        "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after a fit, else 0.1",
+        "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after "
+        "a fit, else 0.1",
         positive=True,
     )
 
@@ -135,13 +141,15 @@ class RationalTrack(SideslipFilter):
     rate_hz: float = rate(20.0)
     tyres: Tyres = setting(
         "rational_adaptive",
-        "linear (LINT: cornering stiffnesses are states), rational (RATT: fixed), rational_adaptive (RATTE: c₁ and c₂ of both axles are "
-        "states) or rational_friction (beyond the paper: the friction is)",
+        "linear (LINT: cornering stiffnesses are states), rational (RATT: fixed), "
+        "rational_adaptive (RATTE: c₁ and c₂ of both axles are states) or rational_friction "
+        "(beyond the paper: the friction is)",
     )
     filter: Literal["extended", "unscented"] = setting("extended", "kind of Kalman filter")
     bound: float = setting(
         3.0,
-        "factor by which tyre parameters may leave those at the start, three of their standard deviations at least",
+        "factor by which tyre parameters may leave those at the start, three of their standard "
+        "deviations at least",
         above=1.0,
     )
     largest_sideslip: float = setting(
@@ -153,7 +161,8 @@ class RationalTrack(SideslipFilter):
     )
     adapt_above: float = setting(
         0.0,
-        "lateral acceleration |u r| below which tyre parameters are held; 0: never, as in the paper",
+        "lateral acceleration |u r| below which tyre parameters are held; 0: never, as in the "
+        "paper",
         unit="m/s²",
         least=0.0,
     )
@@ -188,7 +197,8 @@ class RationalTrack(SideslipFilter):
         """
         if self.gate is not None and self.filter != "extended":
             raise ConfigurationError(
-                "estimator.gate is there for estimator.filter=extended only; set gate to null, or the filter to extended"
+                "estimator.gate is there for estimator.filter=extended only; set gate to null, "
+                "or the filter to extended"
             )
         for group, names in (("noise", LEVELS[:3]), ("curves", self.kind.curve_names)):
             values = [getattr(getattr(self, group), name) for name in names]
@@ -213,7 +223,7 @@ class RationalTrack(SideslipFilter):
         return self.kind.adapted
 
     def model(self) -> RationalModel:
-        """The model at the curves that the filter starts with, with limits and start of the filter."""
+        """The model at the curves of the filter's start, with its limits and start."""
         return RationalModel(
             self.car,
             self.axle_curves,
@@ -234,8 +244,9 @@ class RationalTrack(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """State before the first sample: straight ahead, or an initial state; tyre parameters as
-        fitted.
+        """State before the first sample.
+
+        Straight ahead, or an initial state; tyre parameters as fitted.
         """
         tyres = self.model().start_tyres
         deviation = np.array([*ROLLING, *np.zeros(len(tyres))])
@@ -274,9 +285,7 @@ class RationalTrack(SideslipFilter):
         return filter_extended(self.model(), samples, levels, first, gate, refused, crossfall)
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
-        """Cornering stiffnesses [N/rad], c₁ [rad²] and friction of states (T, n); see
-        `RationalModel`.
-        """
+        """Cornering stiffnesses [N/rad], c₁ [rad²] and friction of states (T, n)."""
         return self.model().quantities(states)
 
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
@@ -291,14 +300,16 @@ class RationalTrack(SideslipFilter):
         levels = self.values if levels is None else levels
         if has_no_curves or any(math.isnan(level) for level in levels.values()):
             raise ConfigurationError(
-                f"estimator '{self.name}' has no {'axle curves' if has_no_curves else 'noise levels'} yet; "
-                "fit or load it first, or give estimator.curves and estimator.noise"
+                f"estimator '{self.name}' has no "
+                f"{'axle curves' if has_no_curves else 'noise levels'} yet; fit or load it first, "
+                "or give estimator.curves and estimator.noise"
             )
 
 
 class RationalFilter(RationalTrack):
-    """Kalman filter of sideslip angle, yaw rate, their rates and, if adapted, tyre parameters, over
-    `TyreTrack`.
+    """Kalman filter over `TyreTrack`.
+
+    Its states are sideslip angle, yaw rate, their rates and, if adapted, tyre parameters.
 
     Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process
     noise Δt B Λ Bᵀ comes from the steering angle and the drift of tyre parameters. Below the
@@ -323,8 +334,9 @@ class RationalFilter(RationalTrack):
 
     @property
     def variant(self) -> str:
-        """The paper's name of these tyres, then: unscented filter, tyres that stay straight ahead,
-        gate.
+        """The paper's name of these tyres, then.
+
+        Unscented filter, tyres that stay straight ahead, gate.
         """
         filter_suffix = "_ukf" if self.filter == "unscented" else ""
         stay_suffix = "_held" if self.adapted and self.adapt_above > 0.0 else ""
@@ -350,7 +362,7 @@ class RationalFilter(RationalTrack):
         return n_curves + len(self.unknown_levels)
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` where curves are fitted or levels searched, unless there is a sideslip angle."""
+        """``vy_ref`` for fitted curves or searched levels, unless there is a sideslip angle."""
         is_searched = training.method != "data" and bool(searched_levels(self.unknown_levels))
         needs_none = self.curves.has_values and not is_searched
         return () if needs_none or "sideslip_ref" in channels else ("vy_ref",)
@@ -359,8 +371,9 @@ class RationalFilter(RationalTrack):
     def fit_members(
         cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext
     ) -> list[FitRecord]:
-        """Fit axle curves to the reference sideslip of the training recordings, then find the noise
-        levels; see `NoiseTuningSettings`.
+        """Fit axle curves to the reference sideslip, then search noise levels.
+
+        See `NoiseTuningSettings`.
 
         Members of one seed cannot differ, others only by Optuna's trials.
         """
@@ -413,7 +426,8 @@ class RationalFilter(RationalTrack):
         """Values of the C template; raises `ConfigurationError`: the filter is unscented."""
         if self.filter != "extended":
             raise ConfigurationError(
-                "estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended"
+                "estimator 'rational_ekf' with estimator.filter=unscented has no C; train it "
+                "with filter=extended"
             )
         tables = rational_c_values(self.model(), self.values, is_linear=self.tyres == "linear")
         return {**super().c_values(), **tables}
@@ -462,7 +476,7 @@ def _fit(
             estimator.minimum_speed,
             skip,
         )
-        outcome = search.run(training, estimator._seed, context)
+        outcome = search.run(training, estimator.fit_seed, context)
         history = outcome.history(searched)
         metrics |= {
             "evaluations": outcome.evaluations,

@@ -29,9 +29,8 @@ from vehest.estimators.base import (
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
-_numbers_type: Any = cache(
-    partial(namedtuple, "Numbers")
-)  # one type a family, so that numba compiles its ``step`` once
+# one type a family, so that numba compiles its ``step`` once
+_numbers_type: Any = cache(partial(namedtuple, "Numbers"))
 
 
 def compiled(step: Callable[..., Any]) -> Any:
@@ -40,8 +39,9 @@ def compiled(step: Callable[..., Any]) -> Any:
 
 
 class Recursive(Estimator):
-    """An observer or filter: it goes through samples in order and carries a state. Nothing in it is
-    random.
+    """An observer or filter: it goes through samples in order and carries a state.
+
+    Nothing in it is random.
 
     Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a
     setting is not fitted. A family has either a compiled ``step(numbers, state, sample)``, which
@@ -49,9 +49,8 @@ class Recursive(Estimator):
     """
 
     training_type: ClassVar[type] = NoTraining
-    states: ClassVar[tuple[str, ...]] = (
-        "vy",
-    )  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
+    # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
+    states: ClassVar[tuple[str, ...]] = ("vy",)
     refuses: ClassVar[tuple[str, ...]] = ("NaN",)
     step: ClassVar[Any]
     values: dict[str, float]  # fitted numbers by name
@@ -74,8 +73,9 @@ class Recursive(Estimator):
         self.unknown = tuple(name for name, value in fitted_settings.items() if value is None)
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
-        """The state before the first sample: that of a protocol, else what is measured, else 0; see
-        `Estimator.first_state`.
+        """The state before the first sample.
+
+        That of a protocol, else what is measured, else 0; see `Estimator.first_state`.
         """
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
         return tuple(
@@ -89,9 +89,7 @@ class Recursive(Estimator):
         return dict(zip(self.states, estimates.T.copy(), strict=True)), state
 
     def numbers(self) -> Any:
-        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes
-        them: a named tuple.
-        """
+        """Named tuple that ``step`` takes: numeric settings, fitted numbers and ``dt`` [s]."""
         numbers = {
             name: value
             for name, value in vars(self.settings).items()
@@ -100,8 +98,7 @@ class Recursive(Estimator):
         return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
-        """Numbers of the smallest mean squared error of vy, where the family has them in closed
-        form.
+        """Numbers of the smallest mean squared error of vy; None without a closed form.
 
         Raises
         ------
@@ -113,8 +110,9 @@ class Recursive(Estimator):
     def find_numbers(
         self, data: FitData, training: Any, context: FitContext
     ) -> tuple[Mapping[str, float], FitRecord]:
-        """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared
-        error of vy in training.
+        """Best values of what is not given.
+
+        In closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
 
@@ -126,12 +124,11 @@ class Recursive(Estimator):
         values = self.closed_form(data.train)
         if values is not None:
             self.values |= values
-            losses = {"best_train_loss": data.train, "best_validation_loss": data.validation}
-            return values, FitRecord(
-                metrics={
-                    name: self.mean_squared_error(recordings) for name, recordings in losses.items()
-                }
-            )
+            metrics = {
+                "best_train_loss": self.mean_squared_error(data.train),
+                "best_validation_loss": self.mean_squared_error(data.validation),
+            }
+            return values, FitRecord(metrics=metrics)
         declared = [self.settings.declarations()[name] for name in self.unknown]
         scales = [
             largest_absolute(data.train, declaration.of_largest, self.name)
@@ -151,7 +148,9 @@ class Recursive(Estimator):
             self.values |= dict(zip(self.unknown, numbers.tolist(), strict=True))
             return self.mean_squared_error(data.train)
 
-        search = nelder_mead_over_grid(cost, boxes, starts, training, context)  # type: ignore[arg-type]
+        search = nelder_mead_over_grid(  # type: ignore[arg-type]
+            cost, boxes, starts, training, context
+        )
         self.values |= dict(zip(self.unknown, search.best.tolist(), strict=True))
         metrics = {
             "evaluations": search.evaluations,
@@ -162,7 +161,7 @@ class Recursive(Estimator):
 
     @property
     def n_parameters(self) -> int:
-        """How many numbers are not given."""
+        """Number of values that are not given."""
         return len(self.unknown)
 
     @classmethod
@@ -180,22 +179,22 @@ class Recursive(Estimator):
         recursives = [member for member in members if isinstance(member, Recursive)]
         values: Mapping[str, float] = {}
         record = FitRecord()
-        if recursives[0].learns:
-            channels = (*recursives[0].channels, *recursives[0].learns_from)
+        first = recursives[0]
+        if first.learns:
             require_learnable(
                 [*data.train, *data.validation],
-                channels,
-                recursives[0].name,
-                recursives[0].skippable,
+                (*first.channels, *first.learns_from),
+                first.name,
+                first.skippable,
             )
-            values, record = recursives[0].find_numbers(data, training, context)
+            values, record = first.find_numbers(data, training, context)
         for member in recursives:
             member.values |= {name: float(value) for name, value in values.items()}
         metrics = {"epochs": 0, **record.metrics, "train_seconds": time.monotonic() - started}
         return [replace(record, metrics=metrics)] * len(members)
 
     def mean_squared_error(self, recordings: Sequence[Recording]) -> float:
-        """Of vy against ``vy_ref`` with the present `values` [m²/s²]; NaN without recordings."""
+        """Mean squared error of vy with the present `values` [m²/s²]; NaN without recordings."""
         errors = []
         for recording in recordings:
             samples = recording.stack(self.channels)
@@ -248,7 +247,7 @@ def _fitted_number(name: str) -> property:
 
 @numba.njit(error_model="numpy")
 def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
-    """State after the last sample; writes the state after each sample into ``found``, (T, n)."""
+    """State after the last sample; writes those after all samples into ``estimates``, (T, n)."""
     for k in range(len(samples)):
         state = step(numbers, state, samples[k])
         for i in range(len(state)):

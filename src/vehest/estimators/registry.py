@@ -1,7 +1,7 @@
 """Names of estimators; a name, never an import path, is what files may hold.
 
-An estimator called ``name`` is the module ``vehest.estimators.name`` with its class as ``ESTIMATOR``, or an entry point of
-another package in the group ``vehest.estimators``.
+An estimator called ``name`` is the module ``vehest.estimators.name`` with its class as
+``ESTIMATOR``, or an entry point of another package in the group ``vehest.estimators``.
 """
 
 from __future__ import annotations
@@ -26,23 +26,27 @@ ENTRY_POINTS = "vehest.estimators"
 @cache
 def estimator_names() -> list[str]:
     """Every known name: vehest's own, then those that other packages installed."""
-    own = [
+    module_names = [
         module.name
         for module in pkgutil.iter_modules(package.__path__)
-        if _own_class(module.name) is not None
+        if _class_of_module(module.name) is not None
     ]
     return [
-        *sorted(own),
-        *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in own),
+        *sorted(module_names),
+        *sorted(
+            point.name
+            for point in entry_points(group=ENTRY_POINTS)
+            if point.name not in module_names
+        ),
     ]
 
 
 @cache
 def estimator_class(name: str) -> type[Estimator]:
     """The class behind a name; raises `ConfigurationError`: the name is unknown."""
-    own = _own_class(name)
-    if own is not None:
-        return own
+    module_class = _class_of_module(name)
+    if module_class is not None:
+        return module_class
     points = entry_points(group=ENTRY_POINTS, name=name)
     if points:
         try:
@@ -87,21 +91,21 @@ def option_names() -> dict[str, list[str]]:
 
 def is_plugin(name: str) -> bool:
     """Whether an estimator comes from another package, which may raise anything."""
-    return _own_class(name) is None
+    return _class_of_module(name) is None
 
 
 def plugin_failure(name: str, failed: str, error: Exception) -> ConfigurationError:
-    """The error to raise where an estimator of another package cannot be ``failed``, as "loaded"."""
+    """The error of an estimator of another package that cannot be ``failed``, as "loaded"."""
     reason = f"{type(error).__name__}: {printable(first_line(error))}"
     return ConfigurationError(
         f"estimator '{name}' of another package cannot be {failed} ({reason}); repair or remove it"
     )
 
 
-def _own_class(name: str) -> type[Estimator] | None:
+def _class_of_module(name: str) -> type[Estimator] | None:
     if name not in {module.name for module in pkgutil.iter_modules(package.__path__)}:
         return None
-    found: type[Estimator] | None = getattr(
+    loaded_class: type[Estimator] | None = getattr(
         importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None
     )
-    return found
+    return loaded_class

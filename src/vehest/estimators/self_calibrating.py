@@ -61,7 +61,7 @@ class SelfCalibrating(Recursive):
             "estimator.wheelbase={wheelbase}",
         ),
     )
-    version = "5"
+    version = "6"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -122,7 +122,7 @@ class SelfCalibrating(Recursive):
     )
     place_deviation: float = setting(0.5, "its deviation", positive=True)
     point_deviation: float = setting(
-        0.055, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
+        0.07, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
@@ -162,19 +162,16 @@ class SelfCalibrating(Recursive):
         3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True
     )
     variance_share: float = setting(
-        0.35, "share of the filters' and candidates' variance that is reported", positive=True
-    )
-    residual_share: float = setting(
-        0.002, "share of the mean square that is left of v' that is reported, too", least=0.0
+        0.3, "share of the filters' and candidates' variance that is reported", positive=True
     )
     error_share: float = setting(
-        0.06, "share of the square of the axle's error s e that is reported, too", least=0.0
+        0.17, "share of the mean square of the axle's error s e that is reported, too", least=0.0
     )
     band_time: float = setting(
-        2.0, "time over which that mean square is taken", unit="s", positive=True
+        1.0, "time over which that mean square is taken", unit="s", positive=True
     )
     angle_floor: float = setting(
-        0.0017, "least deviation of the sideslip angle", unit="rad", least=0.0
+        0.0024, "least deviation of the sideslip angle", unit="rad", least=0.0
     )
     residual_time: float = setting(
         1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True
@@ -400,7 +397,7 @@ class SelfCalibrating(Recursive):
         (mean, deviation) = self.prior
         (grips, start) = self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
-        gains["g_recent"] = n.band_time
+        gains["g_band"] = n.band_time
         return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
             "numbers": n._asdict()
             | {name: -math.expm1(-n.dt / time) for name, time in gains.items()},
@@ -414,6 +411,7 @@ class SelfCalibrating(Recursive):
             "measured_ax": self.measured_ax,
             "least_limit": kernel.LEAST_LIMIT,
             "rolling": kernel.ROLLING,
+            "max_error_of_place": kernel.MAX_ERROR_OF_PLACE,
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:

@@ -1,4 +1,7 @@
-"""Feed-forward network from the measurements of one instant to the sideslip angle: the data-driven method of Bertipaglia et al. 2024."""
+"""Feed-forward network from the measurements of one instant to the sideslip angle.
+
+Source: the data-driven method of Bertipaglia et al. 2024.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,13 @@ from vehest.training.samples import SampleSettings
 
 
 class SideslipFfnn(SampleNetworkEstimator):
-    """Two hidden layers with rectifiers and dropout, trained on the mean squared error of the sideslip angle with early stopping.
+    """Network of two hidden layers with rectifiers and dropout.
 
-    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural network for vehicle sideslip angle
-    estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section IV-C.
+    It is trained on the mean squared error of the sideslip angle with early stopping.
+
+    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural
+    network for vehicle sideslip angle estimation, IEEE Transactions on Vehicular Technology 73 (9),
+    2024, Section IV-C.
     """
 
     name = "sideslip_ffnn"
@@ -55,19 +61,19 @@ class SideslipFfnn(SampleNetworkEstimator):
 
     @property
     def variant(self) -> str:
-        """Which inputs it sees, and how they are scaled."""
+        """Name with the inputs and their normalisation."""
         return self.inputs + NAMED[self.normalisation]
 
     @property
     def full_title(self) -> str:
-        """With its inputs."""
+        """Title with the inputs."""
         return f"{self.title}{', without tyre forces' if self.inputs == 'imu' else ''}"
 
     def fit_member(
         self, data: FitData, training: SampleSettings, context: FitContext, index: int
     ) -> FitRecord:
         """Train on samples in random order."""
-        return self.fit_samples(data, training, squared_error, context, index, [self._seed])
+        return self.fit_samples(data, training, squared_error, context, index, [self.fit_seed])
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
         """v = u tan β, each sample by itself."""
@@ -75,11 +81,11 @@ class SideslipFfnn(SampleNetworkEstimator):
         return {"vy": samples[:, self.channels.index("vx")] * np.tan(sideslip)}, None
 
     def sideslip(self, inputs: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Of measured inputs (T, C) in the order of ``channels``: (T,) [rad]."""
+        """Sideslip angle (T,) [rad] of measured inputs (T, C) in the order of ``channels``."""
         return clip_sideslip(self.network.outputs(inputs)[0, :, 0] * float(self.network.unit))
 
     def c_values(self) -> dict[str, Any]:
-        """Its network."""
+        """Values of the network for the C template."""
         return self.network.c_values()
 
 

@@ -14,7 +14,7 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
+# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified separately
 CONDITION = 1e8
 
 
@@ -34,7 +34,7 @@ class StaticMap(Recursive):
     ignores_initial_state = True
     template = "static"
     rate_hz: float = rate(20.0)
-    b: float = fitted("distance of the rear axle from the point where v holds", unit="m")
+    b: float = fitted("distance from the rear axle to the point at which v is estimated", unit="m")
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
@@ -50,7 +50,8 @@ class StaticMap(Recursive):
         scale = np.sqrt(np.mean(np.square(design), axis=0))
         if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
             raise DataError(
-                "the training recordings do not determine a static map: the car hardly turns, or always at the same speed"
+                "the training recordings do not determine a static map: the car hardly turns, or "
+                "always at the same speed"
             )
         return dict(
             zip(
@@ -66,7 +67,7 @@ class StaticMap(Recursive):
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its two numbers."""
+        """The numbers b and k of the C template."""
         return {
             "about": "Steady cornering of a linear single track, its two numbers by least squares.",
             **self.values,

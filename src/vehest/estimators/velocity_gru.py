@@ -1,4 +1,4 @@
-"""Gated recurrent unit that estimates velocities from all samples so far: Srinivasan et al. 2020."""
+"""Gated recurrent unit for velocities from all samples so far: Srinivasan et al. 2020."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class VelocityGruNetwork(VelocityNetwork):
 
     h⁺ = GRU(h, x),  y = leaky_relu(W d(h⁺) + b)         x, y standardised, d dropout
 
-    Source: Srinivasan et al., End-to-end velocity estimation for autonomous racing, IEEE RA-L 5 (4), 2020.
+    Source: Srinivasan et al., End-to-end velocity estimation for autonomous racing, IEEE RA-L 5
+    (4), 2020.
     """
 
     def __init__(self, settings: Any) -> None:
@@ -42,7 +43,10 @@ class VelocityGruNetwork(VelocityNetwork):
 
 
 class VelocityGru(RecurrentVelocityEstimator):
-    """GRU of Srinivasan et al. 2020; an ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it."""
+    """GRU of Srinivasan et al. 2020.
+
+    An ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it.
+    """
 
     name = "velocity_gru"
     title = "Velocity GRU"

@@ -17,14 +17,16 @@ from vehest.estimators.networks.velocity_recurrent import (
 
 
 class VelocityLstmNetwork(VelocityNetwork):
-    """An LSTM over the sensors, and dense layers over its hidden state and the velocities estimated one sample before.
+    """An LSTM over the sensors, and dense layers over its hidden state and the last velocities.
 
-    h⁺, c⁺ = LSTM(h, c, x),  y⁺ = W₂ relu(W₁ [d(h⁺), y] + b₁) + b₂         x, y standardised, d dropout
+    h⁺, c⁺ = LSTM(h, c, x),  y⁺ = W₂ relu(W₁ [d(h⁺), y] + b₁) + b₂
+    with x, y standardised, d dropout
 
-    The structure is the paper's as Węgrzynowski et al. 2024 describe it; one hidden dense layer, its rectifier, dropout and all
-    sizes are assumed.
+    The structure is the paper's as Węgrzynowski et al. 2024 describe it; one hidden dense layer,
+    its rectifier, dropout and all sizes are assumed.
 
-    Source: Bou Ghosn et al., Robust LSTM-based vehicle velocity observer for regular and near-limits applications, IEEE IV 2023.
+    Source: Bou Ghosn et al., Robust LSTM-based vehicle velocity observer for regular and
+    near-limits applications, IEEE IV 2023.
     """
 
     def __init__(self, settings: Any) -> None:
@@ -34,7 +36,7 @@ class VelocityLstmNetwork(VelocityNetwork):
         self.read_out = nn.Linear(settings.n_dense, len(settings.outputs))
 
     def start(self, velocities: Tensor) -> State:
-        """Hidden state and cell of zero, and the velocities as the estimate before the first sample."""
+        """Hidden state and cell of zero, and the velocities as the estimate before."""
         zeros = velocities.new_zeros(1, len(velocities), self.recurrent.hidden_size)
         return (zeros, zeros, (velocities - self.output_mean) / self.output_scale)
 
@@ -61,7 +63,10 @@ class VelocityLstmNetwork(VelocityNetwork):
 
 
 class VelocityLstm(RecurrentVelocityEstimator):
-    """Robust LSTM of Bou Ghosn et al. 2023; the previous estimate starts from ``initial_state``, else from measured velocities."""
+    """Robust LSTM of Bou Ghosn et al. 2023.
+
+    The previous estimate starts from ``initial_state``, else from measured velocities.
+    """
 
     name = "velocity_lstm"
     title = "Velocity LSTM"

@@ -27,7 +27,7 @@ class Zero(Recursive):
         return {"vy": np.zeros(len(samples))}, state
 
     def c_values(self) -> dict[str, Any]:
-        """Its equation."""
+        """The equation as a comment of the C template."""
         return {"about": "v = 0."}
 
 

@@ -16,7 +16,13 @@ from vehest.constants import FloatArray
 from vehest.evaluation.blocks import MIN_BLOCKS, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import BoolArray, Scored
 from vehest.evaluation.regimes import AY_BANDS, Mask, is_long_enough, is_represented
-from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, effective_blocks, intraclass_correlation
+from vehest.trust.bands import (
+    CHANNEL_LEVEL,
+    LEVELS,
+    Bands,
+    effective_blocks,
+    intraclass_correlation,
+)
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
@@ -50,8 +56,8 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     }
     scale = {"vy": 1.0, "sideslip": np.degrees(1.0)}
     level_ratios = {
-        "vy": bands.vy.beside(SHOWN_LEVEL),
-        "sideslip": bands.sideslip.beside(SHOWN_LEVEL),
+        "vy": bands.vy.beside(CHANNEL_LEVEL),
+        "sideslip": bands.sideslip.beside(CHANNEL_LEVEL),
     }
     half = {
         name: scale[name]
@@ -90,10 +96,10 @@ def band_figures(
         if not len(errors):
             continue
         labels = np.unique(manoeuvres[is_scored], return_inverse=True)[1]
-        half_width_90 = half[:, LEVELS.index(SHOWN_LEVEL)]
+        half_width_90 = half[:, LEVELS.index(CHANNEL_LEVEL)]
         inside = np.abs(errors)[:, None] <= half
         by_block = block_sums(
-            inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels
+            inside[:, LEVELS.index(CHANNEL_LEVEL)].astype(np.float64), labels
         ) / np.bincount(labels)
         normalised = np.square(
             np.divide(errors, half_width_90, out=np.zeros_like(errors), where=half_width_90 > 0)
@@ -106,7 +112,7 @@ def band_figures(
             "coverage_90_p10": float(np.quantile(by_block, 0.1)),
             "coverage_90_p90": float(np.quantile(by_block, 0.9)),
             "width_90": float(2.0 * half_width_90.mean()),
-            "interval_score": float(interval_score(errors, half_width_90, SHOWN_LEVEL).mean()),
+            "interval_score": float(interval_score(errors, half_width_90, CHANNEL_LEVEL).mean()),
             "crps": float(crps_of_levels(errors, half, LEVELS).mean()),
             "error_icc": intraclass_correlation(normalised, labels),
             "band_blocks": effective_blocks(block_sums(normalised, labels)),
@@ -156,11 +162,11 @@ def figures_by_regime(
                 continue
             errors = banded_errors[name].errors[chosen]
             half = banded_errors[name].half[chosen]
-            half_width_90 = half[:, LEVELS.index(SHOWN_LEVEL)]
+            half_width_90 = half[:, LEVELS.index(CHANNEL_LEVEL)]
             values = (
                 np.mean(np.abs(errors) <= half_width_90),
                 2.0 * half_width_90.mean(),
-                interval_score(errors, half_width_90, SHOWN_LEVEL).mean(),
+                interval_score(errors, half_width_90, CHANNEL_LEVEL).mean(),
             )
             figures[regime] |= {
                 f"{metric}{suffix}": float(value)

@@ -26,7 +26,7 @@ from vehest.trust.bands import effective_blocks
 
 Name = tuple[str, str]  # estimator and variant
 
-Verdict = Literal["lower", "higher", "not told apart"]
+Verdict = Literal["lower", "higher", "no significant difference"]
 BASELINES = ("zero", "static_map")
 
 
@@ -85,7 +85,7 @@ class Ranking:
             for (candidate, against), comparison in self.pairs.items()
             if candidate == name and against[0] == baseline
         ]
-        if not comparisons or comparisons[0].verdict == "not told apart":
+        if not comparisons or comparisons[0].verdict == "no significant difference":
             return None
         return comparisons[0].verdict == "lower"
 
@@ -130,7 +130,7 @@ class Ranking:
         return [
             name
             for name, comparison in comparisons
-            if comparison is not None and comparison.verdict == "not told apart"
+            if comparison is not None and comparison.verdict == "no significant difference"
         ]
 
 
@@ -234,7 +234,7 @@ def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
         )
         low, high = difference.at(1.0 - (1.0 - CONFIDENCE) / factor)
         verdict: Verdict = (
-            "not told apart"
+            "no significant difference"
             if p_value >= 1.0 - CONFIDENCE
             else ("lower" if difference.value < 0 else "higher")
         )

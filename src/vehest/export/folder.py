@@ -1,4 +1,4 @@
-"""An export on disk: sources, vectors and what people need to know, written whole or not at all."""
+"""Writes an export: sources, vectors and README, completely or not at all."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from vehest.trust.record import Trust
 from vehest.version import __version__
 
 PRECISIONS = get_args(Precision)
-LEAST_DIGITS = 8.0  # roundings of a float, that a channel's innovations have to exceed
-OWN = "vehest_estimator.h"
+MIN_ROUNDINGS = 8.0  # roundings of a float, that a channel's innovations have to exceed
+EXPORT_MARKER = "vehest_estimator.h"
 """The file that shows a folder to be an export."""
 FILES = frozenset(
     {
@@ -54,21 +54,38 @@ def export_model(
     elsewhere: bool = False,
     drive: Recording | None = None,
 ) -> None:
-    """Write a fitted estimator as C99 into a folder of its own; an earlier export there is replaced.
+    """Write a fitted estimator as C99 into a folder of its own.
 
-    Args:
-        estimator: fitted, causal.
-        trust: learnt with it; without it limits are those of any car, and there is neither band nor health of channels.
-        out: the folder.
-        precision: of all numbers in C, ``double`` or ``float``.
-        bus_rate_hz: rate at which samples come, if it is not the estimator's [Hz]; a causal low-pass leads down to that.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are twice as wide then.
-        drive: recorded, at the rate at which samples come, for the test vectors; else they are `SECONDS` of a drive with every fault.
+    An earlier export there is replaced.
 
-    Raises:
-        ConfigurationError: the estimator cannot be written in C, the bus is slower than it, float cannot resolve a channel, or the folder
-            holds something else.
-        MissingError: the folder cannot be written.
+    Parameters
+    ----------
+    estimator : Estimator
+        A fitted, causal estimator.
+    trust : Trust or None
+        Its calibration; without it limits are those of any car, and there is neither band nor
+        health of channels.
+    out : Path
+        The folder.
+    precision : str
+        Of all numbers in C, ``double`` or ``float``.
+    bus_rate_hz : float or None
+        Rate at which samples come, if it is not the estimator's [Hz]; a causal low-pass leads
+        down to that.
+    elsewhere : bool
+        Whether the car or its tyres are others than those that were calibrated on; bands are
+        twice as wide then.
+    drive : Recording or None
+        Recorded, at the rate at which samples come, for the test vectors; else they are
+        `SECONDS` of a drive with every fault.
+
+    Raises
+    ------
+    ConfigurationError
+        The estimator cannot be written in C, the bus is slower than it, float cannot resolve a
+        channel, or the folder holds something else.
+    MissingError
+        The folder cannot be written.
     """
     if precision not in PRECISIONS:
         raise ConfigurationError(f"precision must be {' or '.join(PRECISIONS)}, not '{precision}'")
@@ -105,7 +122,7 @@ def readme(
     has_trust: bool,
     elsewhere: bool,
 ) -> str:
-    """What people need to know of an export: how it is called, units, licences."""
+    """README of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
     reasons = {
         kind: text
@@ -132,22 +149,32 @@ def readme(
 
 
 def refuse_unresolved(trust: Trust | None) -> None:
-    """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float.
+    """Refuse float for health of a channel that follows the others to the last digits.
 
-    Raises `ConfigurationError`: there is one.
+    A channel that was computed from the others does.
+
+    Raises
+    ------
+    ConfigurationError
+        There is such a channel.
     """
     if trust is None or trust.health is None:
         return
-    own = trust.health
+    health_model = trust.health
     for name, deviation, largest, weights in zip(
-        own.channels, own.deviation, own.largest, own.precision, strict=True
+        health_model.channels,
+        health_model.deviation,
+        health_model.largest,
+        health_model.precision,
+        strict=True,
     ):
         if (
             max(weights) > 0.0
-            and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest
+            and deviation < MIN_ROUNDINGS * float(np.finfo(np.float32).eps) * largest
         ):
             raise ConfigurationError(
-                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size in "
+                "the training, which float cannot "
                 f"resolve; export with --precision double"
             )
 
@@ -158,9 +185,10 @@ def _refuse_foreign(out: Path) -> None:
         return
     if out.is_symlink() or not out.is_dir():
         raise ConfigurationError(f"'{printable(str(out))}' is no folder; name another")
-    held = sorted(entry.name for entry in out.iterdir())
-    foreign = [name for name in held if name not in FILES or not (out / OWN).is_file()]
+    names = sorted(entry.name for entry in out.iterdir())
+    foreign = [name for name in names if name not in FILES or not (out / EXPORT_MARKER).is_file()]
     if foreign:
         raise ConfigurationError(
-            f"'{printable(str(out))}' holds '{printable(foreign[0])}', which is no part of an export; name another folder"
+            f"'{printable(str(out))}' holds '{printable(foreign[0])}', which is no part of an "
+            "export; name another folder"
         )

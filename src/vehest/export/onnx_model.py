@@ -1,4 +1,7 @@
-"""Networks as ONNX by torch.onnx: one step of the estimator, its state going in and coming out, units and channels in the metadata."""
+"""Networks as ONNX by torch.onnx.
+
+One step of the estimator, its state going in and coming out, units and channels in the metadata.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ from vehest.estimators.velocity_lstm import VelocityLstm
 from vehest.training.members import prepare
 
 OPSET = 18
-"""Of the ai.onnx operators."""
+"""Version of the ai.onnx operators."""
 
 _UNITS = {"vy": "m/s", "vx": "m/s", "yaw_rate": "rad/s", "sideslip": "rad"}
 
@@ -33,15 +36,24 @@ _UNITS = {"vy": "m/s", "vx": "m/s", "yaw_rate": "rad/s", "sideslip": "rad"}
 def write_onnx(estimator: Estimator, path: str | Path) -> None:
     """Write one step of a network.
 
-    Inputs are ``sample``, (C,) in the order of the estimator's channels [SI], and the state; outputs are the quantities of an estimate, ()
-    each, ``vy`` [m/s] among them, and the state after the sample as ``next_`` and its name. ``start_`` and its name in the metadata says
-    what a state begins with, as JSON. Windowed networks give NaN until their window is full, as in Python. Numbers have the precision of
-    the training. ``state_started`` of the velocity LSTM is 0 before the first sample, whose measured velocities it starts from.
-    Raises `ConfigurationError`: the estimator is no network. Raises `MissingError`: onnx or onnxscript is not installed.
+    Inputs are ``sample``, (C,) in the order of the estimator's channels [SI], and the state;
+    outputs are the quantities of an estimate, () each, ``vy`` [m/s] among them, and the state after
+    the sample as ``next_`` and its name. ``start_`` and its name in the metadata says what a state
+    begins with, as JSON. Windowed networks give NaN until their window is full, as in Python.
+    Numbers have the precision of the training. ``state_started`` of the velocity LSTM is 0 before
+    the first sample, whose measured velocities it starts from.
+
+    Raises
+    ------
+    ConfigurationError
+        The estimator is no network.
+    MissingError
+        The package onnx or onnxscript is not installed.
     """
     if estimator.name not in NETWORKS:
         raise ConfigurationError(
-            f"estimator '{estimator.name}' is no network that ONNX could hold; these are: {', '.join(NETWORKS)}"
+            f"estimator '{estimator.name}' is no network that ONNX could hold; these are: "
+            f"{', '.join(NETWORKS)}"
         )
     try:
         import onnx
@@ -68,9 +80,8 @@ def write_onnx(estimator: Estimator, path: str | Path) -> None:
         finally:
             logging.disable(logging.NOTSET)
     assert program is not None
-    ir.passes.common.ClearMetadataAndDocStringPass()(
-        program.model
-    )  # where in the sources each node comes from
+    # where in the sources each node comes from
+    ir.passes.common.ClearMetadataAndDocStringPass()(program.model)
     about = {
         "estimator": estimator.name,
         "variant": estimator.variant,
@@ -111,10 +122,10 @@ class _WindowStep(_Step):
 
     def __init__(self, estimator: WindowedEstimator) -> None:
         network = copy.deepcopy(estimator.network)
-        if isinstance(
-            network, KinematicsStructuredNetwork
-        ):  # a plain number would be rounded to float
-            network.step = torch.tensor(network.step, dtype=network.gamma.dtype)  # type: ignore[assignment]
+        if isinstance(network, KinematicsStructuredNetwork):
+            # a plain number would be rounded to float
+            exact_step = torch.tensor(network.step, dtype=network.gamma.dtype)
+            network.step = exact_step  # type: ignore[assignment]
         super().__init__(
             network,
             ("vy",),
@@ -134,11 +145,11 @@ class _VelocityStep(_Step):
         super().__init__(
             estimator.network, s.outputs, {name: torch.zeros(size) for name, size in starts.items()}
         )
-        self.seen = [estimator.channels.index(name) for name in s.inputs]
+        self.input_columns = [estimator.channels.index(name) for name in s.inputs]
 
     def _driven(self, sample: Tensor) -> tuple[Tensor, ...]:
         """Arguments of a cell besides its state: the standardised sample, and weights."""
-        return ((sample[self.seen] - self.network.input_mean) / self.network.input_scale)[
+        return ((sample[self.input_columns] - self.network.input_mean) / self.network.input_scale)[
             None
         ], *self.network.recurrent.parameters()
 
@@ -164,26 +175,26 @@ class _GruStep(_VelocityStep):
 class _LstmStep(_VelocityStep):
     """Begins with the velocities that are measured, 0 for the lateral one."""
 
-    known: Tensor
+    is_measured: Tensor
 
     def __init__(self, estimator: VelocityLstm) -> None:
         s = estimator.settings
         super().__init__(estimator, h=s.n_states, c=s.n_states, y=len(s.outputs), started=1)
-        known = [name in estimator.channels and name != "vy" for name in s.outputs]
+        measured = {name for name in estimator.channels if name != "vy"}
         self.measured = [
-            estimator.channels.index(name) if own else 0
-            for name, own in zip(s.outputs, known, strict=True)
+            estimator.channels.index(name) if name in measured else 0 for name in s.outputs
         ]
-        self.register_buffer("known", self.network.output_mean.new_tensor(known))
+        is_measured = [name in measured for name in s.outputs]
+        self.register_buffer("is_measured", self.network.output_mean.new_tensor(is_measured))
 
     def forward(
         self, sample: Tensor, h: Tensor, c: Tensor, y: Tensor, started: Tensor
     ) -> tuple[Tensor, ...]:
         first = (
-            sample[self.measured] * self.known - self.network.output_mean
+            sample[self.measured] * self.is_measured - self.network.output_mean
         ) / self.network.output_scale
         x, *weights = self._driven(sample)
-        h, c = (own[0] for own in torch.lstm_cell(x, (h[None], c[None]), *weights))
+        h, c = (batch[0] for batch in torch.lstm_cell(x, (h[None], c[None]), *weights))
         hidden = torch.relu(
             self.network.dense(torch.cat([h, torch.where(started > 0.0, y, first)]))
         )
@@ -202,9 +213,8 @@ class _SampleStep(_Step):
         w1, b1, w2, b2, w3, b3 = (parameter[0] for parameter in self.network.parameters())
         hidden = torch.relu(torch.relu(self.network.scaled(sample) @ w1 + b1) @ w2 + b2)
         sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-STEEPEST, STEEPEST)
-        return sample[self.speed] * torch.sin(sideslip) / torch.cos(
-            sideslip
-        ), sideslip  # onnxruntime has no Tan of double
+        # onnxruntime has no Tan of double
+        return sample[self.speed] * torch.sin(sideslip) / torch.cos(sideslip), sideslip
 
 
 _STEPS: dict[str, Any] = {

@@ -1,6 +1,9 @@
-"""Sources of an export, as text: the method, the contract around it with explicit state, and a program.
+"""Sources of an export, as text.
 
-Numbers are read from a `GuardedStepper` itself, so that C and Python hold the same, to the last bit.
+The method, the contract around it with explicit state, and a program.
+
+Numbers are read from a `GuardedStepper` itself, so that C and Python hold the same, to the last
+bit.
 """
 
 from __future__ import annotations
@@ -23,12 +26,12 @@ from vehest.estimators.registry import estimator_classes
 from vehest.export.rendering import (
     Precision,
     ascii_only,
+    bool_table,
     braced,
+    integer_table,
     limit,
     render,
     render_block,
-    truths,
-    whole,
 )
 from vehest.trust import bands as band_rules
 from vehest.trust import clock, health_kernel, verdict
@@ -75,7 +78,8 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
     """
     if not estimator.template:
         raise ConfigurationError(
-            f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}"
+            f"estimator '{estimator.name}' cannot be exported to C; these can: "
+            f"{', '.join(exportable())}"
         )
     estimator.online()  # raises where it is not causal, or not fitted
     path = f"methods/{estimator.template}.c.j2"
@@ -115,23 +119,31 @@ def channels_of(estimator: Estimator) -> list[tuple[str, str]]:
 def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, str]:
     """Sources that build anywhere: the method, the contract around it, and `main`, name -> text.
 
-    Args:
-        stepper: in its initial state; what it holds is written.
-        precision: of ``vehest_real``.
-        title: what is estimated by what, for the banners.
+    Parameters
+    ----------
+    stepper : GuardedStepper
+        In its initial state; what it holds is written.
+    precision : Precision
+        Of ``vehest_real``.
+    title : str
+        What is estimated by what, for the banners.
 
-    Raises:
-        ConfigurationError: the estimator cannot be written in C.
+    Raises
+    ------
+    ConfigurationError
+        The estimator cannot be written in C.
     """
     files = method_files(stepper.estimator, precision)
     context = context_of(stepper, precision, title)
-    wanted = [
+    contract_files = [
         "types.h",
         "estimator.h",
         "estimator.c",
         *(["health.h", "health.c"] if context["h"] is not None else []),
     ]
-    files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
+    files |= {
+        f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in contract_files
+    }
     values = {
         "names": context["names"],
         "tolerance": TOLERANCES[precision],
@@ -139,15 +151,14 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
         "notes": context["notes"],
         "sources": sorted(name for name in files if name.endswith(".c")),
     }
-    files["main.c"] = render(
-        "main.c.j2", "double", **values
-    )  # files hold double, whatever the model computes in
+    # files hold double, whatever the model computes in
+    files["main.c"] = render("main.c.j2", "double", **values)
     files["Makefile"] = render("makefile.j2", "double", **values)
     return files
 
 
 def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
-    """What the templates of the contract are filled in with."""
+    """Variables of the contract's templates."""
     estimator = stepper.estimator
     monitor = stepper.monitor
     rate = float(estimator.settings.rate_hz)
@@ -181,8 +192,8 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "h": health,
         "r": number,
         "reals": lambda values: braced(values, number),
-        "whole": whole,
-        "truths": truths,
+        "integer_table": integer_table,
+        "bool_table": bool_table,
         "brief": brief,
         "starts_anew": monitor.starts_anew,
         "adapts": monitor.adapts,
@@ -193,7 +204,10 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
 
 
 def guard_table(guard: Guard) -> dict[str, Any]:
-    """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged and that a new level has to stand."""
+    """Limits of each channel, longest runs, bridged samples, and samples that confirm a new level.
+
+    A row of limits is low, high, jump, lower and upper stop.
+    """
     runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard.limits[:, 3]]
     limits = _endless(guard.limits[:, [0, 1, 2, 4, 5]]).tolist()
     return {
@@ -248,7 +262,7 @@ def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
     """Tables of `vehest.trust.health_kernel` by name; None where no health was learnt."""
     if packed is None:
         return None
-    layout = Layout(*packed.view(np.int64)[: len(Layout._fields)].tolist())
+    layout = Layout(*map(int, views(Layout, packed, ())[0]))
     model, _ = views(Model, packed, layout)
     return {
         **model._asdict(),

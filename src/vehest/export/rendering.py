@@ -1,4 +1,7 @@
-"""From templates to C: constants as literals that read back to the same number, float builds with suffixes."""
+"""Renders templates as C.
+
+Constants are literals that read back to the same number, with suffixes in float builds.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +23,9 @@ if TYPE_CHECKING:
 
 Precision = Literal["double", "float"]
 
-LARGEST_FLOAT = float(np.finfo(np.float32).max)
-LEAST_FLOAT = float(np.finfo(np.float32).tiny)
-LINE = 110  # characters of a line of a table
+MAX_FLOAT = float(np.finfo(np.float32).max)
+MIN_FLOAT = float(np.finfo(np.float32).tiny)
+MAX_TABLE_COLUMNS = 110  # characters of a line of a table
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _BLANK = re.compile(r"\n{3,}")
@@ -41,13 +44,21 @@ _ASCII = {
 
 
 def render(template: str, precision: Precision, beside: Path | None = None, **values: Any) -> str:
-    """The text of a template; every floating literal outside comments has the type of ``vehest_real``.
+    """The text of a template.
 
-    Args:
-        template: path among those of `vehest.export`; ``methods/NAME`` may also be ``NAME`` in another folder.
-        precision: of numbers.
-        beside: that folder.
-        values: what it needs.
+    Every floating literal outside comments has the type of ``vehest_real``.
+
+    Parameters
+    ----------
+    template : str
+        Path among those of `vehest.export`; ``methods/NAME`` may also be ``NAME`` in another
+        folder.
+    precision : Precision
+        Type of ``vehest_real``.
+    beside : Path or None
+        The other folder.
+    values : any
+        Variables of the template by name.
     """
     text = _environment(precision, beside).get_template(template).render(values)
     return typed(_BLANK.sub("\n\n", text), precision)
@@ -57,15 +68,18 @@ def render_block(
     template: str, block: str, precision: Precision, beside: Path | None = None, **values: Any
 ) -> str:
     """The text of one block of a template; see `render`."""
-    found = _environment(precision, beside).get_template(template)
-    if block not in found.blocks:
+    loaded = _environment(precision, beside).get_template(template)
+    if block not in loaded.blocks:
         return ""
-    context = found.new_context(dict(values))
-    return typed("".join(found.blocks[block](context)), precision)
+    context = loaded.new_context(dict(values))
+    return typed("".join(loaded.blocks[block](context)), precision)
 
 
 def typed(source: str, precision: Precision) -> str:
-    """C source whose floating literals are those of a precision: ``0.5`` stays, or becomes ``0.5f``."""
+    """C source whose floating literals are those of a precision.
+
+    ``0.5`` stays, or becomes ``0.5f``.
+    """
     if precision == "double":
         return source
     pieces = _COMMENT.split(source)
@@ -75,29 +89,36 @@ def typed(source: str, precision: Precision) -> str:
 
 
 def literal(value: float, precision: Precision) -> str:
-    """A C literal, without suffix, that reads back to the same double or to the float nearest to the value.
+    """A C literal, without suffix, that reads back to the same double or the nearest float.
 
-    Raises `ConfigurationError`: the value is not finite in this precision.
+    Raises
+    ------
+    ConfigurationError
+        The value is not finite in this precision.
     """
     with np.errstate(over="ignore"):
         number = float(np.float32(value)) if precision == "float" else float(value)
     if not math.isfinite(number):
         raise ConfigurationError(
-            f"the model holds {value}, which is no {precision} number; fit it anew, or export with precision double"
+            f"the model holds {value}, which is no {precision} number; fit it anew, or export "
+            "with precision double"
         )
     text = f"{number:.9g}" if precision == "float" else repr(number)
     return text if any(mark in text for mark in ".e") else f"{text}.0"
 
 
 def limit(value: float, precision: Precision) -> str:
-    """A literal of a number that may be infinite; what a float cannot hold becomes infinite or 0."""
+    """A literal of a number that may be infinite.
+
+    What a float cannot hold becomes infinite or 0.
+    """
     value = float(value)
     if precision == "float":
         value = (
             math.copysign(math.inf, value)
-            if abs(value) > LARGEST_FLOAT
+            if abs(value) > MAX_FLOAT
             else 0.0
-            if abs(value) < LEAST_FLOAT
+            if abs(value) < MIN_FLOAT
             else value
         )
     if math.isinf(value):
@@ -119,18 +140,20 @@ def braced(values: Any, write: Callable[[Any], str]) -> str:
 def _wrapped(words: list[str]) -> str:
     """Words in braces, on one line if they fit on it."""
     text = ", ".join(words)
-    if len(text) + 2 <= LINE:
+    if len(text) + 2 <= MAX_TABLE_COLUMNS:
         return f"{{ {text} }}"
-    lines = textwrap.wrap(f"{text},", LINE - 1, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        f"{text},", MAX_TABLE_COLUMNS - 1, break_long_words=False, break_on_hyphens=False
+    )
     return "{\n" + "\n".join(f"    {line}" for line in lines).removesuffix(",") + "\n}"
 
 
-def whole(values: Any) -> str:
+def integer_table(values: Any) -> str:
     """The initialiser of a table of whole numbers."""
     return braced(np.asarray(values, np.int64), str)
 
 
-def truths(values: Any) -> str:
+def bool_table(values: Any) -> str:
     """The initialiser of a table of ``bool``."""
     return braced(np.asarray(values, bool), lambda value: "true" if value else "false")
 
@@ -153,11 +176,11 @@ def _environment(precision: Precision, beside: Path | None) -> Environment:
         StrictUndefined,
     )
 
-    own = PackageLoader("vehest.export")
+    packaged = PackageLoader("vehest.export")
     environment = Environment(
-        loader=ChoiceLoader([own, PrefixLoader({"methods": FileSystemLoader(beside)})])
+        loader=ChoiceLoader([packaged, PrefixLoader({"methods": FileSystemLoader(beside)})])
         if beside
-        else own,
+        else packaged,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

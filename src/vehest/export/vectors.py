@@ -1,4 +1,7 @@
-"""Test vectors of an export: a short drive with everything that goes wrong on a bus, and what Python makes of it."""
+"""Test vectors of an export.
+
+A short drive with everything that goes wrong on a bus, and what Python makes of it.
+"""
 
 from __future__ import annotations
 
@@ -22,25 +25,29 @@ RADIUS = 0.3  # m, of a wheel where nothing was learnt
 def replayed(
     stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """What a stepper says after each row: `COLUMNS`, (T, 6); NaN where it says nothing.
+    """Outputs of a stepper after each row: `COLUMNS`, (T, 6); NaN where there is none.
 
-    Args:
-        stepper: in its initial state.
-        times: of the rows, (T,) [s]; where one is NaN the row follows the last one without a gap.
-        samples: channel -> (T,).
+    Parameters
+    ----------
+    stepper : GuardedStepper
+        In its initial state.
+    times : array
+        Of the rows, (T,) [s]; where one is NaN the row follows the last one without a gap.
+    samples : mapping
+        Channel -> (T,).
     """
-    found = np.full((len(times), len(COLUMNS)), np.nan)
+    outputs = np.full((len(times), len(COLUMNS)), np.nan)
     for k, time in enumerate(times.tolist()):
         sample = {name: float(values[k]) for name, values in samples.items()}
-        said = stepper.step(sample, None if math.isnan(time) else time)
-        found[k] = [
-            said.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS
+        output = stepper.step(sample, None if math.isnan(time) else time)
+        outputs[k] = [
+            output.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS
         ]
-    return found
+    return outputs
 
 
 def in_float64(estimator: Estimator) -> Estimator:
-    """The same estimator with weights that compute in float64, which networks that were trained in float32 do not."""
+    """The same estimator with weights in float64, also where it was trained in float32."""
     twin = type(estimator)(estimator.settings)
     twin.preparation = estimator.preparation
     twin.load_weights(
@@ -53,15 +60,16 @@ def in_float64(estimator: Estimator) -> Estimator:
 
 
 def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Times (T,) [s] and samples, channel -> (T,), that a stepper is tried on: swerves at the speed that its limits allow, and faults.
+    """Times (T,) [s] and samples, channel -> (T,), that a stepper is tried on.
 
-    The faults: values that are NaN, infinite or beyond physics, one channel after another; a channel that stands still; an offset; rows
-    that are lost for 0.03 s and for 0.7 s; a row that comes twice.
+    The drive has swerves at the speed that its limits allow. Its faults are values that are NaN,
+    infinite or beyond physics, one channel after another; a channel that stands still; an offset;
+    rows that are lost for 0.03 s and for 0.7 s; a row that comes twice.
     """
     rate = stepper.input_rate_hz
     steps = round(SECONDS * rate)
     times = np.arange(steps) / rate
-    samples = _motion(stepper, times, rate)
+    samples = _motion(stepper, times)
     names = list(samples)
     for at, name in enumerate(names):
         first = round((3.0 + 0.3 * at / len(names)) * rate)
@@ -69,32 +77,33 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
         samples[name][first + 3] = -1e30
         if name in stepper.estimator.skippable or at == 0:
             samples[name][round(4.0 * rate) : round(4.3 * rate)] = math.nan
-    if stepper.front_end is None or not len(
-        stepper.front_end.sections
-    ):  # behind a low-pass it stands still once digits run out: sooner in float
-        samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][
-            round(5.0 * rate)
-        ]
+    if stepper.front_end is None or not len(stepper.front_end.sections):
+        # behind a low-pass it stands still once digits run out: sooner in float
+        first = round(5.0 * rate)
+        samples[names[0]][first : round(5.6 * rate)] = samples[names[0]][first]
     samples[names[-1]][round(6.5 * rate) : round(7.5 * rate)] *= 1.6
-    kept = np.ones(steps, bool)
-    kept[round(8.0 * rate) : round(8.03 * rate) + 1] = False
-    kept[round(9.0 * rate) : round(9.7 * rate)] = False
-    kept_rows = np.flatnonzero(kept)
-    again = np.sort(np.append(kept_rows, round(2.0 * rate)))
-    return times[again], {name: values[again] for name, values in samples.items()}
+    is_received = np.ones(steps, bool)
+    is_received[round(8.0 * rate) : round(8.03 * rate) + 1] = False
+    is_received[round(9.0 * rate) : round(9.7 * rate)] = False
+    received_rows = np.flatnonzero(is_received)
+    rows = np.sort(np.append(received_rows, round(2.0 * rate)))
+    return times[rows], {name: values[rows] for name, values in samples.items()}
 
 
-def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
-    """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that is the same on every machine."""
+def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]:
+    """Swerves at a varying speed with noise that is the same on every machine.
+
+    They are as large as 0.3 of the largest values in training.
+    """
     names = list(stepper.channels)
     limits = stepper.guard.limits[:, :2]
     sizes, usual = _sizes(stepper)
     speed = 1.0 + 0.2 * np.sin(0.7 * times)
     swerve = np.sin(2.0 * times) * np.sin(0.3 * times)
-    found = {}
+    motion = {}
     for number, name in enumerate(names):
         size = sizes[name]
-        if name == "vx" or name == "motor_speed" or name.startswith("wheel_speed"):
+        if name in ("vx", "motor_speed") or name.startswith("wheel_speed"):
             values = usual[name] * speed
         elif name == "ax" and "vx" in names:
             values = np.gradient(usual["vx"] * speed, times)
@@ -105,43 +114,49 @@ def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str
         else:
             values = usual[name] + 0.05 * size * np.sin(1.3 * times + number)
         low, high = limits[number]
-        found[name] = np.clip(
+        motion[name] = np.clip(
             values + 0.002 * size * _noise(len(times), number), 0.9 * low, 0.9 * high
         )
-    return found
+    return motion
 
 
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
-    """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
+    """Largest and usual values of channels in training.
+
+    Round ones of a passenger car where nothing was learnt.
+    """
     names = stepper.channels
     table = health_table(stepper.monitor.packed_health)
     if table is not None:
         return dict(zip(names, table["largest"].tolist(), strict=True)), dict(
             zip(names, table["usual"].tolist(), strict=True)
         )
-    known = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 8.0, "steer": 0.1, "handwheel": 1.5}
+    car_sizes = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 8.0, "steer": 0.1, "handwheel": 1.5}
     sizes = {
-        name: known.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high)))
+        name: car_sizes.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high)))
         for name in names
     }
     speeds = {
-        name: known["vx"] / RADIUS
+        name: car_sizes["vx"] / RADIUS
         for name in names
         if name == "motor_speed" or name.startswith("wheel_speed")
     }
     return {**sizes, **speeds}, {
-        name: speeds.get(name, known["vx"] if name == "vx" else 0.0) for name in names
+        name: speeds.get(name, car_sizes["vx"] if name == "vx" else 0.0) for name in names
     }
 
 
 def _noise(n: int, seed: int) -> FloatArray:
-    """Uniform between -1 and 1, (n,), by a linear congruential generator (Numerical Recipes, 2007, Section 7.1)."""
+    """Uniform between -1 and 1, (n,), by a linear congruential generator.
+
+    Source: Numerical Recipes, 2007, Section 7.1.
+    """
     state = (1664525 * seed + 1013904223) % 2**32
-    found = np.empty(n)
+    noise = np.empty(n)
     for k in range(n):
         state = (1664525 * state + 1013904223) % 2**32
-        found[k] = state / 2**31 - 1.0
-    return found
+        noise[k] = state / 2**31 - 1.0
+    return noise
 
 
 def table_text(columns: Sequence[str], rows: FloatArray) -> str:

@@ -88,7 +88,7 @@ def quiet_level(
     )
     is_gap_free = ~(np.isnan(signal_pieces).any(1) | np.isnan(activity_pieces).any(1))
     if not is_gap_free.any():
-        raise ValueError(f"no stretch of {piece_samples} samples without a gap")
+        raise ValueError(f"no segment of {piece_samples} samples without a gap")
     signal_variance, activity_variance = (
         np.square(scipy.signal.detrend(values[is_gap_free], axis=1)).sum(1) / (piece_samples - 2)
         for values in (signal_pieces, activity_pieces)

@@ -1,1 +1,4 @@
-"""A fitted model applied to recordings: finding and opening it, its car's values, estimates and their tables."""
+"""A fitted model applied to recordings.
+
+Finding and opening it, its car's values, estimates and their tables.
+"""

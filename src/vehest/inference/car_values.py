@@ -1,4 +1,7 @@
-"""Values of a car that a model's settings take, and a car's record: what `vehest identify` finds on its drives, in YAML."""
+"""Values of a car as settings of a model, and a car's record.
+
+`vehest identify` identifies the record's values on drives and writes them as YAML.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 @dataclass(frozen=True)
 class Number:
-    """A number with its standard deviation, and the drives on which it was identified; where on none, no estimate starts from it."""
+    """A number with its standard deviation, and the drives on which it was identified.
+
+    Where on none, no estimate starts from it.
+    """
 
     value: float
     deviation: Positive
@@ -50,31 +56,37 @@ class CarRecord:
 
     wheelbase: Annotated[float, Field(ge=0.05, le=20.0)]  # [m]
     cg_to_rear_axle: Positive | None  # as given [m]
-    leakage: Number  # κ: share of the measured ay that is none, because the body rolls or the sensor's gain errs
+    # κ: share of the measured ay that is none, because the body rolls or the sensor's gain errs
+    leakage: Number
     rear_axle: Number  # its distance from the inertial unit [m]
-    compliance: Number  # C: slip angle of the rear axle over its lateral acceleration, both small [rad s²/m]
+    # C: slip angle of the rear axle over its lateral acceleration, both small [rad s²/m]
+    compliance: Number
     grip: Number  # lateral acceleration at the rear axle's limit [m/s²]
-    offsets: Mapping[
-        str, Mapping[str, Number]
-    ]  # drive -> channel -> mean offset [m/s²]; no estimate starts from it
+    # drive -> channel -> mean offset [m/s²]; no estimate starts from it
+    offsets: Mapping[str, Mapping[str, Number]]
 
     def __post_init__(self) -> None:
         for name, (low, high) in LIMITS.items():
             if not low < getattr(self, name).value < high:
                 raise DataError(
-                    f"{name} must lie between {low:g} and {high:g}, not at {getattr(self, name).value:.4g}"
+                    f"{name} must lie between {low:g} and {high:g}, not at "
+                    f"{getattr(self, name).value:.4g}"
                 )
         if self.cg_to_rear_axle is not None and self.cg_to_rear_axle >= self.wheelbase:
             raise DataError(
-                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {self.cg_to_rear_axle:g}"
+                f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not "
+                f"{self.cg_to_rear_axle:g}"
             )
 
 
 def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
-    """The filter with some settings changed; raises `ConfigurationError` where it is another estimator, or one is out of bounds."""
+    """The filter with some settings changed.
+
+    Raises `ConfigurationError` where it is another estimator, or one is out of bounds.
+    """
     if not isinstance(model, SelfCalibrating):
-        what = "a car's record and estimator.KEY=VALUE are for the self-calibrating filter"
-        raise ConfigurationError(f"{what}, not for '{model.name}'; leave the model out")
+        requirement = "a car's record and estimator.KEY=VALUE are for the self-calibrating filter"
+        raise ConfigurationError(f"{requirement}, not for '{model.name}'; leave the model out")
     for option in changed:
         if not hasattr(model.settings, option):
             raise ConfigurationError(unknown_option(model.name, option, option_names()))
@@ -97,8 +109,9 @@ def adapted(
 ) -> tuple[Estimator, Trust | None, list[str]]:
     """A model for the car of a recording.
 
-    Settings of the command line come first, then the car's record, then the values of the data set; each
-    applies where those before it do not. A model whose settings were chosen in training keeps them.
+    Settings of the command line come first, then the car's record, then the values of the data set;
+    each applies where those before it do not. A model whose settings were chosen in training keeps
+    them.
 
     Parameters
     ----------
@@ -116,7 +129,8 @@ def adapted(
     Returns
     -------
     tuple
-        The model, its calibration without health where the channels differ, and remarks for the user.
+        The model, its calibration without health where the channels differ, and remarks for the
+        user.
 
     Raises
     ------
@@ -126,12 +140,14 @@ def adapted(
     remarks = []
     before = model
     if isinstance(model, SelfCalibrating):
-        taken = _values_of_dataset(model, car, settings, record)
-        if taken:
-            values = [f"{name} {value:g} {CAR_SETTINGS[name]}" for name, value in taken.items()]
+        dataset_values = _values_of_dataset(model, car, settings, record)
+        if dataset_values:
+            values = [
+                f"{name} {value:g} {CAR_SETTINGS[name]}" for name, value in dataset_values.items()
+            ]
             remarks.append(f"{' and '.join(values)}: of the data set")
-            model = with_settings(model, taken)
-        has_wheelbase = record is not None or "wheelbase" in {*settings, *taken}
+            model = with_settings(model, dataset_values)
+        has_wheelbase = record is not None or "wheelbase" in {*settings, *dataset_values}
         if not has_wheelbase and not _is_changed(model, "wheelbase"):
             remarks.append(
                 f"{ASSUMED} {model.wheelbase:g} m; give your car's, such as "
@@ -147,10 +163,10 @@ def adapted(
 
 
 def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[str, Any]:
-    """The configuration of a training in which a wheelbase of null is that of its recordings' one car, as is the centre of gravity.
+    """The configuration of a training with the wheelbase and centre of gravity of its one car.
 
-    So is the default wheelbase of the self-calibrating filter. Other settings with values stay, and so do all where the cars have no
-    wheelbase or different ones.
+    They replace settings of null and the default wheelbase of the self-calibrating filter. Other
+    settings stay, as do all where the cars have no wheelbase or different ones.
     """
     settings = config["estimator"]
     unstated: set[float | None] = {None}
@@ -178,7 +194,7 @@ def _values_of_dataset(
     settings: Mapping[str, Any],
     record: CarRecord | None,
 ) -> dict[str, float]:
-    """Values of a data set's car that neither the command line nor the record nor the training decides."""
+    """Values of a data set's car that command line, record and training leave open."""
     wheelbase = settings.get("wheelbase", None if record is None else record.wheelbase)
     if wheelbase not in (None, car.wheelbase):
         return {}  # another car is meant
@@ -197,9 +213,12 @@ def _is_changed(model: SelfCalibrating, name: str) -> bool:
 
 
 def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) -> SelfCalibrating:
-    """The filter with a car's wheelbase and, as priors, its leakage and rear axle, deviations widened; errors of `with_settings`.
+    """The filter with a car's wheelbase and, as priors, its leakage and rear axle.
 
-    Compliance and grip are found anew: tyres and road change them, and estimates that started from them were worse.
+    Deviations are widened. Errors are those of `with_settings`.
+
+    Compliance and grip are found anew: tyres and road change them, and estimates that started from
+    them were worse.
     """
     changed: dict[str, Any] = {"wheelbase": record.wheelbase}
     if record.cg_to_rear_axle is not None:
@@ -221,7 +240,10 @@ def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) 
 
 
 def read_car(path: Path) -> CarRecord:
-    """Read a car's record back; raises `MissingError`, or `DataError` where it is damaged, of another format or not of a car."""
+    """Read a car's record back.
+
+    Raises `MissingError`, or `DataError` where it is damaged, of another format or not of a car.
+    """
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:
         raise DataError(f"'{path}' is no record of a car as vehest identify writes it")

@@ -26,15 +26,18 @@ def estimate_recording(
     trust: Trust | None = None,
     same_vehicle: bool | None = None,
 ) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
-    needed = prepared_recording(model, recording)
+    """Bring a recording to the model's rate and run the model on it, guarded as online.
+
+    See `vehest.trust.contract`; raises `DataError`.
+    """
+    prepared = prepared_recording(model, recording)
     elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle, recording.car)
     run = GuardedRun(model, trust, elsewhere=elsewhere)
-    return require_estimate(model, recording, run(needed.channels, needed))
+    return require_estimate(model, recording, run(prepared.channels, prepared))
 
 
 def estimate_parts(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate]:
-    """The estimates of parts, each made by a thread, in compiled code, while the next part is read, checked and resampled."""
+    """Estimate parts, each in a thread while the next one is read, checked and resampled."""
     with ThreadPoolExecutor(1) as thread:
         going: list[Future[Estimate]] = []
         for part in parts:
@@ -47,7 +50,10 @@ def estimate_parts(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Esti
 def prepared_recording(
     model: Estimator, recording: Recording, rate_hz: float | None = None
 ) -> Recording:
-    """The channels that a model reads, at its rate or another one [Hz]; raises as `estimate_recording` does."""
+    """The channels that a model reads, at its rate or another one [Hz].
+
+    Raises as `estimate_recording` does.
+    """
     return resampled(
         recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation
     )
@@ -63,5 +69,6 @@ def require_estimate(model: Estimator, recording: Recording, estimate: Estimate)
 def too_short_error(model: Estimator, recording_id: str, seconds: float) -> DataError:
     """The error of a recording on which a model has no estimate."""
     return DataError(
-        f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to estimate anything"
+        f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to "
+        "estimate anything"
     )

@@ -1,4 +1,7 @@
-"""Finds and opens fitted models and their calibrations: by folder, by name in an output root, or those that come with vehest."""
+"""Finds and opens fitted models and their calibrations.
+
+By folder, by name in an output root, or those that come with vehest.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +26,19 @@ from vehest.trust.record import TRUST, Trust, read_trust
 
 PRETRAINED = "pretrained"
 SELF_CALIBRATING = "self_calibrating"
-"""Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
+"""Names of the models that come with vehest, for cars without a model of their own.
+
+A network, and the filter around it.
+"""
 WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
 SHIPPED_NOTES = {
-    PRETRAINED: "trained on simulated cars, not on yours; the KS-NN is patented by its authors (PCT/IT2023/050058); "
-    "errors and limits: docs/estimators/ksnn.md",
-    SELF_CALIBRATING: "the network inside was trained on simulated cars, not on yours; the KS-NN is patented by its "
-    "authors (PCT/IT2023/050058); errors and limits: docs/estimators/self_calibrating.md",
+    PRETRAINED: "trained on simulated cars, not on yours; the KS-NN is patented by its authors "
+    "(PCT/IT2023/050058); errors and limits: docs/estimators/ksnn.md",
+    SELF_CALIBRATING: "the network inside was trained on simulated cars, not on yours; the KS-NN "
+    "is patented by its authors (PCT/IT2023/050058); errors and limits: "
+    "docs/estimators/self_calibrating.md",
 }
-"""What users of these models should know, in one line; their model.yaml says more."""
+"""Notes on these models in one line; their model.yaml says more."""
 CALIBRATION_STAGE = "calibrate"
 """Stage that calibrates models, and its folder in an output root."""
 
@@ -42,32 +49,37 @@ def pretrained_folder(name: str = PRETRAINED) -> Path:
 
 
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
-    """A model's folder, by path or by the start of its name in the output root; those of `WITH_VEHEST` come with vehest.
+    """A model's folder, by path or by the start of its name in the output root.
 
-    Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is none.
+    Those of `WITH_VEHEST` come with vehest.
+
+    Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is
+    none.
     """
-    given = Path(name)
-    if given.is_dir():
-        return given
+    path = Path(name)
+    if path.is_dir():
+        return path
     models = [folder for folder in sorted(output.glob("train/[!.]*")) if folder.is_dir()]
-    found = [folder for folder in models if folder.match(f"{given.name}*")]
+    matches = [folder for folder in models if folder.match(f"{path.name}*")]
     if name in WITH_VEHEST:
-        if found:
+        if matches:
             say(
-                f"'{name}' is the model that comes with vehest; yours are {counted([folder.name for folder in found])}"
+                f"'{name}' is the model that comes with vehest; yours are "
+                f"{counted([folder.name for folder in matches])}"
             )
         return pretrained_folder(name)
-    if not found:
-        known = (
+    if not matches:
+        places = (
             f"'{output / 'train'}', which contains {counted([folder.name for folder in models])}"
         )
         raise MissingError(
-            f"there is no model '{name}', neither a folder nor in {known}; train one first"
+            f"there is no model '{name}', neither a folder nor in {places}; train one first"
         )
-    newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
-    if len(found) > 1:
+    newest = max(matches, key=lambda folder: folder.stat().st_mtime_ns)
+    if len(matches) > 1:
         say(
-            f"'{name}' is assumed to be {newest.name}, the newest of {counted([folder.name for folder in found])}"
+            f"'{name}' is assumed to be {newest.name}, the newest of "
+            f"{counted([folder.name for folder in matches])}"
         )
     return newest
 
@@ -75,7 +87,10 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
 def open_model(
     name: str, output: Path, say: Callable[[str], None]
 ) -> tuple[Path, Estimator, Trust | None]:
-    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration."""
+    """Find a model as `find_model` does and open it.
+
+    Returns its folder, the model with the preparation of its training data, and its calibration.
+    """
     folder = find_model(name, output, say)
     if (folder / MANIFEST).is_file():
         read_artefact(folder)  # raises `DataError` where a file was changed after it was made
@@ -97,7 +112,7 @@ def is_training_recording(model_folder: Path, recording_id: str) -> bool:
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
-    """Method and transforms of a model's training data; new recordings must be prepared the same way."""
+    """Method and transforms of a model's training data, which new recordings need too."""
     return read_description(model_folder).about.downsample.as_plain()
 
 
@@ -128,8 +143,11 @@ def trust_of(
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
     """The calibration of a model in its own output root or in another; the newest of several.
 
-    Raises `DataError`: the model or a calibration of it is damaged or was changed after it was made; also one whose manifest cannot be
-    read, where its folder has the model's name.
+    Raises
+    ------
+    DataError
+        The model or a calibration of it is damaged or was changed after it was made; also one
+        whose manifest cannot be read, where its folder has the model's name.
     """
     if not os.path.lexists(model_folder / MANIFEST):
         return None  # a model that was saved from Python, which no calibration names
@@ -139,16 +157,18 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
         {folder for root in roots for folder in (root / CALIBRATION_STAGE).glob("[!.]*")}
     )
     calibrations = [folder for folder in folders if _calibrates(folder, model)]
-    newest = max(
+    return max(
         map(read_artefact, calibrations),
         key=lambda artefact: str(artefact.provenance.get("created", "")),
         default=None,
     )
-    return newest
 
 
 def _calibrates(folder: Path, model: Artefact) -> bool:
-    """Whether a folder holds the calibration of a model; raises `DataError` where its manifest is damaged and its name is the model's."""
+    """Whether a folder holds the calibration of a model.
+
+    Raises `DataError` where its manifest is damaged and its name is the model's.
+    """
     try:
         manifest = read_manifest(folder)
     except VehestError as error:

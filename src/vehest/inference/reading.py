@@ -39,7 +39,8 @@ def read_checked(
     Raises
     ------
     VehestError
-        As `read_single`; `DataError` also where a check finds an error that the data set does not accept.
+        As `read_single`; `DataError` also where a check finds an error that the data set does not
+        accept.
     """
     with use_limits(limits):
         if columns:

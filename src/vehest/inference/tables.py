@@ -58,5 +58,6 @@ def check_table_name(path: Path) -> None:
     """Raise `ConfigurationError` for a file that is neither a table nor a log."""
     if path.suffix.lower() not in TABLE_SUFFIXES:
         raise ConfigurationError(
-            f"'{path}' must end in {', '.join(TABLE_SUFFIXES)} or, as a log with further channels, {' or '.join(LOG_SUFFIXES)}"
+            f"'{path}' must end in {', '.join(TABLE_SUFFIXES)} or, as a log with further "
+            f"channels, {' or '.join(LOG_SUFFIXES)}"
         )

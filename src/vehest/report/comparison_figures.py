@@ -29,6 +29,8 @@ MIN_RATIO_FOR_LOG = 8.0  # highest over lowest RMSE, from which the axis is loga
 MAX_POINTS = 500  # of a cloud of samples
 AGREEMENT_COLUMNS = 4
 TITLE_CHARACTERS = 25  # of an estimator, in a line
+MARKER_SIZE = 2.2  # pt, of a sample
+FIRST_MARKER_SIZE = 3.6  # pt, of a sample of the cloud that is drawn first
 
 
 @dataclass(frozen=True)
@@ -96,14 +98,16 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
         axes.tick_params(axis="y", length=0)
         axes.tick_params(axis="x", labelsize=FOREST_FONT)
         axes.grid(visible=False, axis="y")
-        axes.set_xlabel("RMSE(β) [deg]", fontsize=FOREST_FONT)
+        x_label = "RMSE(β) [deg]"
         if min(sizes) > 0 and max(sizes) > MIN_RATIO_FOR_LOG * min(sizes):
             axes.set_xscale("log")
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.xaxis.set_minor_formatter(NullFormatter())
+            x_label += ", logarithmic scale"
         else:
             axes.set_xlim(left=0.0)
+        axes.set_xlabel(x_label, fontsize=FOREST_FONT)
     return figure
 
 
@@ -136,12 +140,13 @@ def clouds_figure(
             all_axes, panels, strict=True
         ):
             for cloud in clouds:
-                draw_cloud(axes, cloud)
+                # the first one is larger, so that it stays visible below the others
+                draw_cloud(axes, cloud, FIRST_MARKER_SIZE if cloud is clouds[0] else MARKER_SIZE)
             axes.set_xlabel(x_label)
             axes.set_ylabel(y_label)
             if has_equal_scales:
                 axes.set_aspect("equal", adjustable="datalim")
-            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, markerscale=4)
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, markerscale=2)
     return figure
 
 
@@ -176,7 +181,7 @@ def _wrapped(label: str) -> str:
     )
 
 
-def draw_cloud(axes: Any, cloud: Cloud, marker_size: float = 1.6) -> None:
+def draw_cloud(axes: Any, cloud: Cloud, marker_size: float = MARKER_SIZE) -> None:
     """Points of a cloud, every n-th so that a figure stays small."""
     step = max(len(cloud.x) // MAX_POINTS, 1)
     axes.plot(

@@ -107,7 +107,7 @@ def drive_figure(
     """Draw a drive on one page for print, in colours that colour-blind readers tell apart.
 
     Sideslip with the 90 % band and the health of the first estimate; lateral velocity; the measured
-    channels; the course, reckoned from u, v and yaw rate, in colours of β; estimate over reference.
+    channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over reference.
     What is not there is left out.
 
     Parameters
@@ -306,7 +306,7 @@ def _draw_course(recording: Recording, motion: Traces, axes: Axes) -> None:
     axes.autoscale()
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.set_title("course reckoned from u, v and yaw rate", loc="left")
+    axes.set_title("course integrated from u, v and yaw rate", loc="left")
     bar = axes.figure.colorbar(course, ax=axes, extend="both", shrink=0.85)
     bar.ax.set_title("β [deg]", fontsize=7.0)
 

@@ -230,9 +230,7 @@ def compare_estimates(
         reference.rate_hz,
     )
     titles = {
-        name: {"zero": "the zero-sideslip baseline", "static_map": "the static map"}.get(
-            name[0], name[0]
-        )
+        name: {"zero": "Zero-sideslip baseline", "static_map": "Static map"}.get(name[0], name[0])
         for name in ranking.order
     }
     errors = {name: accuracy([part]) for name, part in scored.items()}

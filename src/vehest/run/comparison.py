@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vehest.artefacts.artefact import Artefact
-from vehest.configuration.composition import GIVEN, Config
+from vehest.configuration.composition import OVERRIDDEN_RATES_KEY, Config
 from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording_summary import RecordingSummary
@@ -249,7 +249,7 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
     if not rate > lowest * (1.0 + RATE_TOLERANCE):
         return config, []
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
-    if key in config.get(GIVEN, ()):
+    if key in config.get(OVERRIDDEN_RATES_KEY, ()):
         raise DataError(
             f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave "
             "it out for that"

@@ -17,7 +17,7 @@ from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.car import CarValues
 from vehest.data.splits import Split
 from vehest.estimators.base import Estimator, FitRecord
-from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.blas import single_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.calibrate import plan_calibrate
 from vehest.run.evaluate import Evaluation
@@ -87,7 +87,7 @@ class Group:
             )
 
         torch.set_num_threads(1)
-        with one_blas_thread():
+        with single_blas_thread():
             models = {job.plan.key: self.existing(job.plan) for job in self.jobs}
             waiting = [job for job in self.jobs if models[job.plan.key] is None]
             while waiting and not should_stop():

@@ -20,9 +20,10 @@ import torch
 from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, provenance
 from vehest.artefacts.keys import changed_options
 from vehest.data.errors import ConfigurationError
+from vehest.data.files import sha256_of
 from vehest.data.splits import VALIDATION
 from vehest.data.text_files import write_json
-from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.blas import single_blas_thread
 from vehest.estimators.registry import new_estimator
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.comparison import NOT_TRAINED, Comparison, name_in_part
@@ -140,6 +141,7 @@ def draw_report(
         **({"search_remarks": list(search_remarks)} if search_remarks else {}),
         **({"not_trained": artefacts.not_trained} if artefacts.not_trained else {}),
         **({"weights": FORMAT} if study.publish else {}),
+        **({"templates": templates} if (templates := template_digests(study.report)) else {}),
     }
     ingested = [
         artefact
@@ -185,6 +187,15 @@ def draw_report(
     )
 
 
+def template_digests(name: str) -> dict[str, str]:
+    """File name -> SHA-256 of each Markdown template beside the module of a study.
+
+    A report is drawn again where one of them changed; no published study becomes stale by it.
+    """
+    folder = Path(str(study_module(name).__file__)).parent
+    return {file.name: sha256_of(file) for file in sorted(folder.glob("*.md.j2"))}
+
+
 def _write(
     artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path
 ) -> None:
@@ -203,7 +214,7 @@ def _write(
         (artefacts.titles[name], timings[name], {model.name: model.title for model in part.models})
         for name, part in artefacts.parts.items()
     ]
-    with one_blas_thread():
+    with single_blas_thread():
         write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times))
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
         raise ConfigurationError(

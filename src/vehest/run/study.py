@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from vehest.configuration.composition import (
-    GIVEN,
+    OVERRIDDEN_RATES_KEY,
     Config,
     check_jobs,
     close_key,
@@ -442,7 +442,9 @@ def _part_jobs(
             config = config_of([*shared, *suiting(config_of([*shared, *faults]))])
             if seeds and "seed" not in map(key_of, overrides):
                 config["seed"] = value_of(seeds[-1])
-            configs.setdefault(json.dumps({**config, GIVEN: None}, sort_keys=True), config)
+            configs.setdefault(
+                json.dumps({**config, OVERRIDDEN_RATES_KEY: None}, sort_keys=True), config
+            )
     jobs = [Job(config) for config in configs.values()]
     for key in SHARED_KEYS:
         if any(job.config[key] != jobs[0].config[key] for job in jobs):

@@ -10,7 +10,9 @@ by training, and is replaced in one step.
 
 from __future__ import annotations
 
+import base64
 import json
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -30,9 +32,14 @@ from vehest.run.console import Messages
 from vehest.run.train import FIT_METRICS, HISTORY
 
 MODELS = "models"  # the only entry of the file's metadata
+COMPRESSED = "zlib,"
+"""Begins the content of a file that is compressed and written in base64; files of weights of
+earlier versions have plain text.
+"""
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
 FORMAT = 2  # in the key of a report that has weights: 2 has a digest for each model
 MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
+MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
 
 
 class WeightsTooLargeError(VehestError):
@@ -46,7 +53,7 @@ class PublishedModel:
     label: str
     code: str  # version of the training
     digest: str  # of the training's artefact
-    files: dict[str, str] = field(default_factory=dict)  # those of `FILES` that it has -> content
+    files: dict[str, str] = field(default_factory=dict)  # of `FILES` -> content, `compressed`
 
 
 class PublishedWeights:
@@ -102,7 +109,7 @@ class PublishedWeights:
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
         records = self._models | {key: _record_of(model) for key, model in added.items()}
         about = {key: asdict(record) for key, record in sorted(records.items())}
-        content = save(tensors, metadata={MODELS: json.dumps(about, ensure_ascii=False)})
+        content = save(tensors, metadata={MODELS: json.dumps(about)})
         megabytes = len(content) / 1e6
         if megabytes > MAX_MEGABYTES:
             raise WeightsTooLargeError(
@@ -124,9 +131,15 @@ class PublishedWeights:
             The model is not the one that was published.
         """
         record = self._models[key]
-        for name in FILES:
-            if name in record.files:
-                (folder / name).write_bytes(record.files[name].encode())
+        try:
+            for name in FILES:
+                if name in record.files:
+                    (folder / name).write_bytes(uncompressed(record.files[name]))
+        except ValueError as error:
+            raise DataError(
+                f"'{self.path}' is damaged ({error}, in {record.label}); restore it by 'git "
+                f"checkout {self.path}', or add --retrain"
+            ) from error
         (folder / TIMINGS).write_text("metric,value\n", encoding="utf-8")
         prefix = f"{key}/"
         with safe_open(self.path, framework="np") as file:
@@ -162,9 +175,34 @@ class PublishedWeights:
             ) from error
 
 
+def compressed(content: bytes) -> str:
+    """A file's content as text in a `PublishedModel`."""
+    return COMPRESSED + base64.b64encode(zlib.compress(content, level=9)).decode()
+
+
+def uncompressed(text: str) -> bytes:
+    """A file's content; raises `ValueError` where it is damaged or above `MAX_FILE_BYTES`."""
+    if not text.startswith(COMPRESSED):
+        return text.encode()
+    inflation = zlib.decompressobj()
+    try:
+        content = inflation.decompress(
+            base64.b64decode(text.removeprefix(COMPRESSED), validate=True), MAX_FILE_BYTES
+        )
+    except (ValueError, zlib.error) as error:
+        raise ValueError(f"a compressed file is damaged: {error}") from error
+    if not inflation.eof:
+        raise ValueError(
+            f"a compressed file is cut off or has more than {MAX_FILE_BYTES / 1e6:g} MB"
+        )
+    return content
+
+
 def _record_of(model: Artefact) -> PublishedModel:
     files = {
-        name: (model.folder / name).read_bytes().decode() for name in FILES if name in model.outputs
+        name: compressed((model.folder / name).read_bytes())
+        for name in FILES
+        if name in model.outputs
     }
     return PublishedModel(model.label, model.code, model.digest, files)
 

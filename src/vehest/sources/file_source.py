@@ -81,7 +81,7 @@ class FileSource(Source):
     def _runs(self, file: Path) -> Mapping[int | None, slice]:
         """Number of each run in a file -> its rows.
 
-        All rows under None where runs are not told apart.
+        All rows under None where runs are not distinguished.
         """
         return {None: slice(None)}
 

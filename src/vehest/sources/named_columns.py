@@ -33,7 +33,9 @@ class NamedColumn:
     text: str  # a sign, the name and a unit, as they were given
 
     def find(self, names: Sequence[str]) -> tuple[str, str, int] | None:
-        """Name, unit (empty if none is stated) and sign of the column in a table; None if the table lacks it."""
+        """Name, unit (empty if none is stated) and sign of the column in a table; None if the table
+        lacks it.
+        """
         for sign, text in ((1, self.text), (-1, self.text.removeprefix("-"))):
             if text in names:
                 return text, "", sign

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +30,8 @@ from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
+# a row with a cell that is a number, or whose first one is missing
+ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -203,7 +205,7 @@ def column_parts(
                 batches = number_batches(file, opened.enter_context(parquet_file(file)), selected)
             else:
                 layout = with_names(file, layout)
-                options = _options(layout, _conversion(selected, layout))
+                options = _options(layout, _conversion(selected, layout), [])
                 stream = opened.enter_context(table_stream(file))
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
@@ -238,15 +240,30 @@ def parse_table(
     convert: pc.ConvertOptions,
     *,
     threads: bool = True,
+    lines_of_text: list[str] | None = None,
 ) -> pa.Table:
-    """Table of text as pyarrow converts it; raises what pyarrow raises."""
+    """Table of text as pyarrow converts it; raises what pyarrow raises.
+
+    Lines of text between or below the rows are left out, and appended to ``lines_of_text``.
+    """
+    texts = [] if lines_of_text is None else lines_of_text
     with opened() as stream:
-        return pc.read_csv(stream, **_options(layout, convert, threads=threads))
+        return pc.read_csv(stream, **_options(layout, convert, texts, threads=threads))
 
 
 def _options(
-    layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True
+    layout: TextLayout,
+    convert: pc.ConvertOptions,
+    lines_of_text: list[str],
+    *,
+    threads: bool = True,
 ) -> dict[str, Any]:
+    def handle(row: pc.InvalidRow) -> Literal["skip", "error"]:
+        if re.search(ROW_OF_NUMBERS, row.text, re.IGNORECASE):
+            return "error"
+        lines_of_text.append(row.text)
+        return "skip"
+
     read = pc.ReadOptions(
         use_threads=threads,
         block_size=BLOCK,
@@ -257,7 +274,7 @@ def _options(
     )
     return {
         "read_options": read,
-        "parse_options": pc.ParseOptions(delimiter=layout.delimiter),
+        "parse_options": pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=handle),
         "convert_options": convert,
     }
 

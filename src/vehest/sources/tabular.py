@@ -241,7 +241,8 @@ class TabularSource(FileSource):
         """
         if self._cuts or self.options.runs or self.dropped:
             raise ConfigurationError(
-                f"{self.location}: a table in memory is one run; leave out runs, time_restarts, max_gap and drop_rows"
+                f"{self.location}: a table in memory is one run; leave out runs, time_restarts, "
+                "max_gap and drop_rows"
             )
         if self.time is not None:
             table = self.time.in_order(table)
@@ -250,7 +251,7 @@ class TabularSource(FileSource):
         return self._prepared(self._recording_of(Path(name), None, columns, values))
 
     def columns_of(self, names: Sequence[str]) -> Mapping[str, Column]:
-        """Column of each channel: those of the data set, else those that are named like channels."""
+        """Column of each channel: of the data set, else those that are named like channels."""
         if self.columns is not None:
             return self.columns
         return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}

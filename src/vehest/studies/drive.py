@@ -358,6 +358,23 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     ]
 
 
+def data_of_parts(parts: Mapping[str, PartArtefacts]) -> dict[str, pd.DataFrame]:
+    """Ranges, method and notes of all parts, for the CSV files ``ranges``, ``method``, ``notes``."""
+    lines = {name: method_lines(part) for name, part in parts.items()}
+    notes = {name: warnings_of(part) for name, part in parts.items()}
+    ranges = [ranges_of(part).assign(part=name) for name, part in parts.items()]
+    return {
+        "ranges": pd.concat(ranges, ignore_index=True),
+        "method": _text_rows(lines, "statement"),
+        "notes": _text_rows(notes, "note"),
+    }
+
+
+def _text_rows(lines_by_part: Mapping[str, Sequence[str]], column: str) -> pd.DataFrame:
+    rows = [(part, line) for part, lines in lines_by_part.items() for line in lines]
+    return pd.DataFrame(rows, columns=["part", column])
+
+
 CHOICE = (
     "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. "
     "Test data choose nothing."
@@ -370,8 +387,27 @@ def how_it_was_made(
     """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table
     ``ranges``.
     """
+    ranges = Table(
+        "ranges",
+        "What was used for what.",
+        ranges_of(artefacts),
+        {
+            "role": Column("role"),
+            "dataset": Column("data set"),
+            "kind": Column("kind"),
+            "recording": Column("recording"),
+            "range": Column("range"),
+            "seconds": Column("length [s]", decimals=0),
+        },
+    )
+    lines = method_lines(artefacts, choice)
+    return "## Appendix: method and ranges\n\n" + "\n".join(f"- {line}" for line in lines), ranges
+
+
+def method_lines(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) -> list[str]:
+    """Command, protocol, how seeds or settings are chosen, and budgets, in Markdown."""
     protocol = artefacts.protocol
-    lines = [
+    return [
         f"Command: {as_code(artefacts.command)}",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never "
         "interpolated from later values. Estimators may "
@@ -383,6 +419,10 @@ def how_it_was_made(
         *choice,
         *artefacts.facts,
     ]
+
+
+def ranges_of(artefacts: PartArtefacts) -> pd.DataFrame:
+    """Ranges of training, validation and each test set, a row a range."""
     split = artefacts.split
     roles = {
         "training": split.train,
@@ -403,20 +443,7 @@ def how_it_was_made(
         for role, spans in roles.items()
         for span in spans
     ]
-    ranges = Table(
-        "ranges",
-        "What was used for what.",
-        pd.DataFrame(rows),
-        {
-            "role": Column("role"),
-            "dataset": Column("data set"),
-            "kind": Column("kind"),
-            "recording": Column("recording"),
-            "range": Column("range"),
-            "seconds": Column("length [s]", decimals=0),
-        },
-    )
-    return "## Appendix: method and ranges\n\n" + "\n".join(f"- {line}" for line in lines), ranges
+    return pd.DataFrame(rows)
 
 
 def _describe_excluded(artefacts: PartArtefacts) -> str:

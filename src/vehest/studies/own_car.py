@@ -103,7 +103,7 @@ def _comparison_with_plain(recommendation: Recommendation) -> str:
     name = recommendation.model.name if recommendation.model is not None else ranking.order[0]
     sentences = {
         "lower": "It is also significantly better than",
-        "not told apart": "It is not significantly different from",
+        "no significant difference": "It is not significantly different from",
         "higher": "It is significantly worse than",
     }
     by_verdict: dict[str, list[str]] = {verdict: [] for verdict in sentences}

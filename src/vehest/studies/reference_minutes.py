@@ -29,13 +29,18 @@ from vehest.report.document import (
     Document,
     Figure,
     Table,
+    as_code,
     as_text,
 )
 from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.drive import data_sentence, how_it_was_made
+from vehest.studies.drive import data_of_parts
+from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
 TAKES = "parts"
+VERSION = "2"
+TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
 SCRATCH = "from scratch"
 COLUMNS = {
@@ -45,35 +50,110 @@ COLUMNS = {
     "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
     "interval": Column("95 % interval [deg]"),
     "n_trainings": Column("trainings", decimals=0),
-    "against_scratch": Column("than from scratch"),
+    "against_scratch": Column("compared with scratch"),
 }
 """Of a table of `rows_of_curve`."""
+COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
+"""Amounts of reference with a column in the overview [min]; the last column is all of a drive."""
+FIGURE_CAPTION = (
+    "{title}, test set `{test_set}`: RMSE(β) over the minutes of recording with a reference for "
+    "training and validation; bars are 95 % intervals over blocks of the test and trainings. "
+    "Dashed: zero-sideslip baseline."
+)
+OVERVIEW_CAPTION = (
+    "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
+    "trainings with as many minutes."
+)
 MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """A section a curve, and the table of all as the overview."""
-    curves = curves_of(list(artefacts.parts.values()))
-    rows = [
-        {"curve": f"{curve.title}, {curve.test_set}", **row}
-        for curve in curves
-        for row in rows_of_curve(curve)
-    ]
-    overview = Table(
-        "overview",
-        "RMSE(β) by minutes of reference, all curves.",
-        pd.DataFrame(rows),
-        {"curve": Column("test set"), **COLUMNS},
-    )
-    data = list(dict.fromkeys(data_sentence(part) for part in artefacts.parts.values()))
-    blocks: list[Block] = [artefacts.about, "\n\n".join(data)]
-    for number, curve in enumerate(curves, start=1):
-        blocks += [
-            f"## {curve.title}, test set `{curve.test_set}`",
-            *blocks_of_curve(curve, str(number)),
+    """Report: errors with each amount of reference as one table, and a figure a curve."""
+    parts = list(artefacts.parts.values())
+    curves = curves_of(parts)
+    points = pd.DataFrame(
+        [
+            {"curve": f"{curve.title}, {curve.test_set}", **row}
+            for curve in curves
+            for row in rows_of_curve(curve)
         ]
-    blocks += ["## All curves", overview, *how_it_was_made(artefacts.first), PATENT_NOTE]
-    return {REPORT: Document(artefacts.title, blocks)}
+    )
+    placed: list[Block] = [overview_table(points)]
+    figures = []
+    for number, curve in enumerate(curves, start=1):
+        caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
+        figures.append(f"reference_minutes_{number}")
+        placed.append(Figure(figures[-1], caption, _figure(curve)))
+    values = {
+        "about": artefacts.about.strip(),
+        "curves": [summary_of_curve(rows) for _, rows in points.groupby("curve", sort=False)],
+        "figures": figures,
+        "n_models": sum(len(part.models) for part in parts),
+        "data": list(
+            dict.fromkeys(
+                f"{as_text(part.data_titles.get(name, name))} ({part.kinds[name]})"
+                for part in parts
+                for name in part.split.datasets
+            )
+        ),
+        "command": as_code(artefacts.command),
+    }
+    blocks = [*fill_template(TEMPLATE, values, placed), PATENT_NOTE]
+    data = {"points": points, **data_of_parts(artefacts.parts)}
+    return {REPORT: Document(artefacts.title, blocks, data)}
+
+
+def overview_table(points: pd.DataFrame) -> Table:
+    """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns."""
+    rows = []
+    keys = ["curve", "title", "start"]
+    amounts: list[float] = sorted(set(points["minutes"]) & set(COMMON_MINUTES))
+    for key, group in points.groupby(keys, sort=False):
+        by_minutes = group.set_index("minutes")["rmse_sideslip"]
+        longest = float(by_minutes.index.max())
+        row: dict[str, object] = dict(zip(keys, key, strict=True))
+        row |= {f"minutes_{amount:g}": by_minutes.get(amount, math.nan) for amount in amounts}
+        row |= {"longest": longest, "longest_rmse": by_minutes[longest]}
+        rows.append(row)
+    columns = {
+        "curve": Column("test set"),
+        "title": Column("estimator"),
+        "start": Column("training"),
+        **{f"minutes_{amount:g}": Column(f"{amount:g} min", decimals=2) for amount in amounts},
+        "longest_rmse": Column("all", decimals=2),
+        "longest": Column("all [min]", decimals=1),
+    }
+    return Table("overview", OVERVIEW_CAPTION, pd.DataFrame(rows), columns)
+
+
+def summary_of_curve(points: pd.DataFrame) -> dict[str, object]:
+    """Estimators with the lowest error at the fewest and the most minutes [deg], and the minutes at
+    which starting from another model makes a significant difference.
+
+    ``points``: `rows_of_curve`, with a column ``curve``.
+    """
+    ends = []
+    for minutes in (points["minutes"].min(), points["minutes"].max()):
+        of_end = points[points["minutes"] == minutes]
+        best = of_end.loc[of_end["rmse_sideslip"].idxmin()]
+        ends.append(
+            {
+                "minutes": f"{minutes:g}",
+                "title": best["title"],
+                "start": best["start"],
+                "rmse": fixed(float(best["rmse_sideslip"]), 2),
+            }
+        )
+    verdicts = {
+        verdict: [f"{minutes:g}" for minutes in group["minutes"]]
+        for verdict, group in points.groupby("against_scratch")
+    }
+    return {
+        "title": points["curve"].iloc[0],
+        "ends": ends,
+        "lower": verdicts.get("lower", []),
+        "higher": verdicts.get("higher", []),
+    }
 
 
 @dataclass(frozen=True)
@@ -214,12 +294,7 @@ def minutes_of(part: PartArtefacts) -> float:
 
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """Sentences, figure and table of a curve; ``name`` ends the files' names."""
-    caption = (
-        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a "
-        "reference for training and "
-        "validation; bars are 95 % intervals over blocks of the test and trainings. Dashed: "
-        "zero-sideslip baseline."
-    )
+    caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [
         _in_words(curve),
         Figure(f"reference_minutes_{name}", caption, _figure(curve)),
@@ -260,7 +335,9 @@ def _against_scratch(curve: Curve, point: Point) -> str:
         (candidate for candidate in curve.points if _differ_in_start(candidate, point)), None
     )
     pair = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
-    return pair.verdict if pair is not None else ""
+    if pair is None:
+        return ""
+    return pair.verdict if pair.verdict in ("lower", "higher") else NOT_SIGNIFICANT
 
 
 def _lines(curve: Curve) -> list[list[Point]]:

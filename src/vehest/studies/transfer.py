@@ -1,8 +1,7 @@
-"""The study of several vehicles, each tested by estimators that have learnt on others: which family
-carries over from which cars to which.
+"""The study of several vehicles, each tested by estimators that were trained on others.
 
-A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles
-carry no interval over vehicles.
+A part of the pipeline is a vehicle, or a test of its own. Vehicles are too few for an interval over
+vehicles, so that each test is listed by itself.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from vehest.report.document import (
     Document,
     Figure,
     Table,
+    as_code,
     as_text,
 )
 from vehest.report.style import (
@@ -33,39 +34,45 @@ from vehest.report.style import (
     decimals_for,
     fixed,
     lines_of,
-    listed,
     new_figure,
 )
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.drive import appendix_of, budget_sentence, data_sentence
+from vehest.studies.drive import data_of_parts
 from vehest.studies.kit.runs import titles_of
-from vehest.studies.kit.standing import (
-    interval_in_words,
-    ranking_of,
-    standing_columns,
-    verdict_sentences,
-)
-from vehest.studies.kit.warnings import warnings_of
+from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 
-VERSION = "3"
+VERSION = "4"
+TEMPLATE = Path(__file__).with_name("transfer.md.j2")
 TAKES = "parts"
 SHOWS_FAILED = True
 MAX_PANEL_COLUMNS = 4
 TITLE_WIDTH = 24
 ROW_HEIGHT = 0.16  # in, height of an estimator
-REFERENCES = (
-    "zero",
-    "static_map",
-    "kinematic",
-    "data_sheet",
-)  # baselines, in the order in which tables show them first
+REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
+"""Baselines, in the order in which tables list them first."""
+FIGURE_CAPTION = (
+    "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an "
+    "estimator is better than it. The vertical line in each row is the static map, whose two "
+    "numbers are fitted on the same ranges."
+)
+OVERVIEW_CAPTION = (
+    "Number of tests on which an estimator is significantly better than each baseline, and its "
+    "RMSE(β) over that of zero: median and highest over tests."
+)
+ERRORS_CAPTION = (
+    "RMSE(β) [deg] over all seeds. * significantly better than zero and the static map, corrected "
+    "by Holm within the test. – lacks a channel, failed or has no finite error."
+)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how
-    it was made.
+    """Report: answer, errors as a figure, a summary by estimator and the errors of every test.
 
-    Raises `DataError`.
+    Raises
+    ------
+    DataError
+        An estimate is damaged, or fits no range of the test.
     """
     parts = artefacts.parts
     rankings = {
@@ -73,43 +80,159 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         for name, part in parts.items()
         for test_set in part.split.tests
     }
-    board = overview(parts, rankings)
-    caption = (
-        "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, "
-        "an estimator is better than it. The "
-        "vertical line in each row is the static map, whose two numbers are fitted on the same "
-        "ranges."
-    )
-    blocks: list[Block] = [
-        Figure("transfer", caption, _drawn(board)),
-        *([artefacts.about] if artefacts.about.strip() else []),
+    board = standings(parts, rankings)
+    summary = _summary(board)
+    placed: list[Block] = [
+        Figure("transfer", FIGURE_CAPTION, _drawn(board)),
+        Table("overview", OVERVIEW_CAPTION, summary, SUMMARY_COLUMNS),
+        _errors(board),
     ]
-    missing = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
-    blocks.append(
-        carried_over(board)
-        + (
-            f"\n\nNot here, since nothing could be trained or scored: {listed(missing)}."
-            if missing
-            else ""
-        )
-    )
-    blocks.append(_matrix(board))
-    for name, part in parts.items():
-        blocks += _part(name, part, board[board["part"] == name], rankings)
-    blocks += [block for name, part in parts.items() for block in appendix_of(name, part)]
+    values = _values(artefacts, board, summary)
+    blocks: list[Block] = fill_template(TEMPLATE, values, placed)
     if (board["estimator"] == "ksnn").any():
         blocks.append(PATENT_NOTE)
-    return {REPORT: Document(artefacts.title, blocks)}
+    data = {
+        "tests": _tests(parts, rankings),
+        **{f"leaderboard_{name}": board[board["part"] == name] for name in parts},
+        **data_of_parts(parts),
+    }
+    return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def overview(
+def _values(
+    artefacts: StudyArtefacts, board: pd.DataFrame, summary: pd.DataFrame
+) -> dict[str, object]:
+    """Numbers and names that the template has places for."""
+    parts = artefacts.parts
+    places = board[["part", "test_set"]].drop_duplicates()
+    kinds = [
+        parts[part].kinds_of(parts[part].split.tests[test]) for part, test in places.to_numpy()
+    ]
+    candidates = summary[~summary["name"].isin(BASELINES)]
+    everywhere = candidates[candidates["beats_both"] == len(places)]
+    best = int(candidates["beats_both"].max()) if len(candidates) else 0
+    beaten = board[_beats_both(board)]
+    missing = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
+    return {
+        "about": artefacts.about.strip(),
+        "everywhere": list(everywhere["estimator"]),
+        "n_best": best,
+        "best": list(candidates.loc[candidates["beats_both"] == best, "estimator"]) if best else [],
+        "n_tests": len(places),
+        "n_tests_beaten": len(beaten[["part", "test_set"]].drop_duplicates()),
+        "n_parts": len(parts),
+        "n_real": kinds.count("real"),
+        "n_estimators": len(candidates),
+        "n_models": sum(len(part.models) for part in parts.values()),
+        "missing": missing,
+        "left_out": [
+            {"name": as_code(name), "part": as_text(part.title), "reason": as_text(reason)}
+            for part in parts.values()
+            for name, reason in part.failed.items()
+        ],
+        "command": as_code(artefacts.command),
+        "link": {name: f"tables/leaderboard_{name}.csv" for name in parts},
+        "titles": {name: as_text(parts[name].title) for name in parts},
+    }
+
+
+def _beats_both(board: pd.DataFrame) -> pd.Series:
+    """Whether a row is significantly better than zero and the static map."""
+    return (board["beats_zero"] == "yes") & (board["beats_static_map"] == "yes")
+
+
+SUMMARY_COLUMNS = {
+    "estimator": Column("estimator"),
+    "tests": Column("tests", decimals=0),
+    "beats_both": Column("better than both", decimals=0),
+    "beats_zero": Column("better than zero", decimals=0),
+    "beats_static_map": Column("better than static map", decimals=0),
+    "median_ratio": Column("RMSE(β) / zero, median", decimals=2),
+    "max_ratio": Column("highest", decimals=2),
+}
+
+
+def _summary(board: pd.DataFrame) -> pd.DataFrame:
+    """A row an estimator: tests with a finite error, on how many it is significantly better than
+    the baselines, and its RMSE(β) over that of zero.
+    """
+    zero = board[board["estimator"] == "zero"].set_index(["part", "test_set"])["rmse_sideslip"]
+    places = pd.MultiIndex.from_frame(board[["part", "test_set"]])
+    ratio = board["rmse_sideslip"] / zero.reindex(places).to_numpy()
+    rows = []
+    for title, group in board.assign(ratio=ratio).groupby("estimator_title", sort=False):
+        tested = group[np.isfinite(group["rmse_sideslip"])]
+        is_baseline = group["estimator"].iloc[0] in BASELINES
+        counts = {
+            "beats_both": int(_beats_both(tested).sum()),
+            "beats_zero": int((tested["beats_zero"] == "yes").sum()),
+            "beats_static_map": int((tested["beats_static_map"] == "yes").sum()),
+        }
+        row = {
+            "estimator": title,
+            "name": group["estimator"].iloc[0],
+            "tests": len(tested),
+            **(dict.fromkeys(counts, math.nan) if is_baseline else counts),
+            "median_ratio": tested["ratio"].median(),
+            "max_ratio": tested["ratio"].max(),
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _errors(board: pd.DataFrame) -> Table:
+    """A row a test, a column an estimator."""
+    titles = list(dict.fromkeys(board["estimator_title"]))
+    columns = {"test": Column("test")}
+    columns |= {f"estimator_{position}": Column(title) for position, title in enumerate(titles)}
+    rows = []
+    for _, group in board.groupby(["part", "test_set"], sort=False):
+        records = group.drop_duplicates("estimator_title").to_dict("records")
+        cells = {row["estimator_title"]: _cell(row) for row in records}
+        row = {"test": _place(records[0], board)}
+        row |= {
+            f"estimator_{position}": cells.get(title, MISSING)
+            for position, title in enumerate(titles)
+        }
+        rows.append(row)
+    return Table("errors", ERRORS_CAPTION, pd.DataFrame(rows), columns)
+
+
+def _tests(
+    parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
+) -> pd.DataFrame:
+    """A row a test: its data, the estimator with the lowest error, those that are not
+    significantly worse, and the blocks of the comparison.
+    """
+    rows = []
+    for (name, test_set), ranking in rankings.items():
+        part = parts[name]
+        titles = titles_of(part.models)
+        best = ranking.order[0] if ranking.order else None
+        row = {
+            "part": name,
+            "test_set": test_set,
+            "test_data": part.kinds_of(part.split.tests[test_set]),
+            "training_data": part.kinds_of(part.split.train),
+            "best": titles[best] if best else MISSING,
+            "rmse_sideslip": figure_of(ranking, best) if best else MISSING,
+            "not_significantly_worse": "; ".join(titles[name] for name in ranking.tied_with_best),
+            "blocks": ranking.n_blocks,
+            "block_seconds": ranking.block_seconds,
+            "effective_blocks": ranking.effective_blocks,
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def standings(
     parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
 ) -> pd.DataFrame:
     """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its
     interval [deg], and what it beats.
     """
-    nothing: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
-    nothing |= dict.fromkeys(
+    no_rank: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
+    no_rank |= dict.fromkeys(
         (*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING
     )
     rows = []
@@ -128,7 +251,7 @@ def overview(
                 "variant": name[1],
                 "estimator_title": titles[name],
                 "rmse_sideslip": ranking.rmse.get(name, math.nan),
-                **(standing_columns(ranking, name) if name in ranking.rmse else nothing),
+                **(standing_columns(ranking, name) if name in ranking.rmse else no_rank),
                 **_with_best_lever(parts[part], name, test_set),
             }
             rows.append(row)
@@ -159,75 +282,17 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
     }
 
 
-def carried_over(board: pd.DataFrame) -> str:
-    """Sentences: on which vehicles an estimator is significantly better than zero and the static
-    map.
-    """
-    places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
-    tested = board[~board["estimator"].isin(BASELINES)]
-    beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
-    lines = []
-    everywhere = []
-    for title, rows in tested.groupby("estimator_title", sort=False):
-        names = beaten[beaten["estimator_title"] == title]
-        places_beaten = [_place(row, board) for row in names.to_dict("records")]
-        if len(names) == len(rows) == len(places):
-            everywhere.append(str(title))
-        lines.append(
-            f"- {title}: {len(names)} of "
-            f"{len(rows)}{f' ({listed(places_beaten)})' if places_beaten else ''}"
-        )
-    if everywhere:
-        first = (
-            f"On every one of {len(places)} tests {listed(everywhere)} are significantly better "
-            "than zero and the static map."
-        )
-    else:
-        first = (
-            "**No estimator is significantly better than both zero and the static map on each "
-            f"of the {len(places)} tests.**"
-        )
-    return (
-        f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which "
-        "both are beaten significantly:\n\n" + "\n".join(lines)
-    )
-
-
 def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
     several = board[board["part"] == row["part"]]["test_set"].nunique() > 1
     return f"{row['title']}, {row['test_set']}" if several else str(row["title"])
 
 
-def _matrix(board: pd.DataFrame) -> Table:
-    rows: dict[str, dict[str, Any]] = {
-        title: {"estimator": title} for title in board["estimator_title"]
-    }
-    columns = {"estimator": Column("estimator")}
-    for place, (_, rows_of_test) in enumerate(board.groupby(["part", "test_set"], sort=False)):
-        rows_by_title = rows_of_test.drop_duplicates("estimator_title").to_dict("records")
-        cells = {row["estimator_title"]: _cell(row) for row in rows_by_title}
-        columns[f"place_{place}"] = Column(_place(rows_by_title[0], board))
-        for title, row in rows.items():
-            row[f"place_{place}"] = cells.get(title, MISSING)
-    caption = (
-        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. "
-        "* significantly better than zero and the "
-        "static map, corrected by Holm within the test. – lacks a channel, failed or has no finite "
-        "error. Inputs may differ from "
-        "vehicle to vehicle under one name; they are listed in the pipeline's file."
-    )
-    return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
-
-
 def _cell(row: Mapping[Any, Any]) -> str:
-    if not math.isfinite(row["rmse_sideslip"]):
+    error = row["rmse_sideslip"]
+    if not math.isfinite(error):
         return MISSING
-    decimals = decimals_for([row["rmse_sideslip"]])
     mark = " *" if row["beats_zero"] == row["beats_static_map"] == "yes" else ""
-    low = row["rmse_sideslip_low"]
-    high = row["rmse_sideslip_high"]
-    interval = f" [{fixed(low, decimals)}, {fixed(high, decimals)}]" if math.isfinite(low) else ""
-    return f"{fixed(row['rmse_sideslip'], decimals)}{interval}{mark}"
+    return f"{fixed(error, decimals_for([error]))}{mark}"
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
@@ -254,14 +319,14 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
             rows_of_test = board[
                 (board["part"] == part) & (board["test_set"] == test_set)
             ].set_index(["estimator", "variant"])
-            nothing = _first(rows_of_test, "zero")
+            zero = _first(rows_of_test, "zero")
             for height, name in enumerate(names):
                 if name[:2] not in rows_of_test.index or not math.isfinite(
                     rows_of_test.loc[name[:2], "rmse_sideslip"]
                 ):
                     continue
                 value, low, high = (
-                    float(rows_of_test.loc[name[:2], f"rmse_sideslip{end}"]) / nothing
+                    float(rows_of_test.loc[name[:2], f"rmse_sideslip{end}"]) / zero
                     for end in ("", "_low", "_high")
                 )
                 colour = lines[name[:2]].colour
@@ -275,7 +340,7 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                     )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
             axes.axvline(1.0, color="black", linewidth=0.7)
-            static = _first(rows_of_test, "static_map") / nothing
+            static = _first(rows_of_test, "static_map") / zero
             if math.isfinite(static):
                 axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
             title = str(rows_of_test["title"].iloc[0])
@@ -301,49 +366,3 @@ def _first(rows_of_test: pd.DataFrame, estimator: str) -> float:
         "rmse_sideslip"
     ]
     return float(errors.iloc[0]) if len(errors) else math.nan
-
-
-def _part(
-    name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]
-) -> list[Block]:
-    titles = titles_of(part.models)
-    blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
-    for test_set in part.split.tests:
-        kinds = part.kinds_of(part.split.tests[test_set])
-        blocks.append(
-            verdict_sentences(rankings[name, test_set], titles, f"test set `{test_set}` ({kinds})")
-        )
-    warned = warnings_of(part)
-    if warned:
-        blocks.append("**Notes:**\n\n" + "\n".join(f"- {line}" for line in warned))
-    blocks.append(budget_sentence(part))
-    decimals = decimals_for(board["rmse_sideslip"].tolist())
-    table = board.assign(
-        interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
-    )
-    columns: dict[str, Column] = (
-        {"test_set": Column("test set")} if board["test_set"].nunique() > 1 else {}
-    )
-    columns |= {
-        "estimator_title": Column("estimator"),
-        "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
-        "interval": Column("95 % interval [deg]"),
-        "against_best": Column("difference to best [deg]"),
-        "beats_zero": Column("beats zero"),
-        "beats_static_map": Column("beats static map"),
-    }
-    caption = (
-        f"{as_text(part.title)}: baselines first, then by error. Differences are paired over "
-        "blocks and seeds, corrected by Holm."
-    )
-    if board["rmse_sideslip_best_lever"].notna().any():
-        columns |= {
-            "rmse_sideslip_best_lever": Column("with the best lever [deg]", decimals=decimals),
-            "lever_arm": Column("lever [m]", decimals=2),
-        }
-        caption += (
-            " Where the reference was measured is not known: the best lever arm, within 0.5 m, "
-            "takes off the part of an error that is "
-            "one alone; it is chosen on the test, of each estimator for itself."
-        )
-    return [*blocks, Table(f"leaderboard_{name}", caption, table, columns)]

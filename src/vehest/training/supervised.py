@@ -438,7 +438,7 @@ class _Run:
             return False
         if not member.best_epoch:
             raise DataError(
-                f"training: the validation loss of member {index} is {validation_loss} after epoch "
+                f"training: the validation loss of training {index} is {validation_loss} after epoch "
                 f"{self.epoch}; lower training.learning_rate or check the data with 'vehest data check'"
             )
         member.has_diverged = True

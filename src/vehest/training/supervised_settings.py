@@ -18,7 +18,7 @@ class SupervisedSettings(Group):
     batch_size: int = setting(64, "windows in a batch", least=1)
     max_epochs: int = setting(1000, "epochs after which training ends in any case", least=1)
     patience: int = setting(
-        25, "epochs without a better validation loss after which a member stops", least=1
+        25, "epochs without a better validation loss after which a training stops", least=1
     )
     epoch_steps: int = setting(
         0,

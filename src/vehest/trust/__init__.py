@@ -1,1 +1,4 @@
-"""How far an estimate can be trusted: a contract for running online, calibrated bands, health, and faults to try them with."""
+"""How far an estimate can be trusted.
+
+A contract for running online, calibrated bands, health, and faults to try them with.
+"""

@@ -1,9 +1,11 @@
-"""Vector autoregression: predicts the next sample of several channels; its errors are the innovations.
+"""Vector autoregression.
+
+Predicts the next sample of several channels; its errors are the innovations.
 
     y_k = c + A₁ y_{k-1} + … + A_p y_{k-p} + ε_k,  ε ~ N(0, S)
 
-(Lütkepohl, New Introduction to Multiple Time Series Analysis, 2005, Eq. 2.1.1). Fitted by least squares, once more without the rows that
-hold outliers; its order by BIC (Section 4.3.2).
+(Lütkepohl, New Introduction to Multiple Time Series Analysis, 2005, Eq. 2.1.1). Fitted by least
+squares, once more without the rows that hold outliers; its order by BIC (Section 4.3.2).
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
 OUTLIER = 8.0  # robust standard deviations
-LEAST_DEVIATION = 1e-7  # of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no noise
+# of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no
+# noise
+LEAST_DEVIATION = 1e-7
 LEVELS = (0.2, 5.0)  # between which the noise may change with the speed
 ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
 
@@ -38,7 +42,10 @@ class Autoregression:
         return len(self.coefficients)
 
     def innovations(self, samples: FloatArray) -> FloatArray:
-        """y_k less its prediction from the p samples before, (T, C); NaN for the first p and where a sample is not finite."""
+        """y_k less its prediction from the p samples before, (T, C).
+
+        NaN for the first p and where a sample is not finite.
+        """
         innovations = np.full(np.shape(samples), np.nan)
         if len(samples) > self.order:
             innovations[self.order :] = samples[self.order :] - self.constant
@@ -50,12 +57,16 @@ class Autoregression:
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows of unbroken stretches, (T, C) each; keep that of least BIC; raises `DataError`."""
+    """Fit orders 1 to ``max_order`` to the same rows of unbroken stretches, (T, C) each.
+
+    Keep that of least BIC; raises `DataError`.
+    """
     n_channels = pieces[0].shape[1]
     regressors, targets = _rows(pieces, max_order)
     if len(targets) < ROWS_A_NUMBER * (1 + max_order * n_channels):
         raise DataError(
-            f"{len(targets)} samples without gaps are too few for an autoregression of order {max_order} in {n_channels} channels"
+            f"{len(targets)} samples without gaps are too few for an autoregression of order "
+            f"{max_order} in {n_channels} channels"
         )
     centre = targets.mean(0)
     spread = np.maximum(targets.std(0), 1e-12)
@@ -118,9 +129,8 @@ def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) ->
     """Constant and coefficients of the first ``columns`` regressors, (1 + columns, C)."""
     design = np.concatenate([np.ones((len(regressors), 1)), regressors[:, :columns]], axis=1)
     gram = design.T @ design
-    gram[np.diag_indices_from(gram)] += 1e-10 * len(
-        design
-    )  # where one channel is another's multiple
+    # where one channel is another's multiple
+    gram[np.diag_indices_from(gram)] += 1e-10 * len(design)
     return np.linalg.solve(gram, design.T @ targets)
 
 
@@ -129,9 +139,12 @@ def learn_noise_levels(
 ) -> tuple[FloatArray, FloatArray]:
     """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
 
-    Returns:
-        Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of samples; and root mean squares there, (L, C),
-        outliers cut off, between which straight lines hold.
+    Returns
+    -------
+    tuple
+        Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
+        samples; and root mean squares there, (L, C), outliers cut off, between which straight
+        lines hold.
     """
     is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
     scaled = innovations[is_finite] / np.sqrt(np.diag(covariance))

@@ -1,19 +1,24 @@
 """Calibrated half widths of v and β at stated levels, for any family of estimators.
 
-    training ranges -> scale s, domain; validation ranges -> factors q; Bands (trust.yaml) -> band_rows -> half widths
+    training ranges -> scale s, domain; validation ranges -> factors q
+    Bands (trust.yaml) -> band_rows -> half widths
 
     half width at level p = q_p · s(x) · w(x)
 
-s is a local scale that training ranges give: s² is a combination, with weights that are not negative, of the estimator's inputs at the
-instant and of its estimate; of a filter s² = a (P + floor²) with its own variance P. q_p is the level's quantile of |error|/(s w) on
-validation ranges, each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens outside the training's domain.
+s is a local scale that training ranges give: s² is a combination, with weights that are not
+negative, of the estimator's inputs at the instant and of its estimate; of a filter s² = a (P +
+floor²) with its own variance P. q_p is the level's quantile of |error|/(s w) on validation ranges,
+each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens outside the training's
+domain.
 
-The rule of w was fixed before any of its effects was looked at: with m the 99.9th percentile of |f| in training, w is the largest of
-1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre other than those calibrated on.
+The rule of w was fixed before any of its effects was looked at: with m the 99.9th percentile of |f|
+in training, w is the largest of 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre
+other than those calibrated on.
 
-Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA 118 (544), 2023 (pooling
-CDFs); Lee, Barber & Willett, Distribution-free inference with hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et
-al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
+Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical
+models, JASA 118 (544), 2023 (pooling CDFs); Lee, Barber & Willett, Distribution-free inference with
+hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et al., Distribution-free
+predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
 """
 
 from __future__ import annotations
@@ -36,21 +41,23 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number, check_numbers
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)
-SHOWN_LEVEL = 0.9  # of the channels band_vy and band_sideslip
+CHANNEL_LEVEL = 0.9  # of the channels band_vy and band_sideslip
 
-LEAST_PIECES = 10  # ranges, from which on each is a block
+MIN_RANGES = 10  # ranges, from which on each is a block
 TURN_YAW_RATE = 0.05  # rad/s
-LEAST_BLOCK_SECONDS = 2.0
+MIN_BLOCK_SECONDS = 2.0
 
 DOMAIN_QUANTILE = 0.999
 OTHER_VEHICLE = 2.0  # by which a band is wider on another car or tyre
 LOWEST_SPEED = 1.0  # m/s, below which β is not resolved
-LEAST_SCALE = 0.1  # of the root mean square error in training: the scale's floor
-FITS = 20  # of the scale, each with the weights that the last one gives
+MIN_RELATIVE_SCALE = 0.1  # of the root mean square error in training: the scale's floor
+N_FITS = 20  # of the scale, each with the weights that the last one gives
 
 COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")
 TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
-"""Terms of s²: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over vx². ``variance`` is P."""
+"""Terms of s²: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over
+vx². ``variance`` is P.
+"""
 
 MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
 MIN_TERM = 1e-30  # of the terms' sizes that are not 0
@@ -65,21 +72,20 @@ Blocks = Literal["range", "turn"]
 class Quantity:
     """The band of one quantity."""
 
-    weights: dict[
-        str, float
-    ]  # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
+    # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
+    weights: dict[str, float]
     floor: float  # s is never below [m/s, or rad]
     factors: tuple[float, ...]  # q of each level
-    beyond: tuple[
-        bool, ...
-    ]  # of each level, whether there are too few blocks for it (`pooled_quantile`)
+    # of each level, whether there are too few blocks for it (`pooled_quantile`)
+    beyond: tuple[bool, ...]
     effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
         _check_terms("weights", self.weights, 0.0)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
             raise DataError(
-                f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})"
+                f"factors and beyond must have {len(LEVELS)} values, one a level "
+                f"({', '.join(map(str, LEVELS))})"
             )
         check_numbers("factors", self.factors, 0.0, MAX_FACTOR)
         check_number("floor", self.floor, math.ulp(0.0), MAX_FACTOR)
@@ -96,9 +102,9 @@ class Quantity:
 class Bands:
     """Half widths of v and β of one model."""
 
-    vehicles: tuple[
-        str, ...
-    ]  # that were driven where it was calibrated; none: a new car for each drive, as any car is to the model
+    # that were driven where it was calibrated; none: a new car for each drive, as any car is to the
+    # model
+    vehicles: tuple[str, ...]
     datasets: tuple[str, ...]  # whose recordings these are
     scaled_on: tuple[str, ...]  # ranges that gave scale and domain
     calibrated_on: tuple[str, ...]  # ranges that gave the factors
@@ -122,9 +128,9 @@ class Bands:
     def are_of(self, vehicle: str, car: CarValues = UNKNOWN_CAR) -> bool:
         """Whether they apply to a vehicle, by its name and values, as they are.
 
-        They do if they are for any car. They do not where `difference_to` finds one. Otherwise names
-        decide. Where a side has no name, they apply to the one car that they were calibrated on, and
-        not to one beside several.
+        They do if they are for any car. They do not where `difference_to` finds one. Otherwise
+        names decide. Where a side has no name, they apply to the one car that they were calibrated
+        on, and not to one beside several.
         """
         if not self.vehicles:
             return True
@@ -140,8 +146,11 @@ class Bands:
         return differences[0] if differences and all(differences) else ""
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
-        """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
-        level_place = LEVELS.index(SHOWN_LEVEL)
+        """Arguments of `band_rows` for `CHANNEL_LEVEL`.
+
+        ``elsewhere``: the car or its tyres are others than those calibrated on.
+        """
+        level_place = LEVELS.index(CHANNEL_LEVEL)
         wider = OTHER_VEHICLE if elsewhere else 1.0
         head = [
             self.vy.factors[level_place] * wider,
@@ -162,7 +171,10 @@ class Bands:
     def half_widths(
         self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False
     ) -> FloatArray:
-        """Half widths at `SHOWN_LEVEL`, (T, 2): v [m/s] and β [rad]; NaN where there is no estimate. Arguments as of `band_rows`."""
+        """Half widths at `CHANNEL_LEVEL`, (T, 2): v [m/s] and β [rad].
+
+        NaN where there is no estimate. Arguments as of `band_rows`.
+        """
         bands = np.empty((len(vy), 2))
         band_rows(rows, vy, variance, *self.packed(elsewhere=elsewhere), bands)
         return bands
@@ -179,17 +191,21 @@ def _check_terms(name_of_terms: str, numbers: Mapping[str, float], smallest: flo
 class PackedBands(NamedTuple):
     """A level's band as `band_rows` takes it."""
 
-    columns: NDArray[
-        np.int64
-    ]  # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
-    numbers: FloatArray  # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their largest sizes, (29,)
+    # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
+    columns: NDArray[np.int64]
+    # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their
+    # largest sizes, (29,)
+    numbers: FloatArray
 
 
 @entry(nogil=True)
 def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-untyped-def]
-    """``bands`` of one level, (T, 2), v [m/s] and β [rad], of inputs (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
+    """Write ``bands`` of one level, (T, 2), v [m/s] and β [rad].
 
-    NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and ``numbers`` are of `PackedBands`.
+    Inputs are ``rows`` (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
+
+    NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and
+    ``numbers`` are of `PackedBands`.
     """
     n_terms = (len(numbers) - HEAD_LENGTH) // 3
     terms = np.empty(n_terms)
@@ -231,7 +247,7 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
 def with_bands(
     estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False
 ) -> Estimate:
-    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad]; raises `DataError`."""
+    """Add 90 % half widths ``band_vy`` [m/s] and ``band_sideslip`` [rad] to an estimate."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
     return replace(
@@ -247,13 +263,16 @@ def with_bands(
 def band_inputs(
     estimate: Estimate, measured: Recording, channels: Sequence[str], horizon_steps: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them; raises `DataError`.
+    """Rows (T, C), estimates (T,) and their variances (T,) for bands; raises `DataError`.
+
+    Variances are NaN where the method has none.
 
     A row is the last sample that the estimate was made of, so that online they are the same.
     """
     if len(estimate) != len(measured):
         raise DataError(
-            f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the recording {len(measured)}"
+            f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the "
+            f"recording {len(measured)}"
         )
     rows = measured.stack(channels)
     rows = np.ascontiguousarray(rows[np.maximum(np.arange(len(rows)) - horizon_steps, 0)])
@@ -280,7 +299,9 @@ class Piece:
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]
     variance: FloatArray  # of its error, (T,) [m²/s²], NaN where there is none
-    errors: FloatArray  # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, or nothing is to be learnt from
+    # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, or nothing is to be
+    # learnt from
+    errors: FloatArray
     yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
     rate_hz: float  # of the samples [Hz]
 
@@ -293,15 +314,19 @@ class Piece:
 def calibrated(
     training: Sequence[Piece], validation: Sequence[Piece], channels: tuple[str, ...], **origin: Any
 ) -> Bands:
-    """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
+    """Bands of a model.
 
-    ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
-    Raises `DataError` where one of the two has no sample whose error is known.
+    Scale and domain from training ranges, factors from validation ranges that it has not learnt
+    from.
+
+    ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model
+    and its recordings. Raises `DataError` where one of the two has no sample whose error is known.
     """
     for pieces, role in ((training, "training"), (validation, "validation")):
         if not any(piece.has_error.any() for piece in pieces):
             raise DataError(
-                f"no sample of the {role} ranges has both an estimate and a reference to calibrate bands by"
+                f"no sample of the {role} ranges has both an estimate and a reference to "
+                "calibrate bands by"
             )
     columns = _columns(channels)
     terms = np.concatenate(
@@ -371,7 +396,10 @@ def calibrated(
 def terms_of(
     rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]
 ) -> FloatArray:
-    """`TERMS` of each sample without their squares, (T, 8); NaN where a channel is not read or was not measured."""
+    """`TERMS` of each sample without their squares, (T, 8).
+
+    NaN where a channel is not read or was not measured.
+    """
     vx, ax, ay, yaw_rate, steer = (
         rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns
     )
@@ -395,7 +423,9 @@ def _with_factors(scale: Quantity, scores: FloatArray, blocks: NDArray[np.int64]
 
 
 def effective_blocks(sums: FloatArray) -> float:
-    """How many blocks of equal loss would be spread out like these, (B,): (Σ s)² / Σ s², 1 where a single block holds all of it.
+    """How many blocks of equal loss would be spread out like these, (B,).
+
+    (Σ s)² / Σ s², 1 where a single block holds all of it.
 
     Source: Kish, Survey Sampling, 1965, Section 11.7, for weights.
     """
@@ -404,27 +434,33 @@ def effective_blocks(sums: FloatArray) -> float:
 
 
 def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, float]:
-    """Weights, none negative, and floor of a scale: s² = Σ c_j f_j², as squared errors are spread.
+    """Weights, none negative, and floor of a scale.
 
-    Iterated least squares, each sample weighted by 1/s⁴ of the last fit: the quasi-likelihood of squares whose standard deviation is
-    proportional to their mean, as that of Gaussian errors is (McCullagh & Nelder 1989, Section 9.2).
+    s² = Σ c_j f_j², as squared errors are spread.
 
-    Returns:
+    Iterated least squares, each sample weighted by 1/s⁴ of the last fit: the quasi-likelihood of
+    squares whose standard deviation is proportional to their mean, as that of Gaussian errors is
+    (McCullagh & Nelder 1989, Section 9.2).
+
+    Returns
+    -------
+    tuple
         c, (J,), of terms f, (N, J), and errors (N,); and the floor of s.
     """
     squares = np.square(terms)
     targets = np.square(errors)
     mean = float(targets.mean())
-    floor = max(LEAST_SCALE * math.sqrt(mean), 1e-9)
+    floor = max(MIN_RELATIVE_SCALE * math.sqrt(mean), 1e-9)
     columns = np.sqrt(np.mean(np.square(squares), axis=0))
     columns[columns == 0] = 1.0
     predicted = np.full(len(targets), max(mean, floor**2))
     weights = np.zeros(terms.shape[1])
-    for _ in range(FITS):
+    for _ in range(N_FITS):
         whitened = squares / columns / predicted[:, None]
+        # few rows
         triangle: FloatArray = np.asarray(
             np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r")
-        )  # few rows
+        )
         weights = scipy.optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
         former = predicted
         predicted = np.maximum(squares @ weights, floor**2)
@@ -436,18 +472,25 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
 def pooled_quantile(
     scores: FloatArray, blocks: NDArray[np.int64], level: float
 ) -> tuple[float, bool]:
-    """The level's quantile of scores pooled over K blocks, each of the same weight, with 1/(n + 1) of the weight at infinity.
+    """The level's quantile of scores pooled over K blocks of equal weight.
 
-    n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in blocks of m on average, ρ the intraclass
-    correlation of "below the quantile". If scores of a block agree (ρ = 1) n is K, and a further block, exchangeable with these, has on
-    average at least the level of its scores below (Lee, Barber & Willett 2023). If they are independent n is N, as in split conformal
-    prediction. In between the level is met on average, nearly: the rest of the guarantee would make bands of few blocks far too wide.
+    1/(n + 1) of the weight is at infinity.
 
-    Returns:
-        The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small for the level, where by rule it is the
-        largest score times 1 + 1/n.
+    n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in
+    blocks of m on average, ρ the intraclass correlation of "below the quantile". If scores of a
+    block agree (ρ = 1) n is K, and a further block, exchangeable with these, has on average at
+    least the level of its scores below (Lee, Barber & Willett 2023). If they are independent n is
+    N, as in split conformal prediction. In between the level is met on average, nearly: the rest of
+    the guarantee would make bands of few blocks far too wide.
 
-    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4 (design effect).
+    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
+    (design effect).
+
+    Returns
+    -------
+    tuple
+        The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small
+        for the level, where by rule it is the largest score times 1 + 1/n.
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
     n_blocks = len(counts)
@@ -466,12 +509,15 @@ def pooled_quantile(
 
 
 def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> float:
-    """Intraclass correlation of values (N,) in groups (N,), by one-way analysis of variance: 1 where a group's values are equal.
+    """Intraclass correlation of values (N,) in groups (N,), by one-way analysis of variance.
+
+    1 where a group's values are equal.
 
     NaN where there are fewer than two groups, or no group has two.
 
-    Source: Donner, A review of inference procedures for the intraclass correlation coefficient in the one-way random effects model,
-    International Statistical Review 54 (1), 1986, for groups of unlike sizes.
+    Source: Donner, A review of inference procedures for the intraclass correlation coefficient in
+    the one-way random effects model, International Statistical Review 54 (1), 1986, for groups of
+    unlike sizes.
     """
     _, group_of_value, sizes = np.unique(labels, return_inverse=True, return_counts=True)
     groups = len(sizes)
@@ -489,13 +535,15 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
 def block_labels(
     yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float
 ) -> tuple[list[NDArray[np.int64]], Blocks]:
-    """Block that each sample of some ranges belongs to, counted through: a range each if there are 10, else from turn to turn.
+    """Block that each sample of some ranges belongs to, counted through.
+
+    A range each if there are 10, else from turn to turn.
 
     A range without yaw rate [rad/s] is one block.
     """
     labels = []
     count = 0
-    kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"
+    kind: Blocks = "range" if len(lengths) >= MIN_RANGES else "turn"
     for yaw_rate, length in zip(yaw_rates, lengths, strict=True):
         spans_range = kind == "range" or yaw_rate is None
         turns = (
@@ -509,13 +557,13 @@ def block_labels(
 
 
 def turns_of(yaw_rate: FloatArray, rate_hz: float) -> NDArray[np.int64]:
-    """Number of the stretch, from the start of one turn to that of the next, that each sample belongs to, (T,).
+    """Number of the turn that each sample belongs to, (T,).
 
-    A turn starts where |yaw rate| rises over 0.05 rad/s, at the earliest 2 s after the one before; what is left at the end and shorter
-    than that belongs to the last.
+    A turn starts where |yaw rate| rises over 0.05 rad/s, at the earliest 2 s after the one before;
+    what is left at the end and shorter than that belongs to the last.
     """
     turning = np.abs(np.nan_to_num(yaw_rate)) >= TURN_YAW_RATE
-    min_samples = max(math.ceil(LEAST_BLOCK_SECONDS * rate_hz), 1)
+    min_samples = max(math.ceil(MIN_BLOCK_SECONDS * rate_hz), 1)
     starts = [0]
     for start in np.flatnonzero(turning[1:] & ~turning[:-1]) + 1:
         if start - starts[-1] >= min_samples:

@@ -1,4 +1,6 @@
-"""Calibrates a fitted estimator: bands, limits of samples and health, from its training and validation ranges.
+"""Calibrates a fitted estimator.
+
+Bands, limits of samples and health, from its training and validation ranges.
 
 ranges -> estimates through whole ranges from a start of their own, as on a new drive -> `Trust`
 """
@@ -26,7 +28,8 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 class Stretch:
     """A range to learn from, with the part of its recording before it."""
 
-    recording: Recording  # at the model's rate, with references, and with a warm-up before the range where it has one
+    # at the model's rate, with references, and with a warm-up before the range where it has one
+    recording: Recording
     start: float  # of the range [s]
     dataset: str  # of the recording; may be empty
     name: str  # for people
@@ -42,8 +45,8 @@ def learn_trust(
 ) -> Trust:
     """Bands, limits of samples and health of a fitted estimator.
 
-    Training ranges give scales, limits and relations between channels; validation ranges give factors of bands and, together with the
-    others, thresholds of health.
+    Training ranges give scales, limits and relations between channels; validation ranges give
+    factors of bands and, together with the others, thresholds of health.
     """
     bands = None
     guard = None
@@ -87,7 +90,10 @@ def learn_trust(
 
 
 def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
-    """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
+    """Ranges after their starts with the model's estimates on them.
+
+    Raises `DataError` where a recording lacks a channel.
+    """
     pieces: list[Piece] = []
     estimates = estimator.estimate(
         [stretch.recording.without_references() for stretch in stretches]

@@ -1,4 +1,7 @@
-"""Checks of the numbers of trust.yaml: what compiled code indexes and computes with is validated where it becomes an object."""
+"""Checks of the numbers of trust.yaml.
+
+What compiled code indexes and computes with is validated where it becomes an object.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
 
 MAX_NUMBER = 1e100
-"""Of every number without a narrower range: products of three stay finite."""
+"""Largest size of a number without a narrower range: products of three stay finite."""
 
 
 def check_channels(place: str, names: Sequence[str]) -> None:
@@ -40,7 +43,7 @@ def check_numbers(
 
 
 def check_shape(place: str, values: Any, *shape: int) -> None:
-    """Raise `DataError` unless nested tuples have a shape and their numbers are at most `MAX_NUMBER` in size."""
+    """Raise `DataError` unless nested tuples have a shape and numbers up to `MAX_NUMBER`."""
     if not shape:
         if not math.fabs(values) <= MAX_NUMBER:
             raise DataError(f"{place} holds {values:.4g}, beyond {MAX_NUMBER:g}")

@@ -1,7 +1,10 @@
-"""Judges the time stamps of samples online: which samples repeat, which are missing, whether the clock can be trusted.
+"""Judges the time stamps of samples online.
 
-While the clock stands still nothing measures time but the calls themselves, which come at the input rate. "0.2 s" is therefore a number
-of calls here, and so is "1 s". `vehest_step_at` of an export makes the same decisions.
+Which samples repeat, which are missing, whether the clock can be trusted.
+
+While the clock stands still nothing measures time but the calls themselves, which come at the input
+rate. "0.2 s" is therefore a number of calls here, and so is "1 s". `vehest_step_at` of an export
+makes the same decisions.
 """
 
 from __future__ import annotations
@@ -13,16 +16,17 @@ import numpy as np
 
 from vehest.trust.guard import BRIDGED_SECONDS
 
-FAULT_SECONDS = (
-    0.2  # of stamps that do not advance or are uneven, after which the clock is not trusted
-)
+# of stamps that do not advance or are uneven, after which the clock is not trusted
+FAULT_SECONDS = 0.2
 RECOVERY_SECONDS = 1.0  # of even stamps, after which it is trusted again
 RESET_SECONDS = 1.0  # by which a stamp lies before the last one where the clock has been set back
 MIN_ADVANCE = 0.5  # sampling intervals; a stamp that is ahead by less repeats the last sample
 EVEN_INTERVALS = (0.6, 1.6)  # sampling intervals from one stamp to the next that jitter explains
 RATE_INTERVALS = 20
 RATE_TOLERANCE = 0.2
-"""Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
+"""Number of intervals, and deviation of their median, for the warning that samples come at another
+rate.
+"""
 
 CLOCK_STOPPED = 33
 CLOCK_JUMPED = 34
@@ -31,7 +35,10 @@ CLOCK_UNEVEN = 35
 
 REPEATED = -1
 STOPPED = -2
-"""Verdicts on a sample that is not new: pass it over; count it as missing, since the clock has stopped."""
+"""Verdicts on a sample that is not new.
+
+Pass it over; count it as missing, since the clock has stopped.
+"""
 
 
 class SampleClock:
@@ -45,9 +52,11 @@ class SampleClock:
     Attributes
     ----------
     fault : int
-        Why the clock is not trusted: `CLOCK_STOPPED`, `CLOCK_JUMPED`, `CLOCK_UNEVEN`; 0 while it is trusted.
+        Why the clock is not trusted: `CLOCK_STOPPED`, `CLOCK_JUMPED`, `CLOCK_UNEVEN`; 0 while it is
+        trusted.
     fault_calls, recovery_calls, max_missing : int
-        `FAULT_SECONDS` and `RECOVERY_SECONDS` as calls; missing samples that a row of NaN replaces at most.
+        `FAULT_SECONDS` and `RECOVERY_SECONDS` as calls; missing samples that a row of NaN replaces
+        at most.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -75,7 +84,8 @@ class SampleClock:
         Returns
         -------
         int
-            Number of samples that are missing before this one, at most ``max_missing``; `REPEATED` or `STOPPED` where it is not new.
+            Number of samples that are missing before this one, at most ``max_missing``; `REPEATED`
+            or `STOPPED` where it is not new.
         """
         if math.isnan(self._last) and math.isfinite(time):
             self._last = self._previous = time

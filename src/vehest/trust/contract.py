@@ -1,16 +1,22 @@
-"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`GuardedRun`), by the same compiled recursions.
+"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`GuardedRun`).
+
+Both use the same compiled recursions.
 
     received rows -> guard -> health -> estimator -> watch -> verdict, bands -> estimate
 
-1. Values that are not finite, beyond physics, jumping or standing still count as not measured, and so do samples that are missing.
+1. Values that are not finite, beyond physics, jumping or standing still count as not measured, and
+   so do samples that are missing.
 2. Gaps up to 0.5 s are bridged; after longer ones the estimator starts anew.
-3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
-4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
-   the fault is over (`vehest.trust.verdict`).
-5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, or is not finite, starts anew, with
-   adapting states, such as tyres, at their fitted values. Slower than 0.1 m/s, at standstill, the car has no sideslip: 0.
+3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the
+   last one to 0.
+4. A channel that health accuses counts as not measured where the method can do without it; an
+   estimator that remembers starts anew once the fault is over (`vehest.trust.verdict`).
+5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, or is
+   not finite, starts anew, with adapting states, such as tyres, at their fitted values. Slower than
+   0.1 m/s, at standstill, the car has no sideslip: 0.
 
-An estimator that breaks down numerically returns NaN. An exception that it raises is a defect and is passed on.
+An estimator that breaks down numerically returns NaN. An exception that it raises is a defect and
+is passed on.
 """
 
 from __future__ import annotations
@@ -50,7 +56,10 @@ MOTION = ("vx", "yaw_rate", "ay")
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits learnt with an estimator, or those of any car; `DataError` where ``trust`` was learnt with another one."""
+    """The limits learnt with an estimator, or those of any car.
+
+    `DataError` where ``trust`` was learnt with another one.
+    """
     if trust is not None:
         trust.check_fit(estimator)
     learnt_limits = trust.guard if trust is not None else None
@@ -58,14 +67,15 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
 
 
 class GuardedRun:
-    """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
+    """An estimator under the contract on a recording, or on its parts to the same bits.
 
-    Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is neither band nor health of channels. The
-    state of a protocol, ``initial_state``, is that at the first sample; ``elsewhere``: the car or its tyres are others than those that were
-    calibrated on.
+    Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is
+    neither band nor health of channels. The state of a protocol, ``initial_state``, is that at the
+    first sample; ``elsewhere``: the car or its tyres are others than those that were calibrated on.
 
     Attributes:
-        takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
+        takes_parts: whether the estimator can go on where it stopped; else the recording must come
+        whole.
     """
 
     def __init__(
@@ -89,9 +99,8 @@ class GuardedRun:
         self._begun = False
         self._speed = np.full(1, np.nan)
         self._state: Any = None  # of the estimator after the last row
-        self._window = np.empty(
-            (0, len(estimator.channels))
-        )  # rows that it still sees, where it has no state
+        # rows that it still sees, where it has no state
+        self._window = np.empty((0, len(estimator.channels)))
         self._late: dict[str, FloatArray] = {}  # values of the last ``horizon_steps`` rows
         self.extra_quantities: dict[str, FloatArray] = {}
         self.covariance: FloatArray | None = None
@@ -100,20 +109,31 @@ class GuardedRun:
     def __call__(self, samples: Mapping[str, FloatArray], recording: Recording) -> Estimate:
         """The estimate of a part.
 
-        Args:
-            samples: channels that the estimator reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
-            recording: its clock, name and vehicle are used, its samples are not.
+        Parameters
+        ----------
+        samples : mapping
+            Channels that the estimator reads, (T,) each, as received: they may hold NaN,
+            infinite or senseless values.
+        recording : Recording
+            Its clock, name and vehicle are used, its samples are not.
 
-        Returns:
-            ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
+        Returns
+        -------
+        Estimate
+            ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands,
+            ``band_vy`` and ``band_sideslip``.
 
-        Raises `DataError`: a channel is missing.
+        Raises
+        ------
+        DataError
+            A channel is missing.
         """
         estimator = self.estimator
         missing = [name for name in estimator.channels if name not in samples]
         if missing:
             raise DataError(
-                f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs"
+                f"recording '{recording.id}' has no channel '{missing[0]}', which estimator "
+                f"'{estimator.name}' needs"
             )
         rows = np.ascontiguousarray(
             np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1)
@@ -135,9 +155,12 @@ class GuardedRun:
         return self._estimate(verdict)
 
     def _piece(self, start: int) -> int:
-        """Go on from a row up to the next wait or restart, or until the estimator is lost; returns the row to go on with.
+        """Go on from a row up to the next wait or restart, or until the estimator is lost.
 
-        After a loss the next attempt is short at first, so that an estimator that is lost again and again takes no quadratic time.
+        Returns the row to go on with.
+
+        After a loss the next attempt is short at first, so that an estimator that is lost again and
+        again takes no quadratic time.
         """
         flow = self.cleaned.flow
         lost = self.watch.state[5] > 0
@@ -173,10 +196,12 @@ class GuardedRun:
         return done, watched.lost
 
     def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
-        """The estimator's v after each row of a piece, (T,), which goes on from a state or from the rows before it, or begins anew."""
-        extra = (
-            self.estimator.horizon_steps
-        )  # rows after the last, whose values no estimate at their time depends on
+        """The estimator's v after each row of a piece, (T,).
+
+        It continues from a state or from the rows before the piece, or begins anew.
+        """
+        # rows after the last, whose values no estimate at their time depends on
+        extra = self.estimator.horizon_steps
         rows = np.concatenate([window, self.cleaned.rows[start:end]])
         self._window = rows[max(len(rows) - self.estimator.warm_up_steps, 0) :]
         channels = dict(
@@ -220,7 +245,10 @@ class GuardedRun:
     def _estimated(
         self, piece: Recording, state: Any, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        """The estimate of a piece from a state, which is updated, or from the initial state of a protocol where it is None."""
+        """The estimate of a piece from a state, which is updated.
+
+        Where the state is None, it starts from the initial state of a protocol.
+        """
         estimator = self.estimator
         if not estimator.continues:
             return estimator.estimate([piece], initial_state)[0]
@@ -232,7 +260,10 @@ class GuardedRun:
         return estimate
 
     def _estimate(self, verdict: Health) -> Estimate:
-        """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
+        """The estimate on the recording's clock.
+
+        That after row k holds ``horizon_steps`` samples later, its health at once.
+        """
         r = self.recording
         horizon = self.estimator.horizon_steps
         monitor = self.monitor
@@ -292,10 +323,13 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
 
 
 class GuardedStepper(Stepper):
-    """Any fitted, causal estimator online, under the contract; ``trust`` and ``elsewhere`` are as of `GuardedRun`.
+    """Any fitted, causal estimator online, under the contract.
 
-    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal anti-aliasing filter first. ``clock`` judges other
-    stamps than those of `step`, such as the frames' that samples are formed from, and whoever passes it takes them.
+    ``trust`` and ``elsewhere`` are as of `GuardedRun`.
+
+    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal
+    anti-aliasing filter first. ``clock`` judges other stamps than those of `step`, such as the
+    frames' that samples are formed from, and whoever passes it takes them.
 
     Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
 
@@ -348,20 +382,29 @@ class GuardedStepper(Stepper):
 
     @property
     def delay(self) -> float:
-        """Of slow signals through the filter from the bus's rate [s]; 0 without one."""
+        """Delay of slow signals through the filter from the bus's rate [s]; 0 without one."""
         return self.front_end.delay if self.front_end is not None else 0.0
 
     def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:
         """Take the sample received at one instant.
 
-        Args:
-            sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
-            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged. While stamps stand still, go back, jump
-                or are uneven, the estimate is invalid (docs/online_contract.md). None, or no number: the sample is the next one at the rate.
+        Parameters
+        ----------
+        sample : mapping or None
+            Channel -> value [SI]; a channel that is missing, None or no number counts as not
+            measured; None: all.
+        time : float or None
+            Of the sample [s], if known: repeated samples are skipped, missing ones bridged.
+            While stamps stand still, go back, jump or are uneven, the estimate is invalid
+            (docs/online_contract.md). None, or no number: the sample is the next one at the
+            rate.
 
-        Returns:
-            ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
-            ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
+        Returns
+        -------
+        dict
+            ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health``
+            (0 valid, 1 degraded, 2 invalid) and ``health_reason`` of the sample; with
+            calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
         if not isinstance(time, Real):
             if self._judges_samples:

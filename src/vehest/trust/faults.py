@@ -1,10 +1,12 @@
-"""Injects faults of sensors, wiring or decoding into a channel of a recording: 16 kinds at three severities.
+"""Injects faults of sensors, wiring or decoding into a channel of a recording.
+
+16 kinds at three severities.
 
     samples + Fault -> FaultedChannel -> samples with the fault
 
-All random numbers come from the fault's seed. Sizes are round numbers of engineering judgement, from faults that a driver would not notice
-to those of no car, and were set before the error of any estimator under them was looked at;
-docs/faults.md, "Kinds and sizes", is the table of all of them.
+All random numbers come from the fault's seed. Sizes are round numbers of engineering judgement,
+from faults that a driver would not notice to those of no car, and were set before the error of any
+estimator under them was looked at; docs/faults.md, "Kinds and sizes", is the table of all of them.
 """
 
 from __future__ import annotations
@@ -52,13 +54,17 @@ OFFSETS: dict[str, Sizes] = {
 """Channel -> mild, medium and severe offset [unit of the channel]."""
 
 OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
-"""Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples: their radii differ by a factor of ten."""
+"""Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples.
 
+Their radii differ by a factor of ten.
+"""
+
+# offsets of all other channels, as shares of the largest size that `CHANNELS` allows
 OFFSETS_OF_RANGE: Sizes = (
     0.01,
     0.05,
     0.2,
-)  # offsets of all other channels, as shares of the largest size that `CHANNELS` allows
+)
 
 UNIT_FACTORS: dict[str, Sizes] = {
     "m/s": (2.236936, 1.0 / 3.6, 3.6),
@@ -67,16 +73,25 @@ UNIT_FACTORS: dict[str, Sizes] = {
     "rad/s": (1.0 / math.tau, DEGREE, 1.0 / DEGREE),
     "Pa": (1e-3, 1e-5, 1e5),
 }
-"""Unit -> factors of a wrong one: miles an hour, km/h converted once too often, km/h; ft/s², g for m/s² and the inverse; turns, degrees
-converted once too often, degrees; kPa, bar, and bar converted once too often."""
+"""Unit -> factors of a wrong one.
+
+Miles an hour, km/h converted once too often, km/h; ft/s², g for m/s² and the inverse; turns,
+degrees converted once too often, degrees; kPa, bar, and bar converted once too often.
+"""
 
 WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
-"""The same of wheels and motor: turns a second, turns a minute converted once too often, turns a minute."""
+"""The same of wheels and motor.
+
+Turns a second, turns a minute converted once too often, turns a minute.
+"""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of one channel: kind, size and time; `ConfigurationError` for one that makes no sense."""
+    """A fault of one channel: kind, size and time.
+
+    `ConfigurationError` for one that makes no sense.
+    """
 
     kind: str  # one of `KINDS`
     channel: str  # never a reference
@@ -84,9 +99,8 @@ class Fault:
     onset: float = 0.0  # time of its start after the first sample [s]
     duration: float = math.inf  # [s]; ``inf``: to the end
     seed: int = 0  # of everything that is drawn
-    size: float | None = (
-        None  # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
-    )
+    # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
+    size: float | None = None
 
     def __post_init__(self) -> None:
         for name, choices in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
@@ -99,12 +113,14 @@ class Fault:
                 )
         if CHANNELS[self.channel].is_reference:
             raise ConfigurationError(
-                f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel"
+                f"fault.channel '{self.channel}' is a reference, which no estimator reads; name a "
+                "measured channel"
             )
         if not applies(self.kind, self.channel):
             fitting = ", ".join(name for name in CHANNELS if applies(self.kind, name))
             raise ConfigurationError(
-                f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}"
+                f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for "
+                f"{fitting}"
             )
         size_rule = KINDS[self.kind].size_rule
         for name, value, requirement, fits in (
@@ -123,7 +139,10 @@ class Fault:
 
     @property
     def condition(self) -> str:
-        """``bias:ay:mild``; a given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``."""
+        """``bias:ay:mild``.
+
+        A given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
+        """
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
 
@@ -134,9 +153,12 @@ def is_fault(condition: str) -> bool:
 
 
 def applies(kind: str, channel: str) -> bool:
-    """Whether a kind of fault makes sense for a channel: none for a reference, a wrong sign for channels that have one by convention.
+    """Whether a kind of fault makes sense for a channel.
 
-    A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward velocity, which one wheel may measure.
+    None for a reference, a wrong sign for channels that have one by convention.
+
+    A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward
+    velocity, which one wheel may measure.
     """
     channel_range = CHANNELS[channel]
     special = {
@@ -148,7 +170,10 @@ def applies(kind: str, channel: str) -> bool:
 
 
 def size_of(kind: str, channel: str, severity: Severity) -> float:
-    """Size of a fault, as in the module's tables; offsets of wheels and motor are shares of the largest speed."""
+    """Size of a fault, as in the module's tables.
+
+    Offsets of wheels and motor are shares of the largest speed.
+    """
     channel_range = CHANNELS[channel]
     at = SEVERITIES.index(severity)
     sizes = KINDS[kind].sizes
@@ -166,10 +191,14 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
 def inject(
     samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault
 ) -> dict[str, FloatArray]:
-    """Samples, channel -> (T,) [SI], with a fault in one channel (else `ConfigurationError`), which may then hold any value."""
+    """Samples, channel -> (T,) [SI], with a fault in one channel, which may then have any value.
+
+    Raises `ConfigurationError` where there is no such channel.
+    """
     if fault.channel not in samples:
         raise ConfigurationError(
-            f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}"
+            f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: "
+            f"{', '.join(samples)}"
         )
     values = np.array(samples[fault.channel], dtype=np.float64)
     first, end = window(fault, len(values), rate_hz)
@@ -260,9 +289,9 @@ def _lost_wheel(at: FaultedChannel) -> FloatArray:
 class Kind(NamedTuple):
     """A kind of fault."""
 
-    sizes: (
-        Sizes | float | None
-    )  # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong unit
+    # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong
+    # unit
+    sizes: Sizes | float | None
     size_rule: str  # what a size of one's own must be, a key of `SIZE_RULES`
     effect: Callable[[FaultedChannel], FloatArray]
 

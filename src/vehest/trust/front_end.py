@@ -23,11 +23,14 @@ SLACK = 1e-9
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
-    """Channels (T, C) at the model's rate as the filter would pass them from a bus `USUAL_RATIO` times as fast; NaN is bridged.
+    """Channels (T, C) at the model's rate as the filter passes them from a faster bus.
 
-    They are brought to that rate without phase, then filtered causally and thinned out again; the filter starts as in a steady signal.
-    What lay above the model's Nyquist frequency is gone in them, and white noise of the density below it takes its place, since some of it
-    comes through the filter.
+    The bus is `USUAL_RATIO` times as fast; NaN is bridged.
+
+    They are brought to that rate without phase, then filtered causally and thinned out again; the
+    filter starts as in a steady signal. What lay above the model's Nyquist frequency is gone in
+    them, and white noise of the density below it takes its place, since some of it comes through
+    the filter.
     """
     at = np.arange(len(samples))
     measured_columns = [np.isfinite(column) for column in samples.T]
@@ -56,12 +59,14 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 
 class FrontEnd:
-    """Accepted samples of a bus through a causal low-pass, of which as many are passed on as the estimator's rate asks for.
+    """Causal low-pass from a bus's rate to the estimator's, over accepted samples.
 
-    A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. A channel that is not measured holds its last
-    value in the filter, and is passed on as not measured. After longer gaps the filter starts from the first sample that is back.
+    A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. A channel that is
+    not measured holds its last value in the filter, and is passed on as not measured. After longer
+    gaps the filter starts from the first sample that is back.
 
-    ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order of the columns.
+    ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order
+    of the columns.
 
     Raises `ConfigurationError`: the bus is slower than the estimator, or faster than any.
     """
@@ -76,15 +81,16 @@ class FrontEnd:
     ) -> None:
         if not bus_rate_hz >= rate_hz * (1 - SLACK):
             raise ConfigurationError(
-                f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz"
+                f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at "
+                f"{rate_hz:g} Hz"
             )
         if not bus_rate_hz <= HIGHEST_RATE:
             raise ConfigurationError(
-                f"samples at {bus_rate_hz:g} Hz are beyond any bus; rates go up to {HIGHEST_RATE:g} Hz"
+                f"samples at {bus_rate_hz:g} Hz are beyond any bus; rates go up to "
+                f"{HIGHEST_RATE:g} Hz"
             )
-        usual = usual_limits(
-            channels, bus_rate_hz
-        ).channels  # jumps are those of another rate; ranges are the same
+        # jumps are those of another rate; ranges are the same
+        usual = usual_limits(channels, bus_rate_hz).channels
         merged = {
             name: replace(limits_of_channel, jump=max(usual[name].jump, limits_of_channel.jump))
             for name, limits_of_channel in (limits.channels or usual).items()
@@ -103,7 +109,7 @@ class FrontEnd:
 
     @property
     def delay(self) -> float:
-        """Of slow signals through the filter [s]."""
+        """Delay of slow signals through the filter [s]."""
         if not len(self.sections):
             return 0.0
         numerator, denominator = scipy.signal.sos2tf(self.sections)
@@ -113,7 +119,10 @@ class FrontEnd:
         )
 
     def __call__(self, row: FloatArray) -> FloatArray | None:
-        """Take one row, (1, C); returns a row for the estimator where one is due, NaN what was not measured."""
+        """Take one row, (1, C).
+
+        Returns a row for the estimator where one is due, NaN what was not measured.
+        """
         cleaned = self.guard(row)
         waits = bool(cleaned.flow[0] == WAIT)
         measured = cleaned.measured[0]

@@ -2,9 +2,11 @@
 
     rows -> Guard -> rows, measured, flow (use, wait, restart)
 
-A value that is not finite, that no car reaches, that jumps further than a car can, or that has stood still for longer than it ever did
-where the estimator learnt counts as not measured. Channels that a method can do without become NaN then; the others hold the last value
-that was accepted, for half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels are back.
+A value that is not finite, that no car reaches, that jumps further than a car can, or that has
+stood still for longer than it ever did where the estimator learnt counts as not measured. Channels
+that a method can do without become NaN then; the others hold the last value that was accepted, for
+half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels
+are back.
 """
 
 from __future__ import annotations
@@ -39,10 +41,16 @@ REACHED = {
     "rad": (1.0, 15.0, 0.1),
     "m/s": (100.0, 25.0, 2.0),
 }
-"""Unit -> size and change a second that some road car reaches, and change by the sensors' noise, where none was learnt."""
+"""Unit -> size and change a second that some road car reaches, and change by sensor noise.
+
+They apply where none was learnt.
+"""
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
-"""Starts of names whose ranges and changes differ too much between cars; their limits have to be learnt."""
+"""Starts of names whose ranges and changes differ too much between cars.
+
+Their limits have to be learnt.
+"""
 
 STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steering may stand still
 
@@ -69,10 +77,11 @@ class ChannelLimits:
     high: float  # largest value [unit]
     jump: Annotated[float, "a positive number"]  # largest change from one sample to the next [unit]
     run: float = 0.0  # longest time that it may stand still while the car moves [s]; 0 if any
+    # between which alone it is expected to move [unit]
     stops: tuple[float, float] = (
         -ENDLESS,
         ENDLESS,
-    )  # between which alone it is expected to move [unit]
+    )
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
@@ -89,9 +98,8 @@ class GuardLimits:
 
     channels: Mapping[str, ChannelLimits] = field(default_factory=dict)  # name -> limits
     top_speed: float = 140.0  # that the car reaches [m/s]
-    largest_tan_sideslip: float = (
-        1.0  # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
-    )
+    # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
+    largest_tan_sideslip: float = 1.0
 
     def __post_init__(self) -> None:
         check_channels("guard.channels", list(self.channels))
@@ -116,8 +124,8 @@ def learn_limits(
 ) -> GuardLimits:
     """Limits from drives at the estimator's rate, with references where they have them.
 
-    A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for twice
-    its longest run while the car moved.
+    A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump
+    likewise; a channel may stand still for twice its longest run while the car moved.
     """
     channel_limits = {}
     for name in channels:
@@ -182,7 +190,10 @@ def _tan_sideslip(recording: Recording) -> FloatArray:
 
 
 def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
-    """Twice the longest time that a channel stood still between its stops while the car moved [s]; 0 if it has no limit."""
+    """Twice the longest time that a channel stood still while the car moved [s]; 0: no limit.
+
+    Only time between its stops counts.
+    """
     if CHANNELS[name].rests or not recordings:
         return 0.0
     longest = 0.0
@@ -204,19 +215,23 @@ def longest_run(flags: NDArray[np.bool_]) -> int:
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
-    """Where a steering is at its lock, (lower, upper): where it stayed for three samples in training, within a tenth of its extremes.
+    """Locks of a steering, (lower, upper): where it stayed for three samples in training.
 
-    Resampling rings at a stop, so that the extreme itself may lie beyond it. Channels other than `STEERING` have no stops.
+    They lie within a tenth of its extremes.
+
+    Resampling rings at a stop, so that the extreme itself may lie beyond it. Channels other than
+    `STEERING` have no stops.
     """
     stops = [-ENDLESS, ENDLESS]
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
             repeats = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
+            # samples that equal the two before them
             stayed = [
                 sign * part[2:][is_repeated[1:] & is_repeated[:-1]]
                 for part, is_repeated in zip(parts, repeats, strict=True)
-            ]  # equal the two before them
+            ]
             reached = [
                 value for values in stayed for value in values if value >= NEAR_STOP * farthest
             ]
@@ -238,7 +253,9 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
 class Cleaned(NamedTuple):
     """Rows as an estimator may see them."""
 
-    rows: FloatArray  # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is `WAIT`
+    # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is
+    # `WAIT`
+    rows: FloatArray
     measured: NDArray[np.bool_]  # which values were accepted, (T, C)
     flow: NDArray[np.int8]  # `USE`, `WAIT` or `RESTART` at each row, (T,)
 
@@ -246,8 +263,9 @@ class Cleaned(NamedTuple):
 class Guard:
     """Accepts or rejects samples, row after row; keeps the state between calls.
 
-    Channels are in the order of the columns; those without ``limits`` get those of any car. An estimator that ``remembers`` more than a
-    window starts anew at a jump that is accepted after all.
+    Channels are in the order of the columns; those without ``limits`` get those of any car. An
+    estimator that ``remembers`` more than a window starts anew at a jump that is accepted after
+    all.
 
     Attributes
     ----------
@@ -298,18 +316,28 @@ class Guard:
 
 
 @entry(nogil=True)
-def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):  # type: ignore[no-untyped-def]
+def guard_rows(  # type: ignore[no-untyped-def]
+    rows, state, limits, skippable, settings, clean, measured, flow
+):
     """Accept or reject values, row by row.
 
-    Args:
-        rows: (T, C), as received.
-        state: (C + 1, 6), of each channel: last accepted value, samples since, length of the present run, last value, candidate after a
-            jump, how often it was confirmed; last row: whether the estimator waits.
-        limits: (C, 6): low, high, jump, longest run in samples, lower and upper stop.
-        skippable: (C,).
-        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand, whether an
-            accepted jump makes the estimator start anew.
-        clean, measured, flow: output, as in `Cleaned`.
+    Parameters
+    ----------
+    rows
+        (T, C), as received.
+    state
+        (C + 1, 6), of each channel: last accepted value, samples since, length of the present
+        run, last value, candidate after a jump, how often it was confirmed; last row: whether
+        the estimator waits.
+    limits
+        (C, 6): low, high, jump, longest run in samples, lower and upper stop.
+    skippable
+        (C,).
+    settings
+        Columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new
+        level has to stand, whether an accepted jump makes the estimator start anew.
+    clean, measured, flow
+        Output, as in `Cleaned`.
     """
     n_channels = rows.shape[1]
     vx_at, yaw_at, bridged, persists, remembers = settings
@@ -332,9 +360,8 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
                 memory[3] = x
                 if memory[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not is_standing:
                     accepted = False
-                elif (
-                    memory[1] <= bridged and abs(x - memory[0]) > limits[c, 2]
-                ):  # a jump from what is not long gone
+                elif memory[1] <= bridged and abs(x - memory[0]) > limits[c, 2]:
+                    # a jump from what is not long gone
                     memory[5] = memory[5] + 1.0 if abs(x - memory[4]) <= limits[c, 2] else 1.0
                     memory[4] = x
                     accepted = memory[5] >= persists

@@ -1,4 +1,6 @@
-"""Health of estimates, judged by the channels that they were computed from: valid, degraded or invalid.
+"""Health of estimates, judged by the channels that they were computed from.
+
+An estimate is valid, degraded or invalid.
 
     drives -> learn_health -> HealthModel (trust.yaml) -> packed -> health_rows -> status, reason
 
@@ -9,9 +11,9 @@
 3. the largest value of every statistic of `vehest.trust.health_kernel` on healthy training and
    validation drives. Multiplied by a margin it is the limit of the statistic.
 
-`health_rows` flags an estimate as degraded or invalid, with a reason, as soon as a statistic exceeds its
-limit. The flag is cleared after `HOLD_SECONDS` in which every statistic stayed below `CLEAR` times its
-limit.
+`health_rows` flags an estimate as degraded or invalid, with a reason, as soon as a statistic
+exceeds its limit. The flag is cleared after `HOLD_SECONDS` in which every statistic stayed below
+`CLEAR` times its limit.
 """
 
 from __future__ import annotations
@@ -86,7 +88,10 @@ MAX_ORDER = 10
 MAX_COEFFICIENTS = 700  # of the autoregression, for the time of a step
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
-"""Channels of the autoregression, besides wheel speeds; of other channels range, gaps and repeated samples are checked."""
+"""Channels of the autoregression, besides wheel speeds.
+
+Of other channels range, gaps and repeated samples are checked.
+"""
 
 NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Channel -> its number in the code of a reason."""
@@ -95,7 +100,7 @@ _NAMES = {number: name for name, number in NUMBERS.items()}
 NO_ESTIMATE = 30
 BEYOND_SPEED = 31
 TOO_WIDE = 32
-"""Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
+"""Kinds of reasons that follow from an estimate, not from its channels (`vehest.trust.verdict`)."""
 
 SLOW_KERNEL = "vehest.trust.health_kernel:health_kernel"  # compiles for tens of seconds
 
@@ -104,9 +109,9 @@ REASONS: dict[int, tuple[str, float]] = {
     kernel.MISSING: ("{channel} is not measured", 0.0),
     kernel.FROZEN: ("{channel} is frozen", 8.0),
     kernel.HELD: ("{channel} repeats its samples", 7.0),
-    kernel.JUMP: ("{channel} jumps, or is noisier than where the model learnt", 2.0),
-    kernel.NOISE: ("{channel} is noisier than where the model learnt", 2.5),
-    kernel.SMOOTH: ("{channel} varies less than where the model learnt", 1.5),
+    kernel.JUMP: ("{channel} jumps, or is noisier than in training", 2.0),
+    kernel.NOISE: ("{channel} is noisier than in training", 2.5),
+    kernel.SMOOTH: ("{channel} varies less than in training", 1.5),
     kernel.OFFSET: ("{channel} has an offset against the other channels", 4.0),
     kernel.SCALE: ("{channel} has another scale than the other channels", 4.0),
     kernel.SIGN: ("{channel} has the wrong sign", 0.0),
@@ -167,37 +172,30 @@ class HealthModel:
     rate_hz: float  # of the rows [Hz]
     relations: tuple[Relation, ...]  # between channels
     constant: tuple[float, ...]  # of the autoregression, one a channel
-    coefficients: tuple[
-        tuple[tuple[float, ...], ...], ...
-    ]  # of the autoregression: lag, channel, former channel
-    precision: tuple[
-        tuple[float, ...], ...
-    ]  # inverse of the innovations' covariance; zero for channels that are not modelled
+    # of the autoregression: lag, channel, former channel
+    coefficients: tuple[tuple[tuple[float, ...], ...], ...]
+    # inverse of the innovations' covariance; zero for channels that are not modelled
+    precision: tuple[tuple[float, ...], ...]
     deviation: tuple[float, ...]  # of each channel's innovations
     usual: tuple[float, ...]  # median of each channel
     largest: tuple[float, ...]  # largest size of each channel in training
     longest_gap: tuple[float, ...]  # longest time without a sample of each channel in training [s]
-    standstill: tuple[
-        float, float, float
-    ]  # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
-    spin: tuple[
-        float, float
-    ]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
+    # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
+    standstill: tuple[float, float, float]
+    # yaw rate, and its product with the speed, beyond which the car spins if they rise without a
+    # jump
+    spin: tuple[float, float]
     speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
-    levels: tuple[
-        tuple[float, ...], ...
-    ]  # size of the innovations at these speeds, in their deviations, one row a speed
-    healthy: tuple[
-        tuple[float, ...], ...
-    ] = ()  # offset that the likelihood ratio finds in each channel of healthy drives, one row
+    # size of the innovations at these speeds, in their deviations, one row a speed
+    levels: tuple[tuple[float, ...], ...]
+    # offset that the likelihood ratio finds in each channel of healthy drives, one row
+    healthy: tuple[tuple[float, ...], ...] = ()
     heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in it, one row
     limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
-    stops: tuple[
-        tuple[float, float], ...
-    ] = ()  # of each channel, between which alone it is expected to move
-    limits_behind_front_end: tuple[
-        float, ...
-    ] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
+    # of each channel, between which alone it is expected to move
+    stops: tuple[tuple[float, float], ...] = ()
+    # the same for samples that a filter from a faster bus has passed (`front_end`)
+    limits_behind_front_end: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         channels = len(self.channels)
@@ -275,16 +273,9 @@ class HealthModel:
             for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)
         ]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
-        return Layout._make(
-            [
-                len(names),
-                len(self.coefficients),
-                len(self.relations),
-                *columns,
-                *rows,
-                len(self.statistics),
-            ]
-        )
+        counts = [len(names), len(self.coefficients), len(self.relations)]
+        sizes = [*counts, *columns, *rows, len(self.statistics)]
+        return Layout(*sizes)
 
     @property
     def statistics(self) -> list[Statistic]:
@@ -383,7 +374,9 @@ class HealthModel:
         return tables
 
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
-        """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the latest first, and their power, (C, C)."""
+        """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the
+        latest first, and their power, (C, C).
+        """
         coefficients = np.array(self.coefficients)
         precision = np.array(self.precision)
         left = np.eye(len(self.channels)) - np.concatenate(
@@ -395,7 +388,7 @@ class HealthModel:
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Limits of today's 7 C + R statistics from files of earlier versions, which had 23 C + 4 R or 17 C + 3 R."""
+    """Limits of 7 C + R statistics from files of earlier versions: 23 C + 4 R or 17 C + 3 R."""
     forms = {
         23 * channels + 4 * relations: 7 * channels,
         17 * channels + 3 * relations: 5 * channels,
@@ -474,14 +467,15 @@ def learn_health(
     Raises
     ------
     DataError
-        A recording has another rate or lacks a channel, there are too few samples, or no channel can
-        be modelled.
+        A recording has another rate or lacks a channel, there are too few samples, or no channel
+        can be modelled.
     """
     names = tuple(channels)
     for recording in (*train, *validation):
         if abs(recording.rate_hz / rate_hz - 1.0) > 1e-9:
             raise DataError(
-                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health is learnt at {rate_hz:g} Hz"
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, health was "
+                f"fitted at {rate_hz:g} Hz"
             )
     received = train
     train, validation = (
@@ -493,7 +487,8 @@ def learn_health(
     usable = [name for name in names if name in MODELLED or name.startswith("wheel_speed")]
     if not usable:
         raise DataError(
-            f"health cannot be judged from {', '.join(names)} alone; it needs at least one of {', '.join(MODELLED)}"
+            f"health cannot be judged from {', '.join(names)} alone; it needs at least one of "
+            f"{', '.join(MODELLED)}"
         )
     relations = learn_relations(train, usable, rate_hz, least_speed)
     order = max(1, min(MAX_ORDER, MAX_COEFFICIENTS // len(usable) ** 2))
@@ -587,7 +582,7 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """Add the mean offset of each channel by the likelihood ratio over all drives, and the largest weight of a sample."""
+    """Add the mean offset of each channel over all drives, and the largest weight of a sample."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
@@ -603,7 +598,7 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
-    """Largest value of each of K statistics in B blocks of `BLOCK_SECONDS`, without limits, shape (B, K)."""
+    """Largest values of K statistics in B blocks of `BLOCK_SECONDS`, (B, K), without limits."""
     packed = replace(model, limits=()).packed()
     n_statistics = len(model.statistics)
     length = max(round(BLOCK_SECONDS * model.rate_hz), 1)
@@ -624,9 +619,9 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
 def margin(seconds: float, healthy_seconds: float) -> float:
     """Ratio of a limit to the largest value of a statistic in healthy drives.
 
-    The limit is exceeded about once in `HOURS_BETWEEN_FALSE_ALARMS`. The largest of N independent normal
-    values is about √(2 ln N), with one value in each ``seconds``. The ratio of both is multiplied by
-    `DAY_TO_DAY_FACTOR`.
+    The limit is exceeded about once in `HOURS_BETWEEN_FALSE_ALARMS`. The largest of N independent
+    normal values is about √(2 ln N), with one value in each ``seconds``. The ratio of both is
+    multiplied by `DAY_TO_DAY_FACTOR`.
 
     Parameters
     ----------
@@ -647,9 +642,9 @@ def limits_from(
 ) -> tuple[float, ...]:
     """Limits of all K statistics from healthy drives.
 
-    A limit is the largest value times `margin`. Blocks that exceed all others by `OUTLIER_FACTOR` are not
-    counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the blocks, and one
-    where there are thirty blocks or more.
+    A limit is the largest value times `margin`. Blocks that exceed all others by `OUTLIER_FACTOR`
+    are not counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the
+    blocks, and one where there are thirty blocks or more.
 
     Parameters
     ----------
@@ -669,9 +664,9 @@ def limits_from(
         ]
         top = float(column[outlying_blocks[-1] + 1] if outlying_blocks else column[0])
         limit = margin(max(statistic.seconds, step), BLOCK_SECONDS * len(maxima)) * top
-        if (
-            statistic.rule == "share"
-        ):  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
+        # half way to 1 at most, or a channel that often repeats itself could never be found to
+        # repeat only
+        if statistic.rule == "share":
             limit = min(max(top + 0.15, MIN_REPEATED_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
             limit = DAY_TO_DAY_FACTOR
@@ -720,7 +715,10 @@ def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDA
 
 
 def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
-    """Describe the share of a drive outside the range of the training, by the counts of `outside_domain`; empty if there is none."""
+    """Describe the share of a drive outside the training's range; empty if there is none.
+
+    ``counts`` are of `outside_domain`.
+    """
     *numbers, outside, samples = counts.tolist()
     named = [
         (n_outside, f"|{name}| above {DAY_TO_DAY_FACTOR * largest:.3g} {CHANNELS[name].unit}")

@@ -1,13 +1,20 @@
-"""The compiled recursion behind `vehest.trust.health`: statistics of each row against their limits, status and reason.
+"""The compiled recursion behind `vehest.trust.health`.
 
-rows -> x, y -> innovations ε -> statistics -> status, reason; the model and the state are named tuples of arrays.
+rows -> x, y -> innovations ε -> statistics against their limits -> status, reason
 
-With φ(x) features of yaw rate and speed, channels x become y = x - W φ(x), of which an autoregression predicts the next sample; ε is its
-error, in units of the noise at that speed, and S its covariance. A fault that adds b to channel i moves y by J b, J = ∂y/∂xᵢ, and the
-innovations by h b, h = J - Σ_l A_l J once it lasts. An offset is looked for by its likelihood ratio over exponentially forgotten samples,
-z = Σ λʲ hᵀS⁻¹ε / √(Σ λ²ʲ hᵀS⁻¹h), which is N(0, 1) without a fault (Willsky & Jones, A generalized likelihood ratio approach to the
-detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1), 1976; windows replaced by forgetting).
-Innovations count with at most `CLIP` deviations in it, and no sample with more than its share, so that a kerb is no offset.
+The model and the state are named tuples of arrays. With φ(x) features of yaw rate and speed,
+channels x become y = x - W φ(x), of which an autoregression predicts the next sample; ε is its
+error, in units of the noise at that speed, and S its covariance. A fault that adds b to channel i
+moves y by J b, J = ∂y/∂xᵢ, and the innovations by h b, h = J - Σ_l A_l J once it lasts. An offset
+is detected by its likelihood ratio over exponentially forgotten samples,
+
+    z = Σ λʲ hᵀS⁻¹ε / √(Σ λ²ʲ hᵀS⁻¹h),
+
+which is N(0, 1) without a fault. Innovations count with at most `CLIP` deviations in it, and no
+sample with more than its share, so that a kerb is no offset.
+
+Source: Willsky & Jones, A generalized likelihood ratio approach to the detection and estimation of
+jumps in linear systems, IEEE Trans. Automatic Control 21 (1), 1976; windows replaced by forgetting.
 """
 
 from __future__ import annotations
@@ -24,17 +31,16 @@ from vehest.estimators.kernels import compiling
 from vehest.trust.named_arrays import open_views
 
 IntArray = NDArray[np.int64]
-part = partial(
-    compiling.part, _nrt=False
-)  # arrays are views without references, so none are counted: two thirds of the time to compile
+# arrays are views without references, so none are counted: two thirds of the time to compile
+part = partial(compiling.part, _nrt=False)
 
-PLAUSIBLE = (
-    1000.0  # times the largest size in training, beyond which a value counts as not measured
-)
+# times the largest size in training, beyond which a value counts as not measured
+PLAUSIBLE = 1000.0
 CLIP = 4.0  # standard deviations
 STEP_CLIP = 8.0  # the same for steps and for the energy
 CALM = 0.3  # of the mean energy: least energy of a calm stretch
-CAP = 2.0  # times its limit: a statistic remembers no more, so that it is down again soon after a fault
+# times its limit: a statistic remembers no more, so that it is down again soon after a fault
+CAP = 2.0
 INVALID = 1.5  # times its limit, from which on an estimate is invalid and not only degraded
 CLEAR = 0.95  # times its limit, below which a statistic has to stay
 BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather than lost
@@ -90,7 +96,7 @@ class Layout(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Scalars: speed, yaw rate and ay of standstill, sampling interval [s], yaw rate and u r of a spin, forgetting factors."""
+    """Limits of standstill and spin, sampling interval [s], and forgetting factors."""
 
     least_speed: float
     still_yaw_rate: float
@@ -107,7 +113,10 @@ class Settings(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """A value of each statistic, in the order of `HealthModel.statistics`; ``all_values`` is all of them in one array."""
+    """A value of each statistic, in the order of `HealthModel.statistics`.
+
+    ``all_values`` is all of them in one array.
+    """
 
     all_values: Annotated[FloatArray, "statistics"]
     jump: Annotated[FloatArray, "channels"]  # innovation against its energy in the last half second
@@ -121,7 +130,10 @@ class Statistics(NamedTuple):
 
 
 class Model(NamedTuple):
-    """Constants of the recursion, by the names that the C source gives them; [m, q] is of channel m on channel q."""
+    """Constants of the recursion, by the names that the C source gives them.
+
+    [m, q] is of channel m on channel q.
+    """
 
     layout: Layout
     settings: Settings
@@ -137,15 +149,13 @@ class Model(NamedTuple):
     speeds: Annotated[FloatArray, "5"]
     levels: Annotated[FloatArray, "5 channels"]  # noise at these speeds
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
-    steps: Annotated[
-        FloatArray, "order channels channels"
-    ]  # weight of a former innovation in q on a step in m [lag, m, q]
+    # weight of a former innovation in q on a step in m [lag, m, q]
+    steps: Annotated[FloatArray, "order channels channels"]
     step_power: Annotated[FloatArray, "channels channels"]
     healthy: Annotated[FloatArray, "channels"]  # offsets of healthy drives
     heaviest: Annotated[FloatArray, "channels"]  # largest weight of one sample in an offset
-    stops: Annotated[
-        FloatArray, "2 channels"
-    ]  # lower and upper, between which alone a channel is expected to move
+    # lower and upper, between which alone a channel is expected to move
+    stops: Annotated[FloatArray, "2 channels"]
     priority: Annotated[FloatArray, "statistics"]  # of reasons
     limits: Statistics
     inverse: Statistics  # of the limits
@@ -156,9 +166,8 @@ class Model(NamedTuple):
     code: Annotated[IntArray, "channels"]  # number in a reason
     target: Annotated[IntArray, "relations"]  # column that a relation explains
     versus: Annotated[IntArray, "relations"]  # column that it is held against
-    involved: Annotated[
-        IntArray, "relations channels"
-    ]  # 1 if a relation uses a channel, 2 if only in a small term
+    # 1 if a relation uses a channel, 2 if only in a small term
+    involved: Annotated[IntArray, "relations channels"]
     kind: Annotated[IntArray, "statistics"]  # of reason
     accused: Annotated[IntArray, "statistics"]  # column
     partner: Annotated[IntArray, "statistics"]  # column; -1: none
@@ -174,13 +183,11 @@ class State(NamedTuple):
     spinning: Annotated[FloatArray, "1"]  # rows of spin
     since_jump: Annotated[FloatArray, "1"]  # rows since the yaw rate jumped
     mean_ax: Annotated[FloatArray, "1"]
-    drift: Annotated[
-        FloatArray, "1"
-    ]  # lateral velocity, as far as it changed within `SLIDE_SECONDS`
+    # lateral velocity, as far as it changed within `SLIDE_SECONDS`
+    drift: Annotated[FloatArray, "1"]
     last: Annotated[FloatArray, "channels"]  # measured value
-    gap: Annotated[
-        FloatArray, "channels"
-    ]  # rows without a sample; below zero while predictions settle again
+    # rows without a sample; below zero while predictions settle again
+    gap: Annotated[FloatArray, "channels"]
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
     past_y: Annotated[FloatArray, "order channels"]
@@ -192,9 +199,8 @@ class State(NamedTuple):
     mean_speed: Annotated[FloatArray, "2"]  # short and long
     left: Annotated[FloatArray, "relations"]  # short mean of the residual
     smooth: Annotated[FloatArray, "relations"]  # short mean of the target
-    product: Annotated[
-        FloatArray, "relations"
-    ]  # means of shown times expected, and of both squares
+    # means of shown times expected, and of both squares
+    product: Annotated[FloatArray, "relations"]
     expected_power: Annotated[FloatArray, "relations"]
     observed_power: Annotated[FloatArray, "relations"]
     x: Annotated[FloatArray, "channels"]
@@ -216,11 +222,14 @@ class State(NamedTuple):
 
 
 @compiling.entry(nogil=True, _nrt=False)
-def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ignore[no-untyped-def]
-    """Judge rows (T, C), as received, one after another; ``measured`` tells which of their values count as measured.
+def health_kernel(rows, measured, tables, memory, out, statistics):
+    """Judge rows (T, C), as received, one after another.
 
-    ``tables`` are of `HealthModel.packed`, ``memory`` is of `HealthModel.start` and changed in place. Output are ``out``, (3, T): status,
-    code of the reason, largest statistic over its limit; and ``statistics``, (T, K), or (0, K) where they are not wanted.
+    ``measured`` tells which of their values count as measured.
+
+    ``tables`` are of `HealthModel.packed`, ``memory`` is of `HealthModel.start` and changed in
+    place. Output are ``out``, (3, T): status, code of the reason, largest statistic over its limit;
+    and ``statistics``, (T, K), or (0, K) where they are not wanted.
     """
     model = open_views(Model, tables, open_views(Layout, tables, ()))
     state = open_views(State, memory, model.layout)
@@ -233,18 +242,20 @@ def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ign
         slow = _look_at_values(is_standing, model, state)
         _look_at_relations(is_standing, model, state)
         out[0, k], out[1, k], out[2, k] = _decide(missing_channel, slow, model, state)
-        for j in range(
-            statistics.shape[1] if statistics.shape[0] > 0 else 0
-        ):  # a slice would compile for seconds
+        # a slice would compile for seconds
+        for j in range(statistics.shape[1] if statistics.shape[0] > 0 else 0):
             statistics[k, j] = state.statistics.all_values[j]
         _remember(model, state)
 
 
 @part()
-def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
-    """Take a row; returns the channel that has been missing for longest beyond its limit, -1 if none has.
+def _receive(k, rows, measured, model, state):
+    """Take a row.
 
-    The last value stands for one that was not measured. A channel that is back has p rows to settle in.
+    Returns the channel that has been missing for longest beyond its limit, -1 if none has.
+
+    The last value stands for one that was not measured. A channel that is back has p rows to settle
+    in.
     """
     first = state.rows[0] == 0.0
     longest = 0.0
@@ -279,13 +290,16 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _value(state, column):  # type: ignore[no-untyped-def]
+def _value(state, column):
     return state.x[column] if column >= 0 else 0.0
 
 
 @part()
-def _describe(model, state):  # type: ignore[no-untyped-def]
-    """Features with their derivatives, y = x - W φ(x) and the noise at this speed; returns whether the car stands."""
+def _describe(model, state):
+    """Features with their derivatives, y = x - W φ(x) and the noise at this speed.
+
+    Returns whether the car stands.
+    """
     columns = model.layout
     settings = model.settings
     speeds = model.speeds
@@ -351,8 +365,8 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _predictable(i, model, state):  # type: ignore[no-untyped-def]
-    """Whether channel i was measured, and so was what its relation is made of, for long enough to be predicted."""
+def _predictable(i, model, state):
+    """Whether channel i and the channels of its relation were measured for long enough."""
     r = model.layout.yaw_rate
     u = model.layout.speed
     if state.rows[0] < model.layout.settling or model.modelled[i] == 0 or state.gap[i] != 0.0:
@@ -367,8 +381,11 @@ def _predictable(i, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _predict(model, state):  # type: ignore[no-untyped-def]
-    """Innovations, scaled and clipped, and their scores S⁻¹ε; zero where nothing can be predicted."""
+def _predict(model, state):
+    """Innovations, scaled and clipped, and their scores S⁻¹ε.
+
+    Zero where nothing can be predicted.
+    """
     C = model.layout.channels
     p = model.layout.order
     for i in range(C):
@@ -410,7 +427,7 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
+def _look_at_innovations(model, state):
     """Jumps out of what has been usual for half a second."""
     statistics = state.statistics
     for i in range(model.layout.channels):
@@ -429,7 +446,7 @@ def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _slope(i, model, state):  # type: ignore[no-untyped-def]
+def _slope(i, model, state):
     """J = ∂y/∂xᵢ."""
     r = model.layout.yaw_rate
     u = model.layout.speed
@@ -444,7 +461,7 @@ def _slope(i, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
+def _look_for_step(i, counts, model, state):
     """A step in channel i that began p samples ago."""
     C = model.layout.channels
     step = 0.0
@@ -459,7 +476,7 @@ def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
+def _look_for_offset(i, counts, model, state):
     """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations."""
     C = model.layout.channels
     top = 0.0
@@ -487,7 +504,7 @@ def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
+def _look_for_offsets(model, state):
     """Steps and offsets of each channel."""
     C = model.layout.channels
     offset_statistics = state.statistics.offset
@@ -509,7 +526,7 @@ def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_at_values(is_standing, model, state):  # type: ignore[no-untyped-def]
+def _look_at_values(is_standing, model, state):
     """Runs and shares of equal samples, range, slip; returns how many wheels are slow."""
     slow = 0
     statistics = state.statistics
@@ -529,8 +546,11 @@ def _look_at_values(is_standing, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_at_relations(is_standing, model, state):  # type: ignore[no-untyped-def]
-    """Means of the residuals of relations; that of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f."""
+def _look_at_relations(is_standing, model, state):
+    """Means of the residuals of relations.
+
+    That of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f.
+    """
     u = _value(state, model.layout.speed)
     step = model.settings.step
     short = model.settings.forget_short
@@ -558,9 +578,8 @@ def _look_at_relations(is_standing, model, state):  # type: ignore[no-untyped-de
             small = 0.0
         gain = 0.0 if is_standing else model.rate_gain[j]
         if complete:
-            state.left[j] += short * (
-                left + small - state.left[j]
-            )  # a fault of r or ay is no sign or unit of ax
+            # a fault of r or ay is no sign or unit of ax
+            state.left[j] += short * (left + small - state.left[j])
             state.smooth[j] += short * (target - state.smooth[j])
         observed = state.smooth[j]
         expected = (
@@ -583,8 +602,11 @@ def _look_at_relations(is_standing, model, state):  # type: ignore[no-untyped-de
 
 
 @part()
-def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
-    """Kind, channel and partner of the weightiest statistic beyond its limit, and the largest statistic over its limit."""
+def _find_reason(slow, model, state):
+    """Kind, channel and partner of the most specific statistic beyond its limit.
+
+    Also returns the largest statistic over its limit.
+    """
     values = state.statistics.all_values
     highest = 0.0
     weightiest = -1.0
@@ -602,10 +624,11 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
     kind = model.kind[best]
     channel = model.accused[best]
     partner = model.partner[best]
+    # likelihood ratios of the same form compare with each other as they are
     if kind in (
         JUMP,
         OFFSET,
-    ):  # likelihood ratios of the same form compare with each other as they are
+    ):
         C = model.layout.channels
         likeliest = -1.0
         for i in range(C):
@@ -625,7 +648,7 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _decide(missing_channel, slow, model, state):  # type: ignore[no-untyped-def]
+def _decide(missing_channel, slow, model, state):
     """Status and reason from all statistics, and the largest of these over its limit."""
     layout = model.layout
     settings = model.settings
@@ -674,7 +697,7 @@ def _decide(missing_channel, slow, model, state):  # type: ignore[no-untyped-def
 
 
 @part()
-def _wheel(channel, slow, state):  # type: ignore[no-untyped-def]
+def _wheel(channel, slow, state):
     """Whether a wheel that slips is locked, lost or neither."""
     if state.x[channel] >= (1.0 - LOST) * (state.x[channel] - state.y[channel]):
         return CONTRADICTION
@@ -682,8 +705,11 @@ def _wheel(channel, slow, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _relation_kind(j, model, state):  # type: ignore[no-untyped-def]
-    """Of the last second: `FREE` if a relation holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small."""
+def _relation_kind(j, model, state):
+    """Kind of a relation in the last second.
+
+    `FREE` if it holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small.
+    """
     product = state.product[j]
     expected = state.expected_power[j]
     observed_power = state.observed_power[j]
@@ -698,10 +724,13 @@ def _relation_kind(j, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _contradiction(model, state):  # type: ignore[no-untyped-def]
-    """Kind, channel and partner of relations that fail by far: the one channel that is in all that fail and in none that holds.
+def _contradiction(model, state):
+    """Kind, channel and partner of relations that fail by far.
 
-    Channels that only ever occur together in failing relations contradict each other; which of them is wrong cannot be decided.
+    The one channel that is in all that fail and in none that holds.
+
+    Channels that only ever occur together in failing relations contradict each other; which of them
+    is wrong cannot be decided.
     """
     suspects = 0
     culprit = -1
@@ -732,7 +761,7 @@ def _contradiction(model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _remember(model, state):  # type: ignore[no-untyped-def]
+def _remember(model, state):
     """Shift the samples that the next row is predicted from."""
     for i in range(model.layout.channels):
         for lag in range(model.layout.order - 1, 0, -1):

@@ -2,9 +2,10 @@
 
     fields with shapes + sizes -> views (Python), open_views (compiled)
 
-A field is declared in one place, as ``past_x: Annotated[FloatArray, "order channels"]``: the words are sizes, or numbers. Fields that are
-``int`` or ``float`` are scalars, and a field ``all_values`` holds all that follow it. A kernel receives the flat array, since handing over
-eighty arrays one by one takes longer than a row.
+A field is declared in one place, as ``past_x: Annotated[FloatArray, "order channels"]``: the words
+are sizes, or numbers. Fields that are ``int`` or ``float`` are scalars, and a field ``all_values``
+holds all that follow it. A kernel receives the flat array, since handing over eighty arrays one by
+one takes longer than a row.
 """
 
 from __future__ import annotations
@@ -43,7 +44,10 @@ def _fields(kind: Any) -> dict[str, Any]:
 
 
 def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any, int]:
-    """Views of a flat array from ``begin`` on, scalars as arrays without dimensions, and the place behind the last."""
+    """Views of a flat array from ``begin`` on, and the place behind the last.
+
+    Scalars are arrays without dimensions.
+    """
     arrays = {}
     for name, declared in _fields(kind).items():
         if hasattr(declared, "_fields"):
@@ -63,7 +67,10 @@ def allocated(kind: Any, sizes: Any) -> FloatArray:
 
 
 class Views(types.Type):  # type: ignore[misc]
-    """Type of a named tuple in compiled code: where it begins, and sizes. Handing over all fields would compile a fifth longer."""
+    """Type of a named tuple in compiled code: where it begins, and sizes.
+
+    Handing over all fields would compile a fifth longer.
+    """
 
     def __init__(self, kind: Any, sizes: Any) -> None:
         super().__init__(f"views({kind.__qualname__}, {sizes})")
@@ -78,7 +85,10 @@ class _Model(models.StructModel):  # type: ignore[misc]
 
 
 def _compiled_type(field_type: Any, sizes: Any) -> Any:
-    """Type of a field, or of a named tuple, in compiled code; one of scalars is a tuple of numbers."""
+    """Type of a field, or of a named tuple, in compiled code.
+
+    One of scalars is a tuple of numbers.
+    """
     if hasattr(field_type, "_fields"):
         inner = [_compiled_type(field, sizes) for field in _fields(field_type).values()]
         return (
@@ -150,7 +160,10 @@ def _opened_field(context: Any, builder: Any, view_type: Views, value: Any, name
 
 @intrinsic
 def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-def]
-    """`views` from the first number on, compiled: without references, so that the flat array has to outlive them."""
+    """`views` from the first number on, compiled.
+
+    They have no references, so that the flat array has to outlive them.
+    """
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         data = builder.bitcast(

@@ -43,7 +43,7 @@ class Trust:
     health: HealthModel | None = None  # residuals and thresholds of the health flag
 
     def check_fit(self, estimator: Estimator) -> None:
-        """Raise `DataError` unless this was learnt with an estimator of this family, channels, rate and horizon."""
+        """Raise `DataError` unless family, channels, rate and horizon are those of an estimator."""
         expected = (estimator.name, tuple(estimator.channels), estimator.settings.rate_hz)
         differences: list[tuple[str, object, object]] = [
             ("about.estimator", current_name(self.about.estimator), expected[0])
@@ -61,12 +61,14 @@ class Trust:
         for name, value, expected_value in differences:
             if value != expected_value:
                 raise DataError(
-                    f"{TRUST} belongs to another model: its {name} is {_abbreviated(value)}, that of the "
-                    f"model is {_abbreviated(expected_value)}; calibrate the model again, or remove {TRUST}"
+                    f"{TRUST} belongs to another model: its {name} is {_abbreviated(value)}, that "
+                    "of the "
+                    f"model is {_abbreviated(expected_value)}; calibrate the model again, or "
+                    f"remove {TRUST}"
                 )
 
     def for_settings(self, estimator: Estimator) -> Trust:
-        """The parts that apply to the same model with other settings, by which it may read fewer channels.
+        """The parts that apply to the same model with other settings.
 
         Health is that of all channels together and is left out where these differ; a band counts
         a channel that is not read as not measured.
@@ -116,7 +118,10 @@ def describe_band(
     same_vehicle: bool | None = None,
     car: CarValues = UNKNOWN_CAR,
 ) -> str:
-    """What calibrated the band of an estimate, and by which rule of `is_other_vehicle` it applies; empty without a band."""
+    """Describe what calibrated the band of an estimate, and why it applies; empty without one.
+
+    The rules are those of `is_other_vehicle`.
+    """
     if trust is None or trust.bands is None:
         return ""
     bands = trust.bands
@@ -162,7 +167,12 @@ def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
 def read_trust(folder: Path) -> Trust:
     """Read trust.yaml of a folder back.
 
-    Raises `MissingError`: there is none. Raises `DataError`: it is damaged, of another format, or something else than a file.
+    Raises
+    ------
+    MissingError
+        There is none.
+    DataError
+        It is damaged, of another format, or something else than a file.
     """
     path = folder / TRUST
     content = read_yaml(path)

@@ -1,15 +1,21 @@
-"""Relations between the measured channels of a car, with coefficients learnt from drives without any reference.
+"""Relations between the measured channels of a car.
+
+Their coefficients are learnt from drives without any reference.
 
 With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r:
 
-    lateral         ay = k u r + c                              what is left is the change of v, which returns to zero, and bank
-    steering        δ = c₁ r/u + c₂ u r + c₃ (u r)³ + c         wheelbase, understeer gradient, tyres that give way
-                    δ = c₁ ay/u² + c₂ ay + c₃ ay³ + c           the same without the yaw rate
-    longitudinal    ax = k du/dt - v r + c₁ r² + c₂ u² + c      drag; v is what the lateral relation leaves, integrated with leakage: its
-                                                                changes, as in a slide, while the rest of v goes with r
-    wheels, motor   ω = u/R + c r                               radius and half the track
+    lateral         ay = k u r + c
+    steering        δ = c₁ r/u + c₂ u r + c₃ (u r)³ + c,  or  δ = c₁ ay/u² + c₂ ay + c₃ ay³ + c
+    longitudinal    ax = k du/dt - v r + c₁ r² + c₂ u² + c
+    wheels, motor   ω = u/R + c r
 
-Coefficients are those of least squares on signals that are low-passed alike, reweighted by Huber's function.
+The residual of the lateral relation is the change of v, which returns to zero, and bank. The terms
+of steering are wheelbase, understeer gradient and tyres that give way. In the longitudinal one, u²
+is drag, and v the residual of the lateral one, integrated with leakage: its changes, as in a slide;
+the rest of v goes with r. Wheels and motor have the radius and half the track.
+
+Coefficients are those of least squares on signals that are low-passed alike, reweighted by Huber's
+function.
 """
 
 from __future__ import annotations
@@ -90,9 +96,8 @@ class Relation:
 
     target: str  # channel that is explained
     partner: str  # channel that it is held against, for messages
-    terms: dict[str, float] = field(
-        default_factory=dict
-    )  # feature, or `RATE`, -> coefficient; the target's units over the feature's
+    # feature, or `RATE`, -> coefficient; the target's units over the feature's
+    terms: dict[str, float] = field(default_factory=dict)
     instant: bool = False  # whether it holds for each sample and not only on average
 
     def __post_init__(self) -> None:
@@ -103,7 +108,10 @@ class Relation:
             check_shape(f"terms.{name}", coefficient)
 
     def involves(self, channel: str, speed: str | None) -> int:
-        """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all; ``speed`` is the channel that u stands for."""
+        """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all.
+
+        ``speed`` is the channel that u stands for.
+        """
         if channel in (self.target, self.partner):
             return 1
         symbol = {"yaw_rate": "r", "ay": "ay", "ax": "ax", speed: "u"}.get(channel)
@@ -122,7 +130,7 @@ def speed_channel(channels: Sequence[str]) -> str | None:
 
 
 def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...], bool]]:
-    """Target, partner, features and whether it holds at each instant, of every relation that these channels allow."""
+    """Every relation that channels allow: target, partner, features, whether it is instant."""
     speed = speed_channel(channels)
     has = set(channels)
     declared: list[tuple[str, str, tuple[str, ...], bool]] = []
@@ -147,7 +155,10 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
 
 
 def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[str, FloatArray]:
-    """Feature -> (T,), of channels as they are measured; those that need a channel that is not there are of zeros."""
+    """Feature -> (T,), of channels as they are measured.
+
+    Those that need a channel that is not there are of zeros.
+    """
     any_samples = next(iter(samples.values()))
     speed = speed_channel(list(samples))
     r, ay, ax = (samples.get(name, np.zeros_like(any_samples)) for name in ("yaw_rate", "ay", "ax"))
@@ -171,7 +182,10 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
 
 
 def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
-    """v r, (T,): v is what the relation of ay leaves, integrated with the leakage of `SLIDE_SECONDS`, at most the speed."""
+    """v r, (T,), with v from the residual of the relation of ay, at most the speed.
+
+    It is integrated with the leakage of `SLIDE_SECONDS`.
+    """
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
     drift = scipy.signal.lfilter(
         [1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left
@@ -180,7 +194,10 @@ def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: flo
 
 
 def without_spikes(samples: FloatArray) -> FloatArray:
-    """NaN for single samples, glitches of the recording, whose second difference exceeds ten times its 99.9 % quantile."""
+    """Replace glitches of single samples by NaN.
+
+    Their second difference exceeds ten times its 99.9 % quantile.
+    """
     if len(samples) < LEAST_ROWS:
         return samples
     deviation = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
@@ -206,7 +223,10 @@ def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording
 
 
 def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> float:
-    """Speed below which angles say little: a share of the median one [unit of the speed channel]."""
+    """Speed below which angles say little.
+
+    A share of the median one [unit of the speed channel].
+    """
     speed = speed_channel(channels)
     if speed is None:
         return 1.0
@@ -225,7 +245,10 @@ def residuals_of(
     relations: Sequence[Relation],
     least_speed: float,
 ) -> FloatArray:
-    """y = x - W φ(x): channels less what relations that hold at each instant explain of them, (T, C)."""
+    """y = x - W φ(x).
+
+    Channels less what relations that hold at each instant explain of them, (T, C).
+    """
     features = features_of(samples, least_speed)
     left = {name: np.array(samples[name], dtype=np.float64) for name in channels}
     for relation in relations:
@@ -239,7 +262,10 @@ def residuals_of(
 def learn_relations(
     recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float
 ) -> list[Relation]:
-    """Coefficients of every relation, from drives at one rate [Hz]; NaN and samples below ``least_speed`` are left out."""
+    """Coefficients of every relation, from drives at one rate [Hz].
+
+    NaN and samples below ``least_speed`` are left out.
+    """
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
     parts = []
@@ -308,7 +334,7 @@ def _fill_gaps(samples: FloatArray) -> FloatArray:
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:
-    """Least squares, reweighted ten times by Huber's function of the residual over its median size."""
+    """Least squares, reweighted ten times by Huber's function of residual over median size."""
     size = np.maximum(np.sqrt(np.mean(np.square(design), axis=0)), 1e-300)
     scaled = design / size
     weight = np.ones(len(target))

@@ -1,13 +1,19 @@
-"""Consequences of health: channels that an estimator gets, restarts, status and reason of its estimate, width of its band.
+"""Consequences of health.
 
-- A channel that health accuses of a fault counts as not measured where the method can do without it, so that nothing adapts to it.
+Channels that an estimator gets, restarts, status and reason of its estimate, width of its band.
+
+- A channel that health accuses of a fault counts as not measured where the method can do without
+  it, so that nothing adapts to it.
 - An estimator that remembers more than a window starts anew once a persistent fault is over.
-- One with states that adapt, such as tyres and friction, does not, since it would forget them. But if the accused channel is one that it
-  needs, these states go back to what they were fitted to, after each two seconds in which the channel was accused.
-- A shorter fault, such as a single wrong sample, changes neither: what it leaves in an estimator is smaller than what a new start loses.
-  Only samples at which a channel is accused count, not the time for which a flag is held afterwards.
-- The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
-  least as far as sideslip did in training. These factors were set before their effect was looked at.
+- One with states that adapt, such as tyres and friction, does not, since it would forget them. But
+  if the accused channel is one that it needs, these states go back to what they were fitted to,
+  after each two seconds in which the channel was accused.
+- A shorter fault, such as a single wrong sample, changes neither: what it leaves in an estimator is
+  smaller than what a new start loses. Only samples at which a channel is accused count, not the
+  time for which a flag is held afterwards.
+- The band is twice as wide while an estimate is degraded and four times while it is invalid, and
+  where there is no estimate it reaches at least as far as sideslip did in training. These factors
+  were set before their effect was looked at.
 """
 
 from __future__ import annotations
@@ -39,26 +45,36 @@ from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, Watched
 BAND_FACTORS = (1.0, 2.0, 4.0)  # factor of the band of a valid, a degraded, an invalid estimate
 
 WIDEST = math.radians(6.0)
-"""Half width of the band of β beyond which an estimate is invalid: what it says of the car is no more than v = 0 does."""
+"""Half width of the band of β beyond which an estimate is invalid.
+
+What it says of the car is no more than v = 0 does.
+"""
 
 PERSISTENT_FAULT_SECONDS = 2.0
-"""Accusation from which on a fault is persistent; a single wrong sample is accused for up to 1.6 s, as sums decay."""
+"""Accusation from which on a fault is persistent.
 
-NO_FAULTS = np.array(
-    [kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN]
-)  # kinds of reasons that accuse no sensor
+A single wrong sample is accused for up to 1.6 s, as sums decay.
+"""
+
+# kinds of reasons that accuse no sensor
+NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 
 
 def starts_anew(estimator: Estimator) -> bool:
-    """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
+    """Whether an estimator is better off without its memory after a fault.
+
+    It has more than a window, and nothing in it adapts.
+    """
     return estimator.warm_up_steps == 0 and not estimator.adapts
 
 
 class Monitor:
-    """Judges samples before and after they are estimated; keeps the state between calls. Parts of ``trust`` that are None are not judged.
+    """Judges samples before and after they are estimated.
 
-    ``elsewhere``: the car or its tyres are others than those that were calibrated on; ``behind_front_end``: rows come through the filter
-    from a faster bus.
+    Keeps the state between calls. Parts of ``trust`` that are None are not judged.
+
+    ``elsewhere``: the car or its tyres are others than those that were calibrated on;
+    ``behind_front_end``: rows come through the filter from a faster bus.
     """
 
     def __init__(
@@ -86,7 +102,10 @@ class Monitor:
         self._fault = np.zeros(2)
 
     def before(self, received: FloatArray, cleaned: Cleaned) -> Health:
-        """Health of rows (T, C) as received; in ``cleaned``, accused channels are taken out and restarts added, in place."""
+        """Health of rows (T, C) as received.
+
+        In ``cleaned``, accused channels are taken out and restarts added, in place.
+        """
         if self.packed_health is None:
             return Health(*np.zeros((3, len(received))))
         health = health_rows(self.packed_health, received, cleaned.measured, self._state)
@@ -111,12 +130,18 @@ class Monitor:
         vx: FloatArray,
         variance: FloatArray,
     ) -> FloatArray:
-        """Complete the verdict of `before`, in place, and give half widths of v [m/s] and β [rad], (T, 2); NaN where none are known.
+        """Complete the verdict of `before`, in place, and return half widths, (T, 2).
 
-        Args:
-            verdict, watched, cleaned: of the same T rows.
-            vx: speed of the estimate, (T,) [m/s].
-            variance: of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
+        They are of v [m/s] and β [rad]; NaN without calibrated bands.
+
+        Parameters
+        ----------
+        verdict, watched, cleaned : Health
+            Of the same T rows.
+        vx : array
+            Speed of the estimate, (T,) [m/s].
+        variance : array
+            Of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
         """
         verdict_rows(
             watched.vy,
@@ -157,15 +182,26 @@ def isolate_rows(  # type: ignore[no-untyped-def]
     flow,
     state,
 ):
-    """Take accused channels out of rows, and have estimators start anew; ``rows, measured, flow`` are changed in place.
+    """Take accused channels out of rows, and have estimators start anew.
 
-    Args:
-        status, reason: of health, (T,).
-        numbers, skippable: of the channels: number in a code, whether the estimator can do without it, (C,).
-        starts_anew: whether the estimator does after a persistent fault.
-        adapts: whether it has adapting states, which go back to fitted values while a required channel is accused.
-        persistent_steps: samples of accusation after which a fault is persistent.
-        state: samples at which any channel was accused since health was last valid, and at which a required one was, (2,).
+    ``rows, measured, flow`` are changed in place.
+
+    Parameters
+    ----------
+    status, reason
+        Of health, (T,).
+    numbers, skippable
+        Of the channels: number in a code, whether the estimator can do without it, (C,).
+    starts_anew
+        Whether the estimator does after a persistent fault.
+    adapts
+        Whether it has adapting states, which go back to fitted values while a required channel
+        is accused.
+    persistent_steps
+        Samples of accusation after which a fault is persistent.
+    state
+        Samples at which any channel was accused since health was last valid, and at which a
+        required one was, (2,).
     """
     for k in range(rows.shape[0]):
         kind = int(reason[k]) // 10000
@@ -193,10 +229,15 @@ def isolate_rows(  # type: ignore[no-untyped-def]
 
 
 @entry(nogil=True)
-def verdict_rows(vy, marks, flow, measured, required, numbers, status, reason):  # type: ignore[no-untyped-def]
-    """Add the findings of guard (``flow``, ``measured``) and watch (``vy``, ``marks``) to ``status, reason`` of health, in place.
+def verdict_rows(  # type: ignore[no-untyped-def]
+    vy, marks, flow, measured, required, numbers, status, reason
+):
+    """Add the findings of guard and watch to ``status, reason`` of health, in place.
 
-    ``required`` are channels that the estimator cannot do without, ``numbers`` those in codes, (C,).
+    Those of the guard are ``flow`` and ``measured``, those of the watch ``vy`` and ``marks``.
+
+    ``required`` are channels that the estimator cannot do without, ``numbers`` those in codes,
+    (C,).
     """
     for k in range(vy.shape[0]):
         status_of_row = int(status[k])
@@ -220,9 +261,12 @@ def verdict_rows(vy, marks, flow, measured, required, numbers, status, reason): 
 
 @entry(nogil=True)
 def widen_rows(status, reason, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
-    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place; wider than `WIDEST` is invalid.
+    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place.
 
-    ``farthest`` is the 99.9th percentile of |v| of estimates in training, ``vx`` the speed of the estimate [m/s].
+    Wider than `WIDEST` is invalid.
+
+    ``farthest`` is the 99.9th percentile of |v| of estimates in training, ``vx`` the speed of the
+    estimate [m/s].
     """
     for k in range(vy.shape[0]):
         wider = BAND_FACTORS[int(status[k])]

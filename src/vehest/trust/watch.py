@@ -1,4 +1,7 @@
-"""Clips, bridges and restarts: an estimate stays finite and within the bound by the car's speed; a diverged estimator starts anew."""
+"""Clips, bridges and restarts.
+
+An estimate stays finite and within the bound by the car's speed; a diverged estimator starts anew.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,11 @@ EXTRAPOLATED = 1
 CLIPPED = 2
 SPINNING = 4
 STARTED = 8
-"""Marks of a sample: no estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew at it."""
+"""Marks of a sample.
+
+No estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew
+at it.
+"""
 
 
 class Watched(NamedTuple):
@@ -54,7 +61,8 @@ class Watch:
     def __call__(self, vy: FloatArray, motion: FloatArray, flow: NDArray[np.int8]) -> Watched:
         """Go on with the estimator's v, (T,) [m/s], NaN without one.
 
-        ``motion`` holds accepted vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3), NaN if unknown; ``flow`` is of the guard, (T,).
+        ``motion`` holds accepted vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3), NaN if unknown;
+        ``flow`` is of the guard, (T,).
         """
         out = np.empty(len(vy))
         marks = np.zeros(len(vy), np.int8)
@@ -80,14 +88,21 @@ class Watch:
 
 @entry(nogil=True)
 def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[no-untyped-def]
-    """Bound, bridge and judge estimates, up to the row at which the estimator is lost; returns the rows done, and whether it is lost.
+    """Bound, bridge and judge estimates, up to the row at which the estimator is lost.
 
-    Args:
-        vy, motion, flow: as in `Watch`.
-        state: last value passed on, remembered speed, seconds of spinning, seconds beyond the bound, samples since the estimator's start,
-            whether it was lost at the last row.
-        settings: top speed, largest tan β, warm-up in samples, sampling interval [s].
-        out, marks: output, (T,).
+    Returns the rows done, and whether it is lost.
+
+    Parameters
+    ----------
+    vy, motion, flow
+        As in `Watch`.
+    state
+        Last value passed on, remembered speed, seconds of spinning, seconds beyond the bound,
+        samples since the estimator's start, whether it was lost at the last row.
+    settings
+        Top speed, largest tan β, warm-up in samples, sampling interval [s].
+    out, marks
+        Output, (T,).
     """
     top_speed, largest_tan, warm_up, step = settings
     for k in range(vy.shape[0]):

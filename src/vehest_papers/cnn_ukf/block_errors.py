@@ -1,4 +1,5 @@
-"""Errors of every candidate by manoeuvre and seed, and how far each was trained: blocks.csv and training.csv.
+"""Errors of every candidate by manoeuvre and seed, and how far each was trained: blocks.csv and
+training.csv.
 
 A block is a manoeuvre, or a group of manoeuvres where a claim counts groups.
 """
@@ -68,7 +69,7 @@ def error_rows(parts: Mapping[str, Runs], learnt: Limited | None, content: Paper
         Claims and tables of the paper.
     """
     rows = []
-    needed = content.metrics()
+    comparisons = content.metrics()
     for part, runs in parts.items():
         compared = learnt.compared if part == LIMITED and learnt is not None else runs
         declared = {
@@ -78,12 +79,18 @@ def error_rows(parts: Mapping[str, Runs], learnt: Limited | None, content: Paper
         for name, candidate in declared.items():
             if name not in content.candidates:
                 continue
-            for of_part, test_set, metric in needed:
+            for of_part, test_set, metric in comparisons:
                 if of_part != part or metric not in METRICS:
                     continue
-                own = errors.errors(candidate, METRICS[metric], GROUP_OF_TEST[test_set])
+                of_candidate = errors.errors(candidate, METRICS[metric], GROUP_OF_TEST[test_set])
                 head = BlockRow(part, name, 0, test_set, metric, "", 0.0, 0)
-                rows += seed_rows(head, errors.seeds(candidate), own.blocks, own.sums, own.sizes)
+                rows += seed_rows(
+                    head,
+                    errors.seeds(candidate),
+                    of_candidate.blocks,
+                    of_candidate.sums,
+                    of_candidate.sizes,
+                )
     if learnt is not None:
         rows += _pseudo_measurement_rows(learnt)
     return rows
@@ -102,8 +109,10 @@ def _pseudo_measurement_rows(learnt: Limited) -> list[BlockRow]:
 
 def network_squares(outputs: Sequence[Sequence[Outputs]]) -> tuple[FloatArray, FloatArray]:
     """Sums of the squared errors of β_DD, (S, M) [deg²], and samples, (M,)."""
-    sums = np.array([[float(np.square(own.error).sum()) for own in seed] for seed in outputs])
-    return sums, np.array([float(len(own.error)) for own in outputs[0]])
+    sums = np.array(
+        [[float(np.square(manoeuvre.error).sum()) for manoeuvre in seed] for seed in outputs]
+    )
+    return sums, np.array([float(len(manoeuvre.error)) for manoeuvre in outputs[0]])
 
 
 def measured_rows(
@@ -133,29 +142,29 @@ def measured_rows(
             deep
         )
     if paper.CNN in outputs:
-        own = outputs[paper.CNN]
+        cnn = outputs[paper.CNN]
         of_network = {
-            "cnn_ukf_distrust_grows_with_error": measures.distrust_correlations(own),
-            "yaw_rate_noise_grows_with_sideslip": measures.yaw_rate_noise_rises(own),
+            "cnn_ukf_distrust_grows_with_error": measures.distrust_correlations(cnn),
+            "yaw_rate_noise_grows_with_sideslip": measures.yaw_rate_noise_rises(cnn),
             "lateral_velocity_noise_grows_with_nonlinearity": (
-                measures.lateral_velocity_noise_rises(own)
+                measures.lateral_velocity_noise_rises(cnn)
             ),
         }
         if paper.DEEP in outputs:
             of_network["cnn_ukf_distrust_spans_more_decades"] = measures.distrust_decades_ratios(
-                own, outputs[paper.DEEP]
+                cnn, outputs[paper.DEEP]
             )
         by_claim |= {(claim, paper.CNN): values for claim, values in of_network.items()}
     conditions = [ManoeuvreErrors(runs) for runs in perturbed.stiffness if runs]
     trained = perturbed.stiffness[NOMINAL]
-    for claim, candidate, other in (
+    for claim, candidate, reference in (
         ("de_ukf_less_sensitive_to_stiffness_than_model", paper.DEEP, paper.MODEL),
         ("cnn_ukf_less_sensitive_to_stiffness_than_model", paper.CNN, paper.MODEL),
         ("de_ukf_less_sensitive_to_stiffness_than_cnn_ukf", paper.DEEP, paper.CNN),
     ):
-        if candidate in trained and other in trained:
+        if candidate in trained and reference in trained:
             by_claim[claim, candidate] = measures.stiffness_rise_differences(
-                conditions, conditions[NOMINAL], candidate, other
+                conditions, conditions[NOMINAL], candidate, reference
             )
     if all(name in trained for name in paper.HYBRIDS):
         by_claim["cnn_ukf_below_de_ukf_at_all_stiffnesses", paper.CNN] = (
@@ -177,14 +186,14 @@ def measured_rows(
 
 def _rows_among_four(main: ManoeuvreErrors) -> list[BlockRow]:
     """CNN-UKF, and zero in its place, against the other three methods of Table II."""
-    others = [name for name in paper.OF_FOUR if name != paper.CNN]
+    rivals = [name for name in paper.OF_FOUR if name != paper.CNN]
     rows = []
     for candidate in (paper.CNN, *(name for name in BASELINE_NAMES if name in main)):
         named = BASELINE_NAMES.get(candidate, candidate)
-        values = measures.mean_error_over_least_of_others(main, candidate, others)
+        values = measures.mean_error_over_least_of_others(main, candidate, rivals)
         head = BlockRow(FULL, named, 0, TEST, "cnn_ukf_mean_error_nearest_zero", "", 0.0, 0)
         rows += seed_rows(head, range(len(values)), main.manoeuvres, values)
-        groups, values = measures.is_best_in_group(main, candidate, others)
+        groups, values = measures.is_best_in_group(main, candidate, rivals)
         rows += seed_rows(
             replace(head, metric="cnn_ukf_best_in_most_groups"), range(len(values)), groups, values
         )
@@ -194,9 +203,11 @@ def _rows_among_four(main: ManoeuvreErrors) -> list[BlockRow]:
 def training_rows(
     parts: Mapping[str, Runs], content: Paper, *, is_complete: bool = True
 ) -> list[TrainingRow]:
-    """How far every candidate was trained; those of the full set are checked by a part with twice the epochs.
+    """How far every candidate was trained; those of the full set are checked by a part with twice
+    the epochs.
 
-    ``is_complete``: whether all planned trainings are done; else candidates without a training are rows as well.
+    ``is_complete``: whether all planned trainings are done; else candidates without a training are
+    rows as well.
     """
     doubled = _validation(parts.get(DOUBLED, {}))
     rows: dict[str, TrainingRow] = {}
@@ -226,8 +237,8 @@ def training_rows(
             )
     if paper.FULL_SCALING in content.candidates and paper.DEEP in rows:
         rows[paper.FULL_SCALING] = replace(rows[paper.DEEP], candidate=paper.FULL_SCALING)
-    absent = [] if is_complete else [name for name in content.candidates if name not in rows]
-    for name in absent:
+    not_trained = [] if is_complete else [name for name in content.candidates if name not in rows]
+    for name in not_trained:
         of_paper = content.candidates[name].epochs_paper
         epochs_paper = "" if of_paper is None else str(of_paper)
         rows[name] = TrainingRow(name, "", epochs_paper, "not trained", "no seed is trained yet")

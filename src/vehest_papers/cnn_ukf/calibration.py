@@ -1,4 +1,6 @@
-"""Coverage of bands and normalised innovations, as the filters give them and calibrated on validation manoeuvres."""
+"""Coverage of bands and normalised innovations, as the filters give them and calibrated on
+validation manoeuvres.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +49,17 @@ def calibration_table(part: PartArtefacts, prepared: Prepared, runs: Runs, data:
             f"after_{level}": Column("after"),
         }
     columns |= {"nis": Column("NIS, before"), "nis_after": Column("after")}
-    caption = f"Share of vy's errors within bands, and NIS, as the filter gives them and calibrated. Data: {data}."
+    caption = (
+        "Share of vy's errors within bands, and NIS, as the filter gives them and calibrated. "
+        f"Data: {data}."
+    )
     return Table("calibration", caption, pd.DataFrame(rows, columns=list(columns)), columns)
 
 
 def raw_coverages(run: Run, prepared: Prepared) -> FloatArray:
-    """Share of vy's errors on the test within the central interval of the filter's own normal distribution, of each level."""
+    """Share of vy's errors on the test within the central interval of the filter's own normal
+    distribution, of each level.
+    """
     deviations = special.ndtri(0.5 + np.array(LEVELS) / 200.0)
     inside = []
     for scored in prepared.with_covariances(run.model, TEST):

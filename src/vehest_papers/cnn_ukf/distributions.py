@@ -1,4 +1,6 @@
-"""Figures 4, 5, 6 and 11: what the drives are made of, and how errors are distributed, over sizes and over groups of manoeuvres."""
+"""Figures 4, 5, 6 and 11: what the drives are made of, and how errors are distributed, over sizes
+and over groups of manoeuvres.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
@@ -25,7 +27,9 @@ def figure_4(
     titles: Mapping[str, str],
     data: str,
 ) -> Figure:
-    """How often which sideslip angle and lateral acceleration is driven: training, validation and test of each part together."""
+    """How often which sideslip angle and lateral acceleration is driven: training, validation and
+    test of each part together.
+    """
     driven = {name: _driven(part, prepared[name]) for name, part in parts.items()}
     labels = ("sideslip angle [deg]", "lateral acceleration [m/s²]")
     with new_figure(DOUBLE_COLUMN, 2.6) as figure:
@@ -43,7 +47,10 @@ def figure_4(
                 axes.set_xlabel(label)
         panels[0].set_ylabel("samples")
         legend_above(figure, panels[0], columns=2)
-    caption = f"Sideslip angle and lateral acceleration of all samples (Figure 4 of the paper). Data: {data}."
+    caption = (
+        "Sideslip angle and lateral acceleration of all samples (Figure 4 of the paper). Data: "
+        f"{data}."
+    )
     return Figure("figure_4", caption, figure)
 
 
@@ -52,7 +59,7 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
     spans = [
         *part.split.train,
         *part.split.validation,
-        *(span for own in part.split.tests.values() for span in own),
+        *(span for test_spans in part.split.tests.values() for span in test_spans),
     ]
     pieces = [
         prepared.recording(span.dataset, span.recording).cut(span.start, span.stop)
@@ -63,9 +70,11 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
 
 
 def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
-    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation."""
-    picked = {candidate: chosen(own) for candidate, own in runs.items()}
-    found = {
+    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean
+    and standard deviation.
+    """
+    picked = {candidate: chosen(seeds) for candidate, seeds in runs.items()}
+    by_candidate = {
         name: error_distribution([part for parts in run.test.values() for part in parts])
         for name, run in picked.items()
     }
@@ -73,18 +82,18 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
         upper, axes = figure.subplots(
             2, 1, height_ratios=(1.2, 3.2)
         )  # errors reach ten times as far as deviations
-        for place, (candidate, own) in enumerate(found.items()):
+        for place, (candidate, seeds) in enumerate(by_candidate.items()):
             line = line_of(candidate)
             axes.stairs(
-                np.maximum(own.counts, 0.5),
-                own.edges,
+                np.maximum(seeds.counts, 0.5),
+                seeds.edges,
                 color=line.colour,
                 linestyle=line.dash,
                 linewidth=1.2,
                 label=candidate,
             )
             upper.errorbar(
-                own.mean, -place, xerr=own.deviation, color=line.colour, fmt="x", capsize=3
+                seeds.mean, -place, xerr=seeds.deviation, color=line.colour, fmt="x", capsize=3
             )
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.5)
@@ -96,39 +105,39 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
         upper.margins(y=0.25)
         legend_above(figure, axes, columns=5)
     caption = (
-        f"Distribution of errors where |ay| ≥ 4 m/s², {title}, bins of {BIN:g}°; above mean and standard deviation (Figure {number} of the "
-        f"paper). Data: {data}."
+        f"Distribution of errors where |ay| ≥ 4 m/s², {title}, bins of {BIN:g}°; above mean and "
+        f"standard deviation (Figure {number} of the paper). Data: {data}."
     )
     rows = [
         {"candidate": candidate, "from_deg": low, "samples": count}
-        for candidate, own in found.items()
-        for low, count in zip(own.edges[:-1].tolist(), own.counts.tolist(), strict=True)
+        for candidate, seeds in by_candidate.items()
+        for low, count in zip(seeds.edges[:-1].tolist(), seeds.counts.tolist(), strict=True)
     ]
     return Figure(f"figure_{number}", caption, figure), pd.DataFrame(rows)
 
 
-def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
+def groups(runs: Runs, data: str) -> tuple[Figure, pd.DataFrame]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
     of_run = {
-        candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()
+        candidate: [kpis_by_group(run.test) for run in seeds] for candidate, seeds in runs.items()
     }
-    known = list(next(iter(of_run.values()))[0])
+    names = list(next(iter(of_run.values()))[0])
     values = {
         (candidate, group): np.array([seed[group].mse_nonlinear for seed in seeds])
         for candidate, seeds in of_run.items()
-        for group in known
+        for group in names
     }
-    counted = {group: next(iter(of_run.values()))[0][group].manoeuvres for group in known}
+    counted = {group: next(iter(of_run.values()))[0][group].manoeuvres for group in names}
     with new_figure(DOUBLE_COLUMN, 2.9) as figure:
         axes = figure.subplots()
         width = 0.84 / len(of_run)
         for place, candidate in enumerate(of_run):
-            middle = np.array([np.median(values[candidate, group]) for group in known])
+            middle = np.array([np.median(values[candidate, group]) for group in names])
             low, high = (
-                np.array([limit(values[candidate, group]) for group in known])
+                np.array([limit(values[candidate, group]) for group in names])
                 for limit in (np.min, np.max)
             )
-            at = np.arange(len(known)) + (place - 0.5 * (len(of_run) - 1)) * width
+            at = np.arange(len(names)) + (place - 0.5 * (len(of_run) - 1)) * width
             axes.bar(at, middle, width, color=line_of(candidate).colour, alpha=0.8, label=candidate)
             axes.errorbar(
                 at,
@@ -140,10 +149,10 @@ def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
                 capsize=1.5,
             )
         axes.set_xticks(
-            range(len(known)),
+            range(len(names)),
             [
                 f"{group.replace(' in the ', chr(10) + 'in the ')}\n({counted[group]})"
-                for group in known
+                for group in names
             ],
         )
         axes.set_ylabel("MSE$_{nl}$ [deg²]")
@@ -156,14 +165,10 @@ def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
             f"{candidate}_median": float(np.median(values[candidate, group]))
             for candidate in of_run
         }
-        for group in known
+        for group in names
     ]
-    columns = {
-        "group": Column("manoeuvres"),
-        "n": Column("of them", decimals=0),
-        **{candidate: Column(candidate) for candidate in of_run},
-    }
-    caption = f"MSE_nl by group of manoeuvres, median and range of seeds (Figure 6 of the paper). Data: {data}."
-    return Figure("figure_6", caption, figure), Table(
-        "figure_6", caption, pd.DataFrame(rows), columns
+    caption = (
+        "MSE_nl by group of manoeuvres, median and range of seeds (Figure 6 of the paper). Data: "
+        f"{data}."
     )
+    return Figure("figure_6", caption, figure), pd.DataFrame(rows)

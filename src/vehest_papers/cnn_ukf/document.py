@@ -1,4 +1,6 @@
-"""The report: tables, figures and numbers of what is trained, for the places of its hand-written template."""
+"""The report: tables, figures and numbers of what is trained, for the places of its hand-written
+template.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import MISSING, fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest_papers.cnn_ukf import (
     block_errors,
@@ -32,7 +35,7 @@ from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
     KPIS,
-    LARGEST_SIDESLIP,
+    MAX_PAPER_SIDESLIP,
     TEST,
     Prepared,
     Run,
@@ -49,8 +52,12 @@ from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import CLAIMS, claims_table, figure_in_words, one_line
+from vehest_papers.kit.verdict_table import (
+    CLAIMS,
+    claims_table,
+    figure_in_words,
+    without_line_breaks,
+)
 from vehest_papers.kit.verdicts import VERDICTS
 
 NAME = "cnn_ukf"  # of the paper's package
@@ -65,23 +72,29 @@ COMPARED = {
     "free": paper.FREE,
 }
 """Place in the template -> with what CNN-UKF is compared there."""
-SHOWN = (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
-SHOWN_FIRST = (paper.CNN, paper.DEEP, paper.DATA, paper.MODEL, paper.SMOOTH, paper.FREE, paper.ZERO)
+FIGURE_CANDIDATES = (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
+OVERVIEW_CANDIDATES = (
+    paper.CNN,
+    paper.DEEP,
+    paper.DATA,
+    paper.MODEL,
+    paper.SMOOTH,
+    paper.FREE,
+    paper.ZERO,
+)
 FILTERS = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
 ALONE = (paper.DATA, paper.RECURRENT, paper.STATIC_MAP, paper.ZERO)  # without a filter
 
 
 @dataclass
 class Outcome:
-    """What the report is made from: blocks that the template places, tables that are files alone, errors by manoeuvre."""
+    """What the report is made from: blocks that the template places, tables that are files alone,
+    errors by manoeuvre.
+    """
 
     blocks: list[Block] = field(default_factory=list)
     data: dict[str, pd.DataFrame] = field(default_factory=dict)
     rows: list[BlockRow] = field(default_factory=list)
-
-    def add_files(self, *new: Table) -> None:
-        """Tables that the report links to and does not show."""
-        self.data |= {table.name: table.frame for table in new}
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,8 @@ class Subjects:
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of the study; candidates that are not trained yet are named, and claims on them not assessed.
+    """The report of the study; candidates that are not trained yet are named, and claims on them
+    not assessed.
 
     Raises
     ------
@@ -164,7 +178,7 @@ def _subjects(artefacts: StudyArtefacts) -> Subjects:
     runs = {name: runs[name] for name in sorted(runs, key=_place)}
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     full = artefacts.parts[FULL]
-    within = runs_of(full, Prepared(full, until_sideslip=LARGEST_SIDESLIP, read=read))
+    within = runs_of(full, Prepared(full, until_sideslip=MAX_PAPER_SIDESLIP, read=read))
     return Subjects(artefacts, prepared, parts, runs, ManoeuvreErrors(runs), within, kind)
 
 
@@ -186,12 +200,14 @@ def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
 
 
 def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
-    """Table II, its figures by car, errors within the paper's range, and networks and oracles beside it."""
+    """Table II, its figures by car, errors within the paper's range, and networks and oracles
+    beside it.
+    """
     main = subjects.main
     in_table = subjects.among([name for name in paper.CANDIDATES if name not in tables.ORACLES])
     training = {
         name: tables.training_error(run, subjects.full)
-        for name, run in subjects.drawn((*SHOWN, paper.RECURRENT)).items()
+        for name, run in subjects.drawn((*FIGURE_CANDIDATES, paper.RECURRENT)).items()
     }
     caption = f"Table II: ours with 95 % intervals (paper's in brackets). Data: {subjects.kind}."
     outcome.blocks += [
@@ -203,12 +219,15 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
             caption,
             tuple(KPIS),
         ),
-        tables.by_car(main, list(subjects.among((*SHOWN, paper.RECURRENT))), subjects.kind),
+        tables.by_car(
+            main, list(subjects.among((*FIGURE_CANDIDATES, paper.RECURRENT))), subjects.kind
+        ),
         _overview(subjects),
     ]
     for name, candidates in (("networks_alone", ALONE), ("oracles", tables.ORACLES)):
         if among := subjects.among(candidates):
-            outcome.add_files(tables.accuracy(ManoeuvreErrors(among), {}, training, name, ""))
+            errors = ManoeuvreErrors(among)
+            outcome.data[name] = tables.accuracy(errors, {}, training, name, "").frame
     outcome.data["within_12_deg"] = kpi_table(subjects.within)
 
 
@@ -223,7 +242,7 @@ def _overview(subjects: Subjects) -> Table:
             "within": within.text(name, MSE) if name in within else MISSING,
             "n_seeds": len(subjects.runs[name]),
         }
-        for name in SHOWN_FIRST
+        for name in OVERVIEW_CANDIDATES
         if name in subjects.runs
     ]
     columns = {
@@ -238,7 +257,9 @@ def _overview(subjects: Subjects) -> Table:
 
 
 def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
-    """What the hybrids' networks do, the factorial, the floor ε, bands, wrong tyres, and the limited set."""
+    """What the hybrids' networks do, the factorial, the floor ε, bands, wrong tyres, and the
+    limited set.
+    """
     main = subjects.main
     prepared = subjects.full
     kind = subjects.kind
@@ -265,16 +286,16 @@ def _hybrids(outcome: Outcome, subjects: Subjects, content: Paper) -> None:
             part, prepared, {name: subjects.parts[FULL][name] for name in _filters(subjects)}, kind
         ),
     ]
-    outcome.add_files(tables.networks_alone(main, outputs, "networks_full", ""))
+    outcome.data["networks_full"] = tables.networks_alone(main, outputs)
     local = pd.DataFrame()
     if paper.SMOOTH in subjects.runs:
         smooth = filter_of(load_model(chosen(subjects.runs[paper.SMOOTH]).model.model_folder))
         assert smooth is not None
         local = observability.local(smooth)
-        outcome.add_files(observability.observability_table(local))
+        outcome.data["observability"] = local
     if off.stiffness[perturbed.NOMINAL]:
         outcome.blocks.append(perturbed.figure_14(off, kind))
-        outcome.add_files(perturbed.perturbed_table(off, kind))
+        outcome.data["perturbed"] = perturbed.by_condition(off)
         outcome.data["stiffness"] = perturbed.values(off)
     learnt = None
     if LIMITED in subjects.parts:
@@ -300,7 +321,10 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
     training = {
         name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()
     }
-    caption = f"Table III, trained up to 7 m/s²; filters are those of the full set. Data: {subjects.kind}."
+    caption = (
+        "Table III, trained up to 7 m/s²; filters are those of the full set. Data: "
+        f"{subjects.kind}."
+    )
     turn = traces.manoeuvre_of(part, prepared, "J-turn")
     hybrids = {name: chosen(learnt.runs[name]) for name in paper.HYBRIDS if name in learnt.runs}
     picked = {name: chosen(seeds) for name, seeds in runs.items()}
@@ -315,9 +339,7 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
         outcome.blocks.append(
             traces.angles_of_networks(hybrids, prepared, warm_up, turn, subjects.kind)
         )
-    outcome.add_files(
-        tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", "")
-    )
+    outcome.data["networks_limited"] = tables.networks_alone(learnt.comparison, learnt.outputs)
 
 
 def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
@@ -328,19 +350,18 @@ def _manoeuvres(outcome: Outcome, subjects: Subjects) -> None:
     part = artefacts.parts[FULL]
     warm_up = part.protocol.warm_up_seconds
     title = artefacts.titles[FULL].lower()
-    both = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
-    figure_4 = distributions.figure_4(both, subjects.prepared, artefacts.titles, kind)
+    of_sets = {name: artefacts.parts[name] for name in (FULL, LIMITED) if name in artefacts.parts}
+    figure_4 = distributions.figure_4(of_sets, subjects.prepared, artefacts.titles, kind)
     outcome.blocks.append(figure_4)
-    shown = subjects.among(SHOWN)
-    if not shown:
+    compared = subjects.among(FIGURE_CANDIDATES)
+    if not compared:
         return
-    drawn = subjects.drawn(SHOWN)
+    drawn = subjects.drawn(FIGURE_CANDIDATES)
     slalom, spiral, lap = (
         traces.manoeuvre_of(part, prepared, group) for group in ("slalom", "spiral", "lap")
     )
-    figure_5, outcome.data["errors_full"] = distributions.errors_figure(shown, 5, title, kind)
-    figure_6, by_group = distributions.groups(shown, title, kind)
-    outcome.add_files(by_group)
+    figure_5, outcome.data["errors_full"] = distributions.errors_figure(compared, 5, title, kind)
+    figure_6, outcome.data["figure_6"] = distributions.groups(compared, kind)
     of_four = {name: run for name, run in drawn.items() if name in paper.OF_FOUR} or drawn
     outcome.blocks += [
         figure_5,
@@ -368,16 +389,18 @@ def _files(outcome: Outcome, subjects: Subjects) -> None:
     losses = loss_curves(models)
     outcome.data[LOSS_CURVES] = losses
     if len(losses):
-        caption = f"Losses of training and validation, the longest phase of each candidate's first seed, scaled. Data: {kind}."
+        caption = (
+            "Losses of training and validation, the longest phase of each candidate's first "
+            f"seed, scaled. Data: {kind}."
+        )
         outcome.blocks.append(loss_figure(losses, caption))
-    outcome.add_files(
-        tables.filters([own for name, own in titled.items() if name in (FULL, "free")], kind),
-        tables.scaling(titled, kind),
-        tables.budget(
-            [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()],
-            kind,
+    outcome.data |= {
+        "filters": tables.filters([titled[name] for name in titled if name in (FULL, "free")]),
+        "scaling": tables.scaling(titled),
+        "budget": tables.budget(
+            [(artefacts.titles[name], part, parts[name]) for name, part in artefacts.parts.items()]
         ),
-    )
+    }
     outcome.data |= {f"kpis_{name}": kpi_table(runs) for name, runs in parts.items()}
 
 
@@ -391,10 +414,10 @@ def _values(
         model.estimator for part in artefacts.parts.values() for model in part.models
     )
     return {
-        "recommendation": one_line(content.recommendation),
+        "recommendation": without_line_breaks(content.recommendation),
         "kind": subjects.kind,
         "manoeuvres": len(main.manoeuvres),
-        "beyond": _number_beyond(main, LARGEST_SIDESLIP),
+        "beyond": _number_beyond(main, MAX_PAPER_SIDESLIP),
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),
@@ -410,11 +433,11 @@ def _values(
     }
 
 
-def _ratio(main: ManoeuvreErrors, other: str, kpi: str) -> str:
+def _ratio(main: ManoeuvreErrors, reference: str, kpi: str) -> str:
     """An indicator of CNN-UKF over that of another with its interval."""
-    if paper.CNN not in main or other not in main:
+    if paper.CNN not in main or reference not in main:
         return NOT_TRAINED
-    return figure_in_words(main.ratio(paper.CNN, other, kpi))
+    return figure_in_words(main.ratio(paper.CNN, reference, kpi))
 
 
 def _number_beyond(main: ManoeuvreErrors, sideslip: float) -> int:
@@ -433,12 +456,12 @@ def _incomplete(
     number = sum(len(names) for names in artefacts.not_trained.values())
     if not number:
         return []
-    absent = [row.candidate for row in trained if row.training == "not trained"]
+    not_trained = [row.candidate for row in trained if row.training == "not trained"]
     parts = [as_code(name) for name, names in artefacts.not_trained.items() if names]
     return [
         {
             "number": number,
-            "candidates": "; ".join(absent) or MISSING,
+            "candidates": "; ".join(not_trained) or MISSING,
             "parts": ", ".join(parts),
         }
     ]

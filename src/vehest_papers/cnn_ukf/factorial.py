@@ -1,4 +1,6 @@
-"""Which part of the gain is whose: tyre curve x process noise x hybrid; and the floor ε of the angle's variance (Eq. 6)."""
+"""Which part of the gain is whose: tyre curve x process noise x hybrid; and the floor ε of the
+angle's variance (Eq. 6).
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,10 @@ def effects_table(comparison: ManoeuvreErrors, data: str) -> Table:
         "ratio": Column("ratio of MSE_nl"),
         "cells": Column("pairs of cells", decimals=0),
     }
-    caption = f"Effects: geometric means over manoeuvres and the other factors, 95 % intervals. Data: {data}."
+    caption = (
+        "Effects: geometric means over manoeuvres and the other factors, 95 % intervals. Data: "
+        f"{data}."
+    )
     return Table("effects", caption, pd.DataFrame(rows), columns)
 
 
@@ -122,7 +127,9 @@ def floor_table(
     active: pd.DataFrame,
     data: str,
 ) -> Table:
-    """Errors of both hybrids, quantiles of σ_DD and its rank correlation with the network's error, by ε."""
+    """Errors of both hybrids, quantiles of σ_DD and its rank correlation with the network's error,
+    by ε.
+    """
     rows = []
     for hybrid in paper.HYBRIDS:
         for floor in FLOORS:

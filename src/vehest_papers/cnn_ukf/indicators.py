@@ -1,4 +1,6 @@
-"""The paper's indicators by manoeuvre and seed, and their values and ratios with 95 % intervals over manoeuvres and seeds."""
+"""The paper's indicators by manoeuvre and seed, and their values and ratios with 95 % intervals
+over manoeuvres and seeds.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +114,9 @@ class ManoeuvreErrors:
         if not group:
             return self._errors[key]
         of_group = [
-            name for name, own in zip(self.manoeuvres, self.groups, strict=True) if own == group
+            name
+            for name, name_of_group in zip(self.manoeuvres, self.groups, strict=True)
+            if name_of_group == group
         ]
         return self._errors[key].of_blocks(tuple(of_group))
 

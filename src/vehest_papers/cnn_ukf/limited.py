@@ -1,4 +1,6 @@
-"""The limited set (Section V-B): what was trained on drives without the limit of handling, with the filters of the full set."""
+"""The limited set (Section V-B): what was trained on drives without the limit of handling, with the
+filters of the full set.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class Limited:
 
 
 def limited(full: Runs, trained: Runs, prepared: Prepared) -> Limited:
-    """Combine what was trained on the limited set with the filters of the full set; the test of both is the same."""
+    """Combine what was trained on the limited set with the filters of the full set; the test of
+    both is the same.
+    """
     filters = {
         name: full[name]
         for name in (paper.MODEL, paper.SMOOTH, paper.ZERO, paper.STATIC_MAP)
@@ -58,10 +62,10 @@ def limited(full: Runs, trained: Runs, prepared: Prepared) -> Limited:
     )
 
 
-def _with_scaling_of(other: Run, run: Run, prepared: Prepared) -> Run:
+def _with_scaling_of(source: Run, run: Run, prepared: Prepared) -> Run:
     """A DE-UKF with p₁ and p₂ (Eq. 11) of another one, on the test."""
     changed = copy.deepcopy(load_model(run.model.model_folder))
-    of_full = load_model(other.model.model_folder)
+    of_full = load_model(source.model.model_folder)
     assert isinstance(changed, EnsembleUkf)
     assert isinstance(of_full, EnsembleUkf)
     changed.scaling = of_full.scaling.copy()

@@ -1,6 +1,8 @@
-"""Key performance indicators of a set of manoeuvres: squared errors over all of them, and each one's largest error on average.
+"""Key performance indicators of a set of manoeuvres: squared errors over all of them, and each
+one's largest error on average.
 
-Source: Bertipaglia et al. 2024, Section IV-B. Means of the largest errors rather than the largest of all: its Tables II and III.
+Source: Bertipaglia et al. 2024, Section IV-B. Means of the largest errors rather than the largest
+of all: its Tables II and III.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ BIN = 0.25  # deg, of Figs. 5 and 11
 
 @dataclass(frozen=True)
 class Kpis:
-    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured."""
+    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in
+    it, or ay was not measured.
+    """
 
     mse: float  # mean squared error over all samples [deg²]
     mse_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s² [deg²]
@@ -59,15 +63,18 @@ class ErrorDistribution:
 
 
 def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, list[Scored]]:
-    """What was scored of each recording, which is one manoeuvre, in the order of a test set's ranges; raises `DataError`."""
+    """What was scored of each recording, which is one manoeuvre, in the order of a test set's
+    ranges; raises `DataError`.
+    """
     if len(spans) != len(parts):
         raise DataError(
-            f"{len(parts)} scored parts do not belong to {len(spans)} ranges; leave evaluation.sequence_seconds empty"
+            f"{len(parts)} scored parts do not belong to {len(spans)} ranges; leave "
+            "evaluation.sequence_seconds empty"
         )
-    found: dict[str, list[Scored]] = {}
+    manoeuvres: dict[str, list[Scored]] = {}
     for span, part in zip(spans, parts, strict=True):
-        found.setdefault(span.recording, []).append(part)
-    return found
+        manoeuvres.setdefault(span.recording, []).append(part)
+    return manoeuvres
 
 
 def group_of(recording: str) -> str:
@@ -87,12 +94,10 @@ def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:
     errors = [
         np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()
     ]
-    beyond = [
+    masks = [
         np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()
     ]
-    nonlinear = [
-        error[chosen] for error, chosen in zip(errors, beyond, strict=True) if chosen.any()
-    ]
+    nonlinear = [error[chosen] for error, chosen in zip(errors, masks, strict=True) if chosen.any()]
     return Kpis(
         mse=float(np.mean(np.square(np.concatenate(errors)))),
         mse_nonlinear=float(np.mean(np.square(np.concatenate(nonlinear))))
@@ -115,7 +120,9 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
 
 
 def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
-    """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only; raises `DataError` where none is."""
+    """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s²
+    only; raises `DataError` where none is.
+    """
     errors = np.concatenate(
         [
             sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part)
@@ -124,7 +131,8 @@ def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> 
     )
     if not len(errors):
         raise DataError(
-            f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False"
+            f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all "
+            "with nonlinear_only=False"
         )
     first = np.floor(errors.min() / BIN)
     last = np.floor(errors.max() / BIN) + 1

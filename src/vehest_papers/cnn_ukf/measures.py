@@ -1,7 +1,9 @@
-"""Values by block and seed for those claims that are not comparisons of errors (``measure`` in claims.yaml).
+"""Values by block and seed for those claims that are not comparisons of errors (``measure`` in
+claims.yaml).
 
-Each function returns an array of shape (S, B), S seeds by B manoeuvres unless it says otherwise; NaN where a
-manoeuvre has no samples of what is measured. Two candidates have their seeds paired in order.
+Each function returns an array of shape (S, B), S seeds by B manoeuvres unless it says otherwise;
+NaN where a manoeuvre has no samples of what is measured. Two candidates have their seeds paired in
+order.
 """
 
 from __future__ import annotations
@@ -33,16 +35,17 @@ Seeds = Sequence[Sequence[Outputs]]  # outputs of a network, seed by seed, manoe
 
 
 def mean_error_over_least_of_others(
-    main: ManoeuvreErrors, candidate: str, others: Sequence[str]
+    main: ManoeuvreErrors, candidate: str, rivals: Sequence[str]
 ) -> FloatArray:
-    """Contributions of the manoeuvres to |mean error| less the smallest |mean error| of the others [deg].
+    """Contributions of the manoeuvres to |mean error| less the smallest |mean error| of the others
+    [deg].
 
-    Where |ay| is at least 4 m/s². Their mean over manoeuvres is the difference of the two magnitudes:
-    the sign of each mean error is that over all manoeuvres.
+    Where |ay| is at least 4 m/s². Their mean over manoeuvres is the difference of the two
+    magnitudes: the sign of each mean error is that over all manoeuvres.
     """
-    magnitudes = [_magnitude_parts(main, name) for name in others]
-    least = min(magnitudes, key=lambda parts: float(parts.mean()))
-    return np.subtract(*paired_seeds(_magnitude_parts(main, candidate), least))
+    magnitudes = [_magnitude_parts(main, name) for name in rivals]
+    smallest = min(magnitudes, key=lambda parts: float(parts.mean()))
+    return np.subtract(*paired_seeds(_magnitude_parts(main, candidate), smallest))
 
 
 def _magnitude_parts(main: ManoeuvreErrors, candidate: str) -> FloatArray:
@@ -58,14 +61,16 @@ def _magnitude_parts(main: ManoeuvreErrors, candidate: str) -> FloatArray:
 
 
 def is_best_in_group(
-    main: ManoeuvreErrors, candidate: str, others: Sequence[str]
+    main: ManoeuvreErrors, candidate: str, rivals: Sequence[str]
 ) -> tuple[list[str], FloatArray]:
-    """Groups of manoeuvres, and 1 where a seed has a lower MSE in non-linear driving than the mean of each other, (S, groups)."""
+    """Groups of manoeuvres, and 1 where a seed has a lower MSE in non-linear driving than the mean
+    of each other, (S, groups).
+    """
     groups = [group for group in GROUPS.values() if group in main.groups]
     columns = []
     for group in groups:
         values = _values_of_seeds(main, candidate, group)
-        limit = min(float(_values_of_seeds(main, name, group).mean()) for name in others)
+        limit = min(float(_values_of_seeds(main, name, group).mean()) for name in rivals)
         columns.append((values < limit).astype(np.float64))
     return groups, np.stack(columns, axis=1)
 
@@ -78,67 +83,74 @@ def _values_of_seeds(main: ManoeuvreErrors, candidate: str, group: str) -> Float
 def distrust_correlations(outputs: Seeds) -> FloatArray:
     """Rank correlation of a network's deviation with the magnitude of its error."""
 
-    def correlation(own: Outputs) -> float:
-        if np.ptp(own.distrust) == 0:
+    def correlation(manoeuvre: Outputs) -> float:
+        if np.ptp(manoeuvre.distrust) == 0:
             return 0.0
-        return float(stats.spearmanr(own.distrust, np.abs(own.error)).statistic)
+        return float(stats.spearmanr(manoeuvre.distrust, np.abs(manoeuvre.error)).statistic)
 
-    return np.array([[correlation(own) for own in seed] for seed in outputs])
+    return np.array([[correlation(manoeuvre) for manoeuvre in seed] for seed in outputs])
 
 
 def distrust_decades_ratios(first: Seeds, second: Seeds) -> FloatArray:
-    """Decades that the deviation of one network spans over those of another, from the 1st to the 99th percentile."""
+    """Decades that the deviation of one network spans over those of another, from the 1st to the
+    99th percentile.
+    """
     return np.divide(*paired_seeds(_decades(first), _decades(second)))
 
 
 def _decades(outputs: Seeds) -> FloatArray:
     ends = np.array(
-        [[np.percentile(own.distrust, [1.0, 99.0]) for own in seed] for seed in outputs]
+        [[np.percentile(manoeuvre.distrust, [1.0, 99.0]) for manoeuvre in seed] for seed in outputs]
     )
     return np.asarray(np.log10(ends[..., 1] / ends[..., 0]))
 
 
 def yaw_rate_noise_rises(outputs: Seeds) -> FloatArray:
-    """Median process noise of the yaw rate where |β| is at least 5° over that where it is below 1°."""
+    """Median process noise of the yaw rate where |β| ≥ 5° over that where |β| < 1°."""
 
-    def rise(own: Outputs) -> float:
-        angle = np.abs(own.sideslip)
-        return _ratio_of_medians(own, YAW_RATE, angle >= HIGH_SIDESLIP, angle < LOW_SIDESLIP)
+    def rise(manoeuvre: Outputs) -> float:
+        angle = np.abs(manoeuvre.sideslip)
+        return _ratio_of_medians(manoeuvre, YAW_RATE, angle >= HIGH_SIDESLIP, angle < LOW_SIDESLIP)
 
-    return np.array([[rise(own) for own in seed] for seed in outputs])
+    return np.array([[rise(manoeuvre) for manoeuvre in seed] for seed in outputs])
 
 
 def lateral_velocity_noise_rises(outputs: Seeds) -> FloatArray:
-    """Median process noise of the lateral velocity in non-linear driving over that in linear driving."""
+    """Median process noise of the lateral velocity in non-linear driving over that in linear
+    driving.
+    """
     return np.array(
         [
             [
-                _ratio_of_medians(own, LATERAL_VELOCITY, own.nonlinear, ~own.nonlinear)
-                for own in seed
+                _ratio_of_medians(
+                    manoeuvre, LATERAL_VELOCITY, manoeuvre.nonlinear, ~manoeuvre.nonlinear
+                )
+                for manoeuvre in seed
             ]
             for seed in outputs
         ]
     )
 
 
-def _ratio_of_medians(own: Outputs, column: int, above: np.ndarray, below: np.ndarray) -> float:
-    assert own.process is not None
+def _ratio_of_medians(outputs: Outputs, column: int, above: np.ndarray, below: np.ndarray) -> float:
+    assert outputs.process is not None
     if not (above.any() and below.any()):
         return float("nan")
-    noise = own.process[:, column]
+    noise = outputs.process[:, column]
     return float(np.median(noise[above]) / np.median(noise[below]))
 
 
 def stiffness_rise_differences(
-    conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str, other: str
+    conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str, reference: str
 ) -> FloatArray:
-    """Contributions of the manoeuvres to the rise of a candidate's MSE less that of another's [deg²].
+    """Contributions of the manoeuvres to the rise of a candidate's MSE less that of another's
+    [deg²].
 
     Each has its own worst combination of stiffnesses, by the MSE over all manoeuvres.
     """
     return np.subtract(
         *paired_seeds(
-            _worst_rise(conditions, nominal, candidate), _worst_rise(conditions, nominal, other)
+            _worst_rise(conditions, nominal, candidate), _worst_rise(conditions, nominal, reference)
         )
     )
 
@@ -146,26 +158,30 @@ def stiffness_rise_differences(
 def _worst_rise(
     conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str
 ) -> FloatArray:
-    errors = [own.errors(candidate, MSE) for own in (*conditions, nominal)]
+    errors = [condition.errors(candidate, MSE) for condition in (*conditions, nominal)]
     sizes = errors[0].sizes
-    worst = max(errors, key=lambda own: float(own.sums.mean(axis=0).sum()))
+    worst = max(errors, key=lambda condition: float(condition.sums.mean(axis=0).sum()))
     return np.asarray((worst.sums - errors[-1].sums) / sizes.mean())
 
 
 def largest_ratios_over_stiffnesses(
-    conditions: Sequence[ManoeuvreErrors], candidate: str, other: str
+    conditions: Sequence[ManoeuvreErrors], candidate: str, reference: str
 ) -> FloatArray:
-    """MSE of a candidate over that of another in non-linear driving, at the stiffnesses where its geometric mean is largest."""
+    """MSE of a candidate over that of another in non-linear driving, at the stiffnesses where its
+    geometric mean is largest.
+    """
     ratios = []
-    for own in conditions:
-        first, second = (own.errors(name, MSE_NL) for name in (candidate, other))
+    for condition in conditions:
+        first, second = (condition.errors(name, MSE_NL) for name in (candidate, reference))
         with np.errstate(invalid="ignore", divide="ignore"):
             ratios.append(np.divide(*paired_seeds(first.sums, second.sums)))
-    return max(ratios, key=lambda own: float(np.nanmean(np.log(own))))
+    return max(ratios, key=lambda condition: float(np.nanmean(np.log(condition))))
 
 
 def ranks(table: pd.DataFrame, is_straight: bool) -> tuple[list[str], FloatArray]:
-    """Steady turns, or straight drives, and the rank of the observation matrix in each, (1, B), with the paper's measurements."""
+    """Steady turns, or straight drives, and the rank of the observation matrix in each, (1, B),
+    with the paper's measurements.
+    """
     rows = table[
         ((table["steer"] == 0.0) == is_straight) & (table["measured"] == PAPER_MEASUREMENTS)
     ]

@@ -1,4 +1,6 @@
-"""Outputs of the hybrids' networks on the test, their influence on the filters, and oracles that know the test."""
+"""Outputs of the hybrids' networks on the test, their influence on the filters, and oracles that
+know the test.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData
-from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.metrics import Scored
@@ -47,7 +50,8 @@ def hybrid_of(run: Run) -> NetworkUkf:
     fitted = load_model(run.model.model_folder)
     if not isinstance(fitted, NetworkUkf):
         raise DataError(
-            f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter"
+            f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network "
+            "in a filter"
         )
     return fitted
 
@@ -64,35 +68,37 @@ def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
 
 def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     """Outputs of a hybrid's network on each test manoeuvre."""
-    drives = prepared.seen(TEST)
+    drives = prepared.estimator_inputs(TEST)
     spans = prepared.spans(TEST)
-    found = []
-    for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
+    outputs = []
+    for drive, span, measurement in zip(
+        drives, spans, pseudo_measurements_of(run, drives), strict=True
+    ):
         (part,) = run.test[span.recording]
         at = rows_of(part, drive)
-        found.append(
+        outputs.append(
             Outputs(
-                sideslip_error(replace(part, sideslip=own.sideslip[at])),
-                np.degrees(np.sqrt(own.variance[at])),
-                None if own.process is None else np.sqrt(own.process[at]),
+                sideslip_error(replace(part, sideslip=measurement.sideslip[at])),
+                np.degrees(np.sqrt(measurement.variance[at])),
+                None if measurement.process is None else np.sqrt(measurement.process[at]),
                 np.degrees(part.sideslip_ref),
                 is_nonlinear(part),
             )
         )
-    return found
+    return outputs
 
 
 def filtered_with(
     fitted: DugoffUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement] | None
 ) -> list[FloatArray]:
     """β of a filter given these outputs of its network, or none, drive by drive [rad]."""
-    found: dict[int, FloatArray] = {}
+    angles: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
         mean = steps.filtered.mean.numpy()
         for place, row in enumerate(rows):
             vx = drives[row]["vx"]
-            found[row] = np.arctan2(mean[place, : len(vx), 0], vx)
-    return [found[row] for row in range(len(drives))]
+            angles[row] = np.arctan2(mean[place, : len(vx), 0], vx)
+    return [angles[row] for row in range(len(drives))]
 
 
 def filtered_run(
@@ -104,7 +110,7 @@ def filtered_run(
 ) -> Run:
     """A run whose test is filtered anew by a changed filter, given the outputs of its network."""
     assert isinstance(estimator, DugoffUkf)
-    drives = prepared.seen(TEST)
+    drives = prepared.estimator_inputs(TEST)
     test = {}
     for drive, span, sideslip in zip(
         drives, prepared.spans(TEST), filtered_with(estimator, drives, pseudo), strict=True
@@ -115,51 +121,69 @@ def filtered_run(
 
 
 def shift_of(run: Run, prepared: Prepared) -> float:
-    """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over scored samples."""
+    """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over
+    scored samples.
+    """
     fitted = hybrid_of(run)
-    drives = prepared.seen(TEST)
+    drives = prepared.estimator_inputs(TEST)
     spans = prepared.spans(TEST)
     pseudo = fitted.pseudo_measurements(drives)
-    moved = [own._replace(sideslip=own.sideslip + math.radians(1.0)) for own in pseudo]
+    moved = [
+        measurement._replace(sideslip=measurement.sideslip + math.radians(1.0))
+        for measurement in pseudo
+    ]
     shifts = []
-    both = zip(
+    filtered_drives = zip(
         drives,
         spans,
         filtered_with(fitted, drives, pseudo),
         filtered_with(fitted, drives, moved),
         strict=True,
     )
-    for drive, span, before, after in both:
+    for drive, span, before, after in filtered_drives:
         at = rows_of(run.test[span.recording][0], drive)
         shifts.append(float(np.degrees(np.mean((after - before)[at]))))
     return float(np.median(shifts))
 
 
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
-    """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no estimator."""
+    """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no
+    estimator.
+    """
     fitted = hybrid_of(run)
-    drives = prepared.seen(TEST)
+    drives = prepared.estimator_inputs(TEST)
     spans = prepared.spans(TEST)
     pseudo = []
-    for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):
-        whole = prepared.recording(span.dataset, span.recording).cut(
+    for drive, span, measurement in zip(
+        drives, spans, fitted.pseudo_measurements(drives), strict=True
+    ):
+        recording = prepared.recording(span.dataset, span.recording).cut(
             drive.start_time, drive.start_time + len(drive) / drive.rate_hz
         )
-        error = own.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
-        pseudo.append(own._replace(variance=fitted.least_variance + np.square(error)))
+        error = (
+            measurement.sideslip - np.arctan2(recording["vy_ref"], recording["vx"])[: len(drive)]
+        )
+        pseudo.append(measurement._replace(variance=fitted.least_variance + np.square(error)))
     return filtered_run(fitted, run, prepared, pseudo, candidate)
 
 
 def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its runs: a filter whose tyres and free noise are identified on the test; CNN-UKF with a perfect distrust."""
-    found: dict[str, list[Run]] = {}
+    """Runs of the candidates that have access to the test.
+
+    Returns
+    -------
+    dict
+        `paper.ORACLE_FILTER`: tyres and free noise are identified on the test.
+        `paper.ORACLE_DISTRUST`: CNN-UKF with the variance of the network's true error.
+    """
+    oracle_runs: dict[str, list[Run]] = {}
     if paper.FREE in runs:
-        found[paper.ORACLE_FILTER] = [_fitted_to_the_test(runs[paper.FREE][0], prepared)]
+        oracle_runs[paper.ORACLE_FILTER] = [_fitted_to_the_test(runs[paper.FREE][0], prepared)]
     if paper.CNN in runs:
-        found[paper.ORACLE_DISTRUST] = [
+        oracle_runs[paper.ORACLE_DISTRUST] = [
             with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]
         ]
-    return found
+    return oracle_runs
 
 
 def _fitted_to_the_test(run: Run, prepared: Prepared) -> Run:

@@ -1,4 +1,6 @@
-"""Section III-B: whether the filter's model is observable, and whether it is not where the wheels point straight ahead."""
+"""Section III-B: whether the filter's model is observable, and whether it is not where the wheels
+point straight ahead.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,6 @@ import torch
 from torch import Tensor
 
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
-from vehest.report.document import Column, Table
 from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)
@@ -22,7 +23,9 @@ PAPER_MEASUREMENTS = "ay, yaw rate, both forces"
 
 
 def local(estimator: DugoffUkf) -> pd.DataFrame:
-    """Observability of the model in steady turns, a row a speed [m/s], steering angle [deg] and set of measurements."""
+    """Observability of the model in steady turns, a row a speed [m/s], steering angle [deg] and set
+    of measurements.
+    """
     track = estimator.track()
     levels = np.array([estimator.levels[name] for name in SENSORS[estimator.settings.inputs]])
     rows = []
@@ -35,14 +38,14 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
             if not 0.0 <= abs(float(state[0])) < 0.2 * speed:
                 continue  # no steady turn: beyond what the tyres can do
             states, driven = (
-                np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs)
+                np.repeat(tensor.numpy()[None], WINDOW, axis=0) for tensor in (state, inputs)
             )
             for words, n in ((PAPER_MEASUREMENTS, 4), ("ay, yaw rate", 2)):
 
                 def observed(states: Tensor, inputs: Tensor, n: int = n) -> Tensor:
                     return track.observation(states, inputs)[..., :n]
 
-                found = {
+                by_steps = {
                     steps: observability_along(
                         track.transition,
                         observed,
@@ -59,20 +62,8 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
                         "speed": speed,
                         "steer": angle,
                         "measured": words,
-                        "rank": int(found[2].rank[0]),
-                        "deviation": float(found[WINDOW].deviation[0, 0]) * float(SIZES[0]),
+                        "rank": int(by_steps[2].rank[0]),
+                        "deviation": float(by_steps[WINDOW].deviation[0, 0]) * float(SIZES[0]),
                     }
                 )
     return pd.DataFrame(rows)
-
-
-def observability_table(found: pd.DataFrame) -> Table:
-    """`local` as it is shown."""
-    columns = {
-        "speed": Column("speed [m/s]", decimals=0),
-        "steer": Column("steering angle [deg]", decimals=1),
-        "measured": Column("measured"),
-        "rank": Column("rank", decimals=0),
-        "deviation": Column("deviation of V_y from 10 samples [m/s]", decimals=4),
-    }
-    return Table("observability", "Local observability in steady turns", found, columns)

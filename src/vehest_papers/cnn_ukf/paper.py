@@ -11,8 +11,11 @@ DEEP = "DE-UKF"
 CNN = "CNN-UKF"
 SMOOTH = "Model-based, smooth tyres"  # not in the paper: the filter of the CNN-UKF alone
 FREE = "Model-based, free noise"
-"""Not in the paper: the same filter, whose process noise may be as large as serves it best, far beyond the paper's."""
-CNN_FREE = "CNN-UKF, free noise"  # not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise
+"""Not in the paper: the same filter, whose process noise may be as large as serves it best, far
+beyond the paper's.
+"""
+# not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise
+CNN_FREE = "CNN-UKF, free noise"
 BEFORE = "CNN-UKF before training through the filter"
 Z_SCORES = "Data-driven, z-scores"
 CNN_Z_SCORES = "CNN-UKF, z-scores"
@@ -91,7 +94,9 @@ LEVELS: Mapping[str, float] = {
     "fy_front": 26.0,
     "fy_rear": 56.0,
 }
-"""Deviations of a step's process noise [m/s, rad/s] and of the sensors [m/s², rad/s, N, N] (Sections III-B and III-C)."""
+"""Deviations of a step's process noise [m/s, rad/s] and of the sensors [m/s², rad/s, N, N]
+(Sections III-B and III-C).
+"""
 
 
 BATCH = 256  # of both phases of the CNN-UKF's training (Section III-C)

@@ -1,4 +1,6 @@
-"""Figure 14 and beyond: what becomes of the errors where filters take the car, or its tyres, for others than they are."""
+"""Figure 14 and beyond: what becomes of the errors where filters take the car, or its tyres, for
+others than they are.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -15,11 +18,11 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import finite_cost, optuna_search
@@ -56,13 +59,14 @@ class Perturbed:
 
     stiffness: Sequence[Runs]  # of each of `COMBINATIONS` the runs of each candidate
     bodies: Mapping[str, Runs]  # of each of `BODIES` likewise
-    tuned: Sequence[
-        Run
-    ]  # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none
+    # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation, or empty
+    tuned: Sequence[Run]
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
-    """A copy of a filter whose cornering stiffnesses are off by shares of their values; raises `DataError` where it has none."""
+    """A copy of a filter whose cornering stiffnesses are off by shares of their values; raises
+    `DataError` where it has none.
+    """
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:
@@ -72,7 +76,9 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
 
 
 def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
-    """A copy of a filter that takes mass and yaw inertia for so many times what they are; its tyres stay as found; raises `DataError`."""
+    """A copy of a filter that takes mass and yaw inertia for so many times what they are; its tyres
+    stay as found; raises `DataError`.
+    """
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:
@@ -86,16 +92,20 @@ def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
 
 
 def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) -> EnsembleUkf:
-    """A copy of a DE-UKF whose p₁ and p₂ (Eq. 11) suit its filter as it is now, by the rule of its training."""
+    """A copy of a DE-UKF whose p₁ and p₂ (Eq. 11) suit its filter as it is now, by the rule of its
+    training.
+    """
     changed = copy.deepcopy(fitted)
     changed.scaling = np.array([0.0, 1.0])
     pseudo = changed.pseudo_measurements(recordings)
-    least = changed.least_variance
+    floor = changed.least_variance
 
     def cost(powers: FloatArray) -> float:
         scaled = [
-            own._replace(variance=scaled_variance(own.variance - least, powers, least))
-            for own in pseudo
+            measurement._replace(
+                variance=scaled_variance(measurement.variance - floor, powers, floor)
+            )
+            for measurement in pseudo
         ]
         return finite_cost(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
 
@@ -106,13 +116,15 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
 
 def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
-    """The filters of the study, all seeds, under all perturbations; p₁ and p₂ alone are tuned anew, of the seed that validation chooses."""
-    own = {candidate: runs[candidate] for candidate in WITH_FILTER if candidate in runs}
+    """The filters of the study, all seeds, under all perturbations; p₁ and p₂ alone are tuned anew,
+    of the seed that validation chooses.
+    """
+    filters = {candidate: runs[candidate] for candidate in WITH_FILTER if candidate in runs}
     fitted = {
         candidate: [load_model(run.model.model_folder) for run in seeds]
-        for candidate, seeds in own.items()
+        for candidate, seeds in filters.items()
     }
-    drives = prepared.seen(TEST)
+    drives = prepared.estimator_inputs(TEST)
     pseudo = {
         candidate: [_network_outputs(model, drives) for model in models]
         for candidate, models in fitted.items()
@@ -123,26 +135,24 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
             candidate: [
                 filtered_run(change(model), run, prepared, outputs)
                 for run, model, outputs in zip(
-                    own[candidate], fitted[candidate], pseudo[candidate], strict=True
+                    filters[candidate], fitted[candidate], pseudo[candidate], strict=True
                 )
             ]
-            for candidate in own
+            for candidate in filters
         }
 
     stiffness = [
-        dict(own)
-        if axles == (0.0, 0.0)
-        else changed(lambda model, axles=axles: with_stiffness(model, *axles))  # type: ignore[misc]
-        for axles in COMBINATIONS
+        changed(partial(with_stiffness, front=front, rear=rear)) if front or rear else dict(filters)
+        for front, rear in COMBINATIONS
     ]
     bodies = {
-        words: changed(lambda model, factors=factors: with_body(model, *factors))  # type: ignore[misc]
-        for words, factors in BODIES.items()
+        name: changed(partial(with_body, mass=mass, inertia=inertia))
+        for name, (mass, inertia) in BODIES.items()
     }
     tuned = []
     judged = prepared.ranges(VALIDATION)
-    for run in [chosen(own[paper.DEEP])] if paper.DEEP in own else []:
-        model = fitted[paper.DEEP][own[paper.DEEP].index(run)]
+    for run in [chosen(filters[paper.DEEP])] if paper.DEEP in filters else []:
+        model = fitted[paper.DEEP][filters[paper.DEEP].index(run)]
         assert isinstance(model, EnsembleUkf)
         softer = with_stiffness(model, *COMBINATIONS[SOFTEST])
         assert isinstance(softer, EnsembleUkf)
@@ -153,25 +163,27 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
 def _network_outputs(
     fitted: Estimator, drives: Sequence[Recording]
 ) -> list[PseudoMeasurement] | None:
-    """What a hybrid's network adds to the measurements, which no perturbation of the filter changes; none of a filter alone."""
+    """What a hybrid's network adds to the measurements, which no perturbation of the filter
+    changes; none of a filter alone.
+    """
     return fitted.pseudo_measurements(drives) if isinstance(fitted, NetworkUkf) else None
 
 
-def figure_14(found: Perturbed, data: str) -> Figure:
+def figure_14(results: Perturbed, data: str) -> Figure:
     """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
-    comparisons = [ManoeuvreErrors(runs) for runs in found.stiffness]
+    comparisons = [ManoeuvreErrors(runs) for runs in results.stiffness]
     with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         panels = figure.subplots(1, 2)
         for axes, indicator, label in zip(
             panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True
         ):
-            for candidate in found.stiffness[NOMINAL]:
+            for candidate in results.stiffness[NOMINAL]:
                 line = line_of(candidate)
-                figures = [own.figure(candidate, indicator) for own in comparisons]
+                figures = [entry.figure(candidate, indicator) for entry in comparisons]
                 at = np.arange(len(COMBINATIONS))
-                low, high = np.array([(own.low, own.high) for own in figures]).T
+                low, high = np.array([(entry.low, entry.high) for entry in figures]).T
                 axes.fill_between(at, low, high, color=line.colour, alpha=0.1, linewidth=0)
-                values = [own.value for own in figures]
+                values = [entry.value for entry in figures]
                 axes.plot(
                     at,
                     values,
@@ -188,44 +200,45 @@ def figure_14(found: Perturbed, data: str) -> Figure:
             axes.set_ylabel(label)
             axes.set_yscale("log")
         legend_above(figure, panels[0], columns=5)
-    caption = f"Errors with cornering stiffnesses of the filters off by 10 % (Figure 14 of the paper). Data: {data}."
+    caption = (
+        "Errors with cornering stiffnesses of the filters off by 10 % (Figure 14 of the paper). "
+        f"Data: {data}."
+    )
     return Figure("figure_14", caption, figure)
 
 
-def perturbed_table(found: Perturbed, data: str) -> Table:
+def by_condition(results: Perturbed) -> pd.DataFrame:
     """MSE_nl of every filter as it is and under every perturbation, with intervals."""
-    conditions: dict[str, Runs] = {"as identified": found.stiffness[NOMINAL]}
+    conditions: dict[str, Runs] = {"as identified": results.stiffness[NOMINAL]}
     conditions |= {
-        f"stiffness {words}": own
-        for words, own in zip(LABELS, found.stiffness, strict=True)
-        if own is not found.stiffness[NOMINAL]
+        f"stiffness {label}": runs
+        for label, runs in zip(LABELS, results.stiffness, strict=True)
+        if runs is not results.stiffness[NOMINAL]
     }
-    conditions |= found.bodies
-    if found.tuned:
-        conditions[f"stiffness {LABELS[SOFTEST]}, p₁ and p₂ tuned anew"] = {paper.DEEP: found.tuned}
+    conditions |= results.bodies
+    if results.tuned:
+        conditions[f"stiffness {LABELS[SOFTEST]}, p₁ and p₂ tuned anew"] = {
+            paper.DEEP: results.tuned
+        }
     rows: list[dict[str, object]] = []
     for words, runs in conditions.items():
-        own = ManoeuvreErrors(runs)
+        comparison = ManoeuvreErrors(runs)
         rows.append(
             {
                 "condition": words,
-                **{candidate: own.text(candidate, MSE_NL) for candidate in runs},
+                **{candidate: comparison.text(candidate, MSE_NL) for candidate in runs},
             }
         )
-    columns = {"condition": Column("the filter takes")} | {
-        candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]
-    }
-    caption = f"MSE_nl [deg²] with wrong tyres or body. Data: {data}."
-    return Table("perturbed", caption, pd.DataFrame(rows).fillna("–"), columns)
+    return pd.DataFrame(rows).fillna("–")
 
 
-def values(found: Perturbed) -> pd.DataFrame:
-    """MSE and MSE_nl of every run with every combination; columns: candidate, seed, front, rear, mse, mse_nonlinear."""
+def values(results: Perturbed) -> pd.DataFrame:
+    """MSE and MSE_nl of every run with every combination of stiffnesses, a row each."""
     return pd.DataFrame(
         [
             {"candidate": candidate, "seed": run.model.seed, "front": front, "rear": rear}
             | {"mse": run.kpis.mse, "mse_nonlinear": run.kpis.mse_nonlinear}
-            for (front, rear), runs in zip(COMBINATIONS, found.stiffness, strict=True)
+            for (front, rear), runs in zip(COMBINATIONS, results.stiffness, strict=True)
             for candidate, seeds in runs.items()
             for run in seeds
         ]

@@ -1,4 +1,6 @@
-"""What the study looks at: trainings, what they make of each manoeuvre, and manoeuvres as the paper prepares them."""
+"""What the study looks at: trainings, what they make of each manoeuvre, and manoeuvres as the paper
+prepares them.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from vehest_papers.kit.reading import models_by_candidate, sideslip_error
 
 TEST = "test"
 CUTOFF_HZ = 5.0
-LARGEST_SIDESLIP = 0.21  # rad, 12°: beyond it no drive of the paper goes
+MAX_PAPER_SIDESLIP = 0.21  # rad, 12°: beyond it no drive of the paper goes
 OFFLINE = (
     RemoveOutliers(),
     LowPass(CUTOFF_HZ, design="fir"),
@@ -126,7 +128,9 @@ Runs = Mapping[str, Sequence[Run]]  # candidate -> its seeds
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named; raises `DataError`."""
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs
+    z-scores are named; raises `DataError`.
+    """
     if model.estimator == "cnn_ukf":
         away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
         if away:
@@ -134,7 +138,8 @@ def candidate_of(model: EvaluatedModel) -> str:
     name = model.estimator, model.variant.endswith("_smooth")
     if name not in _NAMES:
         raise DataError(
-            f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study"
+            f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; "
+            "give it a part of its own study"
         )
     return _NAMES[name]
 
@@ -145,31 +150,41 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its seeds, in the order of Table II; raises `DataError` for two of one seed, other models, or several test ranges."""
+    """Candidate -> its seeds, in the order of Table II.
+
+    Raises
+    ------
+    DataError
+        Two models of a candidate have one seed, a model is none of the paper's methods, or a
+        recording has several test ranges.
+    """
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
         raise DataError(
-            f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split"
+            f"study '{part.study}': a recording of the test set has several ranges, but a "
+            "manoeuvre is one; correct the split"
         )
     groups = models_by_candidate(part, candidate_of, paper.CANDIDATES)
     return {
         name: [
             Run(
                 name,
-                own,
+                model,
                 *(
-                    manoeuvres_of(prepared.spans(test), prepared.scored(own, test))
+                    manoeuvres_of(prepared.spans(test), prepared.scored(model, test))
                     for test in (VALIDATION, TEST)
                 ),
             )
-            for own in models
+            for model in models
         ]
         for name, models in groups.items()
     }
 
 
 def chosen(runs: Sequence[Run]) -> Run:
-    """The seed with the lowest mean RMSE of a validation manoeuvre, which no single one decides. Test manoeuvres choose nothing."""
+    """The seed with the lowest mean RMSE of a validation manoeuvre, which no single one decides.
+    Test manoeuvres choose nothing.
+    """
     return min(runs, key=lambda run: balanced(run.validation))
 
 
@@ -183,7 +198,9 @@ def balanced(manoeuvres: Manoeuvres) -> float:
 
 
 def kpi_table(runs: Runs) -> pd.DataFrame:
-    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse`` [deg²], ``validation_balanced`` [deg]; a row a run."""
+    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse`` [deg²],
+    ``validation_balanced`` [deg]; a row a run.
+    """
     rows = [
         {"candidate": candidate, "seed": run.model.seed}
         | {name: getattr(run.kpis, name) for name in KPIS}
@@ -191,24 +208,28 @@ def kpi_table(runs: Runs) -> pd.DataFrame:
             "validation_mse": kpis(run.validation).mse,
             "validation_balanced": balanced(run.validation),
         }
-        for candidate, own in runs.items()
-        for run in own
+        for candidate, seeds in runs.items()
+        for run in seeds
     ]
     return pd.DataFrame(rows)
 
 
 def until(part: Scored, sideslip: float) -> Scored:
-    """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least; errors alone."""
-    beyond = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
-    last = max(int(beyond[0]), 1) if len(beyond) else len(part.time)
+    """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one
+    sample at least; errors alone.
+    """
+    exceeding = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
+    last = max(int(exceeding[0]), 1) if len(exceeding) else len(part.time)
     return part.at(slice(last))
 
 
 class Prepared:
-    """Recordings of a part as the paper prepares them, at the evaluation rate; what they were scored against here.
+    """Recordings of a part as the paper prepares them, at the evaluation rate; what they were
+    scored against here.
 
-    The evaluation scores against the reference as it was measured. The paper's is low-passed as the measurements are, and whether a
-    sample counts as non-linear is a matter of the low-passed lateral acceleration.
+    The evaluation scores against the reference as it was measured. The paper's is low-passed as the
+    measurements are, and whether a sample counts as non-linear is a matter of the low-passed
+    lateral acceleration.
 
     Parameters
     ----------
@@ -243,8 +264,10 @@ class Prepared:
             self._read[path] = prepared
         return self._read[path]
 
-    def seen(self, test: str) -> list[Recording]:
-        """What an estimator saw of each range of a test set, if it was prepared offline: with its warm-up, without references."""
+    def estimator_inputs(self, test: str) -> list[Recording]:
+        """What an estimator saw of each range of a test set, if it was prepared offline: with its
+        warm-up, without references.
+        """
         return [
             self.recording(span.dataset, span.recording)
             .cut(span.start - self._part.protocol.warm_up_seconds, span.stop)
@@ -262,7 +285,7 @@ class Prepared:
 
     def estimated_by(self, estimator: Estimator, run: Run, candidate: str = "") -> Run:
         """A run whose test is estimated anew by a changed estimator."""
-        parts = self.score(estimator.estimate(self.seen(TEST)), TEST)
+        parts = self.score(estimator.estimate(self.estimator_inputs(TEST)), TEST)
         return Run(
             candidate or run.candidate,
             run.model,
@@ -288,7 +311,9 @@ class Prepared:
         return [until(part, self._until_sideslip) for part in parts]
 
     def with_covariances(self, model: EvaluatedModel, test: str) -> Iterator[Scored]:
-        """Whole ranges of a test set with the covariances of the estimates, one in memory at a time."""
+        """Whole ranges of a test set with the covariances of the estimates, one in memory at a
+        time.
+        """
         protocol = self._part.protocol
         pieces = pieces_of(
             self.spans(test), lambda span: self.recording(span.dataset, span.recording), protocol

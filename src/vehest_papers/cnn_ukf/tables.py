@@ -1,4 +1,6 @@
-"""Tables II and III of the paper beside ours, what hybrids are made of and what is active in them, their filters, and the budget."""
+"""Tables II and III of the paper beside ours, what hybrids are made of and what is active in them,
+their filters, and the budget.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from vehest.estimators.dugoff_ukf import LEVELS, SENSORS, TYRES
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
 from vehest.report.document import Column, Table
-from vehest.report.style import MISSING, fixed, significant
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.block_errors import network_squares
@@ -41,15 +43,6 @@ OutputsOf = Mapping[
 ]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 PROCESS = ("process_vy", "process_yaw_rate")
-LEVEL_HEADERS = {
-    "process_vy": "σ_Vy [m/s]",
-    "process_yaw_rate": "σ_ψ̇ [rad/s]",
-    "ay": "σ_ay [m/s²]",
-    "yaw_rate": "σ of the gyroscope [rad/s]",
-    "fy_front": "σ_Fyf [N]",
-    "fy_rear": "σ_Fyr [N]",
-    "force_factor": "factor of forces, linear",
-}
 
 
 def accuracy(
@@ -58,31 +51,31 @@ def accuracy(
     training: Mapping[str, float],
     name: str,
     caption: str,
-    shown: Sequence[str] = (MSE, MSE_NL),
+    indicators: Sequence[str] = (MSE, MSE_NL),
 ) -> Table:
     """Table II or III: our figures with their intervals, the paper's in brackets.
 
     The CSV file has all indicators, and errors of validation and of training [deg].
     """
     rows = []
-    for candidate, own in comparison.runs.items():
-        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}
+    for candidate, seeds in comparison.runs.items():
+        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(seeds)}
         for kpi in KPIS:
-            known = getattr(published[candidate], kpi) if candidate in published else math.nan
-            row[f"paper_{kpi}"] = known
+            stated = getattr(published[candidate], kpi) if candidate in published else math.nan
+            row[f"paper_{kpi}"] = stated
             row[f"ours_{kpi}"] = comparison.text(candidate, kpi)
             row[kpi] = (
                 row[f"ours_{kpi}"]
-                if math.isnan(known)
-                else f"{row[f'ours_{kpi}']} ({fixed(known, 3)})"
+                if math.isnan(stated)
+                else f"{row[f'ours_{kpi}']} ({fixed(stated, 3)})"
             )
-        judged = [balanced(run.validation) for run in own]
+        judged = [balanced(run.validation) for run in seeds]
         row["validation"] = (
             fixed(float(np.median(judged)), 3) if candidate not in ORACLES else MISSING
         )
         row["training"] = fixed(training[candidate], 3) if candidate in training else MISSING
         rows.append(row)
-    columns = {"candidate": Column("method")} | {kpi: Column(KPIS[kpi]) for kpi in shown}
+    columns = {"candidate": Column("method")} | {kpi: Column(KPIS[kpi]) for kpi in indicators}
     columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
@@ -123,22 +116,24 @@ def by_car(comparison: ManoeuvreErrors, candidates: Sequence[str], data: str) ->
 
 
 def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, data: str) -> Table:
-    """Hybrids, and CNN-UKF with one element removed: errors, how CNN-UKF stands to each, and which parts are active."""
+    """Hybrids, and CNN-UKF with one element removed: errors, how CNN-UKF stands to each, and which
+    parts are active.
+    """
     rows = []
     for row in active.to_dict("records"):
         candidate = row["candidate"]
-        own: dict[str, object] = {
+        cells: dict[str, object] = {
             "candidate": candidate,
             "n_seeds": len(comparison.runs[candidate]),
         }
         for kpi in ("mse", "mse_nonlinear"):
-            own[kpi] = comparison.text(candidate, kpi)
-            own[f"ratio_{kpi}"] = (
+            cells[kpi] = comparison.text(candidate, kpi)
+            cells[f"ratio_{kpi}"] = (
                 figure_in_words(comparison.ratio(paper.CNN, candidate, kpi))
                 if candidate != paper.CNN and paper.CNN in comparison
                 else MISSING
             )
-        rows.append({**own, **{str(key): value for key, value in row.items()}})
+        rows.append({**cells, **{str(key): value for key, value in row.items()}})
     columns = {
         "candidate": Column("method"),
         "mse_nonlinear": Column("MSE_nl [deg²]"),
@@ -158,12 +153,14 @@ def activity(outputs: OutputsOf, shifts: Mapping[str, Sequence[float]]) -> pd.Da
     """
     rows = []
     for name, seeds in outputs.items():
-        of_all = [own for seed in seeds for own in seed]
+        of_all = [manoeuvre for seed in seeds for manoeuvre in seed]
         row: dict[str, object] = {"candidate": name, "shift": float(np.median(shifts[name]))}
         row["shift_range"] = f"{fixed(min(shifts[name]), 2)} … {fixed(max(shifts[name]), 2)}"
-        row["distrust"] = _quantiles([own.distrust for own in of_all])
+        row["distrust"] = _quantiles([manoeuvre.distrust for manoeuvre in of_all])
         for column, place in (("process_vy", LATERAL_VELOCITY), ("process_yaw_rate", YAW_RATE)):
-            noise = [own.process[:, place] for own in of_all if own.process is not None]
+            noise = [
+                manoeuvre.process[:, place] for manoeuvre in of_all if manoeuvre.process is not None
+            ]
             row[column] = _quantiles(noise) if len(noise) == len(of_all) else "the filter's"
         rows.append(row)
     return pd.DataFrame(rows)
@@ -174,40 +171,44 @@ def _quantiles(parts: Sequence[FloatArray]) -> str:
     return " / ".join(f"{value:.2g}" for value in np.percentile(values, [5, 50, 95]))
 
 
-def networks_alone(
-    comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str
-) -> Table:
-    """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
+def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf) -> pd.DataFrame:
+    """Errors of the hybrids' networks and of their filters, and the networks' deviations.
+
+    Returns
+    -------
+    DataFrame
+        ``candidate``; ``network`` and ``filter``, MSE with its interval [deg²]; ``rms`` of the
+        network's error and median ``sigma`` [deg] in non-linear driving.
+    """
     rows = []
     for candidate, seeds in outputs.items():
         squares, sizes = network_squares(seeds)
         names = tuple(str(seed) for seed in comparison.seeds(candidate))
         errors = BlockErrors(names, comparison.manoeuvres, squares, sizes)
-        every = [own for seed in seeds for own in seed]
-        beyond = np.concatenate([own.nonlinear for own in every])
-        error = np.concatenate([own.error for own in every])
-        distrust = np.concatenate([own.distrust for own in every])
+        manoeuvres = [manoeuvre for seed in seeds for manoeuvre in seed]
+        is_nonlinear = np.concatenate([manoeuvre.nonlinear for manoeuvre in manoeuvres])
+        error = np.concatenate([manoeuvre.error for manoeuvre in manoeuvres])
+        distrust = np.concatenate([manoeuvre.distrust for manoeuvre in manoeuvres])
         rows.append(
             {
                 "candidate": candidate,
                 "network": figure_in_words(value_of(errors, "mse")[1]),
                 "filter": comparison.text(candidate, "mse"),
-                "rms": float(np.sqrt(np.mean(np.square(error[beyond])))),
-                "sigma": float(np.median(distrust[beyond])),
+                "rms": float(np.sqrt(np.mean(np.square(error[is_nonlinear])))),
+                "sigma": float(np.median(distrust[is_nonlinear])),
             }
         )
-    columns = {
-        "candidate": Column("method"),
-        "network": Column("MSE of β_DD [deg²]"),
-        "filter": Column("MSE of β [deg²]"),
-        "rms": Column("RMS of β_DD's error from 4 m/s² on [deg]", decimals=3),
-        "sigma": Column("median σ_DD there [deg]", decimals=3),
-    }
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: title and runs."""
+def filters(parts: Sequence[tuple[str, Runs]]) -> pd.DataFrame:
+    """Tyres and levels of noise of the filters, a row for each seed, after those of the paper.
+
+    Parameters
+    ----------
+    parts
+        Title and runs of each part.
+    """
     rows: list[dict[str, object]] = [
         {
             "part": "paper (real)",
@@ -217,8 +218,8 @@ def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
         }
     ]
     for title, runs in parts:
-        for candidate, own in runs.items():
-            for run in own:
+        for candidate, seeds in runs.items():
+            for run in seeds:
                 of_filter = filter_of(load_model(run.model.model_folder))
                 if of_filter is not None:
                     row: dict[str, object] = {
@@ -230,25 +231,10 @@ def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
                     rows.append(
                         row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS}
                     )
-    for row in rows:
-        row |= {f"shown_{level}": significant(float(row[level])) for level in LEVELS}  # type: ignore[arg-type]
-    columns = {
-        "part": Column("part"),
-        "candidate": Column("method"),
-        "seed": Column("seed", decimals=0),
-    }
-    for axle in ("front", "rear"):
-        columns |= {
-            f"cornering_stiffness_{axle}": Column(f"C, {axle} [N/rad]", decimals=0),
-            f"friction_{axle}": Column(f"μ₀, {axle}", decimals=3),
-            f"reduction_{axle}": Column(f"e_r, {axle} [s/m]", decimals=4),
-        }
-    columns |= {f"shown_{level}": Column(header) for level, header in LEVEL_HEADERS.items()}
-    caption = f"Tyres and levels of noise of the filters. Data: {data}."
-    return Table("filters", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
+def scaling(parts: Mapping[str, tuple[str, Runs]]) -> pd.DataFrame:
     """p₁ and p₂ of Eq. 11 of each set."""
     rows = []
     for part, (title, runs) in parts.items():
@@ -256,61 +242,47 @@ def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
             fitted = load_model(run.model.model_folder)
             assert isinstance(fitted, EnsembleUkf)
             p1, p2 = fitted.scaling.tolist()
-            known = paper.SCALING.get(part, (math.nan, math.nan))
+            stated = paper.SCALING.get(part, (math.nan, math.nan))
             rows.append(
                 {
                     "part": title,
                     "seed": run.model.seed,
-                    "paper_p1": known[0],
+                    "paper_p1": stated[0],
                     "p1": p1,
-                    "paper_p2": known[1],
+                    "paper_p2": stated[1],
                     "p2": p2,
                 }
             )
-    columns = {"part": Column("part"), "seed": Column("seed")}
-    columns |= {"paper_p1": Column("p₁, paper", decimals=3), "p1": Column("p₁, ours", decimals=3)}
-    columns |= {"paper_p2": Column("p₂, paper", decimals=3), "p2": Column("p₂, ours", decimals=3)}
-    caption = f"Scaling of the ensemble's variance (Eq. 11) in rad². Data: {data}."
-    return Table("scaling", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
-def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table:
+def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]]) -> pd.DataFrame:
     """Seeds, epochs and parameters, by part and candidate."""
     rows = []
     for title, part, runs in parts:
-        known = metric_values(part)
-        for candidate, own in runs.items():
-            fits = [run.model.fit_metrics() for run in own]
-            keys = [(run.model.estimator, run.model.variant, run.model.seed, TEST) for run in own]
+        metrics = metric_values(part)
+        for candidate, seeds in runs.items():
+            fits = [run.model.fit_metrics() for run in seeds]
+            keys = [(run.model.estimator, run.model.variant, run.model.seed, TEST) for run in seeds]
             rows.append(
                 {
                     "part": title,
                     "candidate": candidate,
-                    "n_seeds": len(own),
-                    "epochs": _epochs(own),
+                    "n_seeds": len(seeds),
+                    "epochs": _epochs(seeds),
                     "lost": sum(
                         fit.get("lost_sequences", 0.0) + fit.get("skipped_steps", 0.0)
                         for fit in fits
                     ),
-                    "n_parameters": known.get((*keys[0], "n_parameters"), math.nan),
+                    "n_parameters": metrics.get((*keys[0], "n_parameters"), math.nan),
                 }
             )
-    columns = {
-        "part": Column("part"),
-        "candidate": Column("method"),
-        "n_seeds": Column("seeds", decimals=0),
-        "epochs": Column("epochs of each seed, best in brackets"),
-        "lost": Column("lost sequences and skipped steps", decimals=0),
-        "n_parameters": Column("parameters", decimals=0),
-    }
-    return Table(
-        "budget", f"What was spent: seeds and epochs. Data: {data}.", pd.DataFrame(rows), columns
-    )
+    return pd.DataFrame(rows)
 
 
 def _epochs(runs: Sequence[Run]) -> str:
-    """``22 + 45 (15)``: epochs of each phase, and the best of the last one; a seed after the other."""
-    shown = []
+    """``22 + 45 (15)``: epochs of each phase, and the best of the last one, for each seed."""
+    texts = []
     for run in runs:
         history = run.model.history()
         if history is None or "epoch" not in history:
@@ -321,14 +293,16 @@ def _epochs(runs: Sequence[Run]) -> str:
             else [str(len(history))]
         )
         best = run.model.fit_metrics().get("best_epoch", math.nan)
-        shown.append(f"{' + '.join(counts)} ({fixed(best, 0)})")
-    return "; ".join(shown) or MISSING
+        texts.append(f"{' + '.join(counts)} ({fixed(best, 0)})")
+    return "; ".join(texts) or MISSING
 
 
 def difference_of_tyres(full: Runs) -> float:
-    """Largest difference between the hybrids' tyres and sensor levels, which the pipeline gives, and those of the filters of the full part [%].
+    """Largest difference between the hybrids' tyres and sensor levels, which the pipeline gives,
+    and those of the filters of the full part [%].
 
-    Stiffness, friction and levels count by their relative difference, the reductions as they are; NaN without a hybrid or its filter.
+    Stiffness, friction and levels count by their relative difference, the reductions as they are;
+    NaN without a hybrid or its filter.
     """
     differences = []
     for candidate, source in ((paper.DEEP, paper.MODEL), (paper.CNN, paper.SMOOTH)):
@@ -339,11 +313,11 @@ def difference_of_tyres(full: Runs) -> float:
         for run in full[candidate]:
             declared = filter_of(load_model(run.model.model_folder))
             assert declared is not None
-            for name, there, here in zip(
+            for name, identified_value, declared_value in zip(
                 TYRES, identified.axle_tyres, declared.axle_tyres, strict=True
             ):
-                scale = 1.0 if name.startswith("reduction") else there
-                differences.append(abs(here - there) / scale)
+                scale = 1.0 if name.startswith("reduction") else identified_value
+                differences.append(abs(declared_value - identified_value) / scale)
             differences += [
                 abs(declared.levels[level] / identified.levels[level] - 1.0)
                 for level in SENSORS["full"]
@@ -352,7 +326,7 @@ def difference_of_tyres(full: Runs) -> float:
 
 
 def process_levels(run: Run) -> FloatArray:
-    """Deviations of a step's process noise of a filter where they are constant, (2,) [m/s, rad/s]."""
+    """Constant deviations of a filter's process noise of a step, (2,) [m/s, rad/s]."""
     of_filter = filter_of(load_model(run.model.model_folder))
     assert of_filter is not None
     return np.array([of_filter.levels[level] for level in PROCESS])

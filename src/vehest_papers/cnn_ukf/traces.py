@@ -1,4 +1,6 @@
-"""Figures 7 to 10, 12 and 13: single manoeuvres, as estimated, with the outputs of the hybrids' networks."""
+"""Figures 7 to 10, 12 and 13: single manoeuvres, as estimated, with the outputs of the hybrids'
+networks.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
+from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, new_figure
@@ -28,7 +30,9 @@ LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
 def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
-    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin; raises `DataError`."""
+    """The test manoeuvre of a group with the largest sideslip angle among those in which the car
+    did not spin; raises `DataError`.
+    """
     peaks = {}
     for span in part.split.tests[TEST]:
         drive = prepared.recording(span.dataset, span.recording)
@@ -42,7 +46,7 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     return max(peaks, key=peaks.__getitem__)
 
 
-def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: str) -> Figure:
+def compared(runs: Mapping[str, Run], span: Span, number: int, subject: str, data: str) -> Figure:
     """Reference and all estimates of one manoeuvre."""
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with new_figure(DOUBLE_COLUMN, 3.9) as figure:
@@ -62,7 +66,7 @@ def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: 
         for axes in (upper, lower):
             axes.margins(x=0.0)
         legend_above(figure, upper, columns=4)
-    caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}."
+    caption = f"{subject} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}."
     return Figure(f"figure_{number}", caption, figure)
 
 
@@ -74,9 +78,11 @@ def inner_life(
     constant: FloatArray,
     data: str,
 ) -> Figure:
-    """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
+    """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the
+    process noise, distrust (Figure 8).
 
-    ``constant``, (2,), are deviations of the filter's process noise where no network gives them; ``warm_up`` [s] is of the estimates.
+    ``constant``, (2,), are deviations of the filter's process noise where no network gives them;
+    ``warm_up`` [s] is of the estimates.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if candidate in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
@@ -165,11 +171,13 @@ def angles_of_networks(
 def lap(
     runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str
 ) -> Figure:
-    """Figure 10: the stretch of a lap with the largest mean |ay|: angles, accelerations, distrust."""
-    whole = next(iter(runs.values())).test[span.recording][0]
-    length = min(round(LAP_SECONDS / float(whole.time[1] - whole.time[0])), len(whole.time))
-    first = int(np.convolve(np.abs(whole.ay), np.ones(length), "valid").argmax())
-    window = (float(whole.time[first]), float(whole.time[first + length - 1]))
+    """Figure 10: angles, accelerations and distrust where a lap has the largest mean |ay|."""
+    scored_lap = next(iter(runs.values())).test[span.recording][0]
+    length = min(
+        round(LAP_SECONDS / float(scored_lap.time[1] - scored_lap.time[0])), len(scored_lap.time)
+    )
+    first = int(np.convolve(np.abs(scored_lap.ay), np.ones(length), "valid").argmax())
+    window = (float(scored_lap.time[first]), float(scored_lap.time[first + length - 1]))
     parts = {
         candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()
     }
@@ -216,17 +224,17 @@ def _network_outputs(
         .cut(span.start - warm_up, span.stop)
         .without_references()
     )
-    found = {}
+    outputs = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
         (output,) = pseudo_measurements_of(run, [drive])
-        kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
-        process = None if output.process is None else output.process[kept]
-        found[candidate] = (
-            drive.time[kept] - scored.time[0],
-            PseudoMeasurement(output.sideslip[kept], output.variance[kept], process),
+        is_scored = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
+        process = None if output.process is None else output.process[is_scored]
+        outputs[candidate] = (
+            drive.time[is_scored] - scored.time[0],
+            PseudoMeasurement(output.sideslip[is_scored], output.variance[is_scored], process),
         )
-    return found
+    return outputs
 
 
 def _within(part: Scored, window: tuple[float, float] | None) -> Scored:
@@ -262,7 +270,9 @@ def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
 
 
 def _deviations(axes: Any) -> None:
-    """A vertical axis of standard deviations: logarithmic where they span a factor of five and more; plain numbers at the ticks."""
+    """A vertical axis of standard deviations: logarithmic where they span a factor of five and
+    more; plain numbers at the ticks.
+    """
     low, high = axes.dataLim.intervaly
     if high < WIDE * low:
         return

@@ -1,4 +1,6 @@
-"""The paper's statements beside Table 3: errors lap by lap, underestimated sideslip, errors before a stop."""
+"""The paper's statements beside Table 3: errors lap by lap, underestimated sideslip, errors before
+a stop.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,12 @@ from vehest.data.recording import Recording
 LAPS = 3
 SKIP_SECONDS = 1.5
 BLOCK_SECONDS = 10.0
-STANDS = 0.3  # m/s
+MIN_SPEED = 0.3  # m/s
 STOP_SECONDS = (5.0, 0.4)  # before the stop, in which an error counts
 
 
 def laps_of(drive: Recording) -> list[NDArray[np.bool_]]:
-    """Which samples belong to each of the three laps, which are of one length: thirds of the way."""
+    """Which samples belong to each of the three laps of equal length: thirds of the way."""
     share = shares_of_way(drive) * LAPS
     return [(share > lap) & (share <= lap + 1) for lap in range(LAPS)]
 
@@ -31,15 +33,16 @@ def shares_of_way(drive: Recording) -> FloatArray:
 def log_change_of_last_lap(
     drive: Recording, estimate: Estimate, minimum_speed: float
 ) -> FloatArray:
-    """Logarithm of the mean squared error of β on the last lap over that on the first, at the same places of the course, (B,).
+    """Logarithm of the mean squared error of β on the last lap over that on the first, at the same
+    places of the course, (B,).
 
     A lap is cut into stretches of equal length, which last 10 s on the faster of both.
     """
     squared = np.square(np.degrees(estimate["sideslip"] - drive["sideslip_ref"]))
     scored = (drive["vx"] >= minimum_speed) & (drive.time >= drive.start_time + SKIP_SECONDS)
     first, *_, last = (lap & scored for lap in laps_of(drive))
-    fewest = min(int(first.sum()), int(last.sum()))
-    n_blocks = max(int(fewest / drive.rate_hz / BLOCK_SECONDS), 1)
+    n_samples = min(int(first.sum()), int(last.sum()))
+    n_blocks = max(int(n_samples / drive.rate_hz / BLOCK_SECONDS), 1)
     of_lap = shares_of_way(drive) * LAPS % 1.0
     block = np.minimum((of_lap * n_blocks).astype(int), n_blocks - 1)
     means = [
@@ -60,5 +63,5 @@ def error_before_stop(drive: Recording, estimate: Estimate) -> float:
 
 def stop_of(drive: Recording) -> float:
     """When the car comes to its last stop [s]."""
-    moves = np.flatnonzero(drive["vx_ref"] > STANDS)
+    moves = np.flatnonzero(drive["vx_ref"] > MIN_SPEED)
     return float(drive.time[min(int(moves[-1]) + 1, len(drive) - 1)])

@@ -1,4 +1,5 @@
-"""Errors of every candidate block by block, and how far each was trained: blocks.csv and training.csv.
+"""Errors of every candidate block by block, and how far each was trained: blocks.csv and
+training.csv.
 
 A block is a segment of a drive that is about independent of its neighbours; a truck in the parts
 ``drawn``, ``drawn_matched`` and ``drawn_nominal``, a drive in part ``twin``, 27.5 s in part
@@ -63,7 +64,9 @@ def drive_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
 
 
 def twin_rows(twin: Factorial) -> list[BlockRow]:
-    """Squared errors of the sideslip angle [deg²] over each drive of the twin, level, tuned on all roads."""
+    """Squared errors of the sideslip angle [deg²] over each drive of the twin, level, tuned on all
+    roads.
+    """
     rows = []
     samples = round(SECONDS * RATE) - candidates.SKIP
     names = [f"drive {seed}" for seed in range(SEEDS)]
@@ -79,7 +82,9 @@ def twin_rows(twin: Factorial) -> list[BlockRow]:
 
 
 def wheel_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
-    """Squared spread of the four wheel speeds [m²/s²] over blocks of 10 s, as measured and as corrected by Eqs. 61 to 64."""
+    """Squared spread of the four wheel speeds [m²/s²] over blocks of 10 s, as measured and as
+    corrected by Eqs. 61 to 64.
+    """
     rows = []
     for test, of_drives in wheels.wheel_sums(part).items():
         for drive, (measured, corrected, sizes) in of_drives.items():
@@ -96,7 +101,8 @@ def measured_rows(
     estimates: Mapping[str, Mapping[str, Estimate]],
     min_speed: float,
 ) -> list[BlockRow]:
-    """Values of claims that need a measurement of their own, a row a block; the metric is the claim's id.
+    """Values of claims that need a measurement of their own, a row a block; the metric is the
+    claim's id.
 
     Parameters
     ----------

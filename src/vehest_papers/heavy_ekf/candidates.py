@@ -1,4 +1,6 @@
-"""The paper's filters, each with and without a crossfall state, baselines, and the search for noise levels."""
+"""The paper's filters, each with and without a crossfall state, baselines, and the search for noise
+levels.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ CHANNELS = ("yaw_rate", "vx", "ay", "steer")
 SKIP = 30  # samples, 1.5 s, that are not scored, as in the study's other drives
 MIN_SPEED = 2.0  # m/s, below which errors are not scored
 BOX = {"ay": (-4.0, 4.0), "steer": (-6.0, 4.0), "tyres": (-8.0, 2.0)}
-"""Powers of ten that the search may take: σ_ay [m/s²], σ_δ [rad √s], wander of the logarithms of tyre parameters [1/√s]."""
+"""Powers of ten that the search may take: σ_ay [m/s²], σ_δ [rad √s], wander of the logarithms of
+tyre parameters [1/√s].
+"""
 DEVIATION = (
     0.26  # of these logarithms at the start: the rms of ln(1 + mismatch) over the cells of the map
 )
@@ -110,7 +114,9 @@ def measured_drive(
 def estimator_of(
     name: str, levels: Levels, curves: FloatArray, car: SingleTrackParameters = TRUCK
 ) -> RationalFilter:
-    """A filter by its name in the report, whose tyres start from curves, c₁ and c₂ of both axles, (4,)."""
+    """A filter by its name in the report, whose tyres start from curves, c₁ and c₂ of both axles,
+    (4,).
+    """
     tyres = TYRE_MODELS[name.removesuffix(WITH_STATE)]
     c1_front, c2_front, c1_rear, c2_rear = curves.tolist()
     if tyres == "linear":
@@ -133,7 +139,9 @@ def mistaken(mismatch: float) -> FloatArray:
 
 
 def states_of(name: str, levels: Levels, measured: MeasuredDrive) -> FloatArray:
-    """States along a drive: β first, tyre parameters from the fifth on, the pull of a crossfall last, (T, n)."""
+    """States along a drive: β first, tyre parameters from the fifth on, the pull of a crossfall
+    last, (T, n).
+    """
     estimator = estimator_of(name, levels, measured.curves, measured.car)
     if name.endswith(WITH_STATE):
         return crossfall_filter.filtered(estimator, measured.samples)
@@ -159,7 +167,9 @@ def baselines(training: Sequence[Recording]) -> dict[str, Callable[[MeasuredDriv
 
 
 def tuning_drives(*, plain: bool = False) -> list[MeasuredDrive]:
-    """18 drives of the twin between the cells of the map, on other seeds; ``plain``: without payload, wet patches and crossfall."""
+    """18 drives of the twin between the cells of the map, on other seeds; ``plain``: without
+    payload, wet patches and crossfall.
+    """
     roads = [(False, False, False)] if plain else list(itertools.product((False, True), repeat=3))
     measured = []
     for number, (slip, mismatch, _) in enumerate(
@@ -172,7 +182,8 @@ def tuning_drives(*, plain: bool = False) -> list[MeasuredDrive]:
 
 
 def tuned(name: str, drives: Sequence[MeasuredDrive]) -> Tuned:
-    """Noise levels with the smallest geometric mean of RMSE(β) over drives, so that drives count by percentages.
+    """Noise levels with the smallest geometric mean of RMSE(β) over drives, so that drives count by
+    percentages.
 
     The gyroscope's level is that of its data sheet, as in the paper. Points are spread over the
     whole box (Sobol); the best are refined by Nelder and Mead.

@@ -1,4 +1,4 @@
-"""The paper's orders as rows with conditions as columns: ratio, interval, significance and power."""
+"""The paper's orders by condition: ratio, interval, significance and power."""
 
 from __future__ import annotations
 
@@ -40,14 +40,15 @@ ORDERS = {
 }
 """Claim -> the filters that it compares."""
 ORDERS_CAPTION = (
-    "The paper's orders in every condition: ratio of RMSE(β), first filter over second, with its 95 % "
-    "interval. 'lower' and 'higher': significant by Holm over this table; 'n.s.': no significant "
-    "difference, in brackets the power to detect the paper's ratio. Trucks: SIMULATED, 20 drawn trucks, noise "
-    "levels tuned on all conditions. Slow laps: SIMULATED, three laps at 30 to 45 km/h. Ferrari: REAL."
+    "The paper's orders in every condition: ratio of RMSE(β), first filter over second, with its "
+    "95 % interval. 'lower' and 'higher': significant by Holm over this table; 'n.s.': no "
+    "significant difference, in brackets the power to detect the paper's ratio. Trucks: "
+    "SIMULATED, 20 drawn trucks, noise levels tuned on all conditions. Slow laps: SIMULATED, "
+    "three laps at 30 to 45 km/h. Ferrari: REAL."
 )
 TUNING_CAPTION = (
-    "The same ratios on the 20 drawn trucks, SIMULATED, by what the noise levels are tuned on. With the "
-    "crossfall state, both filters of a pair have it. Holm over this table."
+    "The same ratios on the 20 drawn trucks, SIMULATED, by what the noise levels are tuned on. "
+    "With the crossfall state, both filters of a pair have it. Holm over this table."
 )
 OVERVIEW_CAPTION = (
     "RMSE(β) [deg]; trucks and laps SIMULATED, Ferrari REAL. Trucks: noise levels tuned on all "
@@ -244,7 +245,7 @@ def _entry(
 
 
 def overview_table(rows: Sequence[BlockRow], slips: Mapping[str, float]) -> Table:
-    """RMSE(β) of all candidates in every condition; ``slips``: title of a test -> rear slip [deg]."""
+    """RMSE(β) of all candidates in every condition; ``slips``: test -> rear slip [deg]."""
     blocks = blocks_of(rows)
     tests = {f"{name.replace('_', ', ')}": (TUNED_ON_ALL, name) for name in CONDITIONS}
     tests |= {

@@ -1,4 +1,6 @@
-"""The filters on the real Ferrari, cross-validated in time: curves and noise levels of each fold come from the others."""
+"""The filters on the real Ferrari, cross-validated in time: curves and noise levels of each fold
+come from the others.
+"""
 
 from __future__ import annotations
 
@@ -51,14 +53,14 @@ def cross_validated(name: str, part: PartArtefacts) -> CrossValidation:
         fit = fit_motion(axle_motion(segments, car, MIN_SPEED))
         curves = np.concatenate([fit.front, fit.rear])
         training = [measured_drive(segment, curves, car) for segment in segments]
-        whole = measured_drive(drive, curves, car)
+        measured = measured_drive(drive, curves, car)
         is_tested = (drive.time >= begin) & (drive.time < end)
         for candidate in paper.ORDER:
             levels = tuned(candidate, training).levels
-            sideslip[candidate][is_tested] = sideslip_of(candidate, levels, whole)[is_tested]
+            sideslip[candidate][is_tested] = sideslip_of(candidate, levels, measured)[is_tested]
         for candidate, estimate in baselines(segments).items():
             values = sideslip.setdefault(candidate, np.zeros(len(drive)))
-            values[is_tested] = estimate(whole)[is_tested]
+            values[is_tested] = estimate(measured)[is_tested]
     estimates = {
         candidate: Estimate(
             drive.id,

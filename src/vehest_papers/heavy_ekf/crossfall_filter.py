@@ -1,4 +1,6 @@
-"""The paper's filters with one more state, the pull of a crossfall b = g sin φ: their outlook names bank angles."""
+"""The paper's filters with one more state, the pull of a crossfall b = g sin φ: their outlook names
+bank angles.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The report: the paper's orders by condition, the map of rear slip and stiffness error, and the claims."""
+"""The report: the paper's orders by condition, the map of rear slip and stiffness error, and the
+claims.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.report.document import REPORT, Block, Document, as_code
 from vehest.report.style import fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import block_errors, conditions, laps, paper, region_map, tyres
 from vehest_papers.heavy_ekf.candidates import FILTERS, MIN_SPEED, Tuned
@@ -32,9 +35,9 @@ from vehest_papers.heavy_ekf.factorial import Factorial, every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import (
     TYRES,
     filters_of,
+    full_drive,
     in_drawing_order,
     titles_of,
-    whole_drive,
 )
 from vehest_papers.kit import methods
 from vehest_papers.kit.block_rows import (
@@ -47,8 +50,12 @@ from vehest_papers.kit.block_rows import (
 )
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
-from vehest_papers.kit.verdict_table import CLAIMS, claims_table, decided_claims, one_line
+from vehest_papers.kit.verdict_table import (
+    CLAIMS,
+    claims_table,
+    decided_claims,
+    without_line_breaks,
+)
 
 NAME = "heavy_ekf"
 TEMPLATE = Path(__file__).with_name("report.md.j2")
@@ -63,8 +70,8 @@ FIGURE_8 = "Cornering stiffnesses, LINT filter (Figure 8 of the paper), three la
 FIGURE_9 = "Parameters of the rational tyre, RATTE filter (Figure 9), three laps, SIMULATED."
 FIGURE_10 = "Sideslip angle during a fast lap (Figure 10 of the paper) and the errors, SIMULATED."
 FERRARI_FIGURE = (
-    "Sideslip angle on the real Ferrari, REAL, and the errors: each fifth of the 550 s is estimated with "
-    "tyre curves and noise levels from the others."
+    "Sideslip angle on the real Ferrari, REAL, and the errors: each fifth of the 550 s is "
+    "estimated with tyre curves and noise levels from the others."
 )
 
 
@@ -80,7 +87,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     drawn_part = _part(artefacts, DRAWN, CONDITIONS)
     parts = artefacts.parts
     content = claims_of(NAME)
-    drives = {test: whole_drive(truck, test) for test in truck.split.tests}
+    drives = {test: full_drive(truck, test) for test in truck.split.tests}
     estimates = _estimates(truck, drives)
     trucks = drawn_trucks(drawn_part)
     twin = factorial()
@@ -107,7 +114,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         decided_claims(claims),
         *_figures(drives, estimates, trucks, ferrari),
     ]
-    values = _values(artefacts, by_condition, trucks, one_line(content.recommendation))
+    values = _values(artefacts, by_condition, trucks, without_line_breaks(content.recommendation))
     data = {
         CLAIMS: claims.frame,
         "orders_by_condition": by_condition,
@@ -115,7 +122,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "twin_cells": every_cell(twin),
         "noise_levels": _noise_levels(trucks, twin),
         "rear_slip": _slips_by_truck(trucks),
-        "ranges": methods.ranges_table(artefacts, "ranges", "", {}).frame,
+        "ranges": methods.ranges(artefacts),
         BLOCKS: frame(rows, BlockRow),
         TRAINING: frame(trained, TrainingRow),
     }
@@ -178,10 +185,10 @@ def _figures(
         of_tyres = {kind: estimates[f"{kind}_laps"][name] for kind in TYRES}
         figures.append(tyres.parameters_figure(by_tyres, of_tyres, name, figure, caption))
     if ferrari:
-        shown = in_drawing_order(ferrari.estimates)
+        drawn = in_drawing_order(ferrari.estimates)
         figures.append(
             laps.sideslip_figure(
-                ferrari.drive, shown, MIN_SPEED, "sideslip_ferrari", FERRARI_FIGURE
+                ferrari.drive, drawn, MIN_SPEED, "sideslip_ferrari", FERRARI_FIGURE
             )
         )
     return figures
@@ -238,9 +245,9 @@ def _noise_levels(trucks: DrawnTrucks, twin: Factorial) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _level_row(where: str, tuned_on: str, name: str, tuned: Tuned) -> dict[str, object]:
+def _level_row(data: str, tuned_on: str, name: str, tuned: Tuned) -> dict[str, object]:
     return {
-        "data": where,
+        "data": data,
         "tuned_on": tuned_on,
         "filter": name,
         "ay": tuned.levels.ay,

@@ -1,7 +1,9 @@
-"""Twenty drawn trucks at the limit: errors in six conditions of tyres and road, by three tunings of the noise levels.
+"""Twenty drawn trucks at the limit: errors in six conditions of tyres and road, by three tunings of
+the noise levels.
 
 Tyre curves are fitted to the nominal, level laps of other trucks, noise levels are tuned on other
-trucks, and the filters assume the mean truck's mass: as with a fleet of which one truck was measured.
+trucks, and the filters assume the mean truck's mass: as with a fleet of which one truck was
+measured.
 """
 
 from __future__ import annotations
@@ -92,7 +94,7 @@ def drawn_trucks(part: PartArtefacts) -> DrawnTrucks:
     fit = fit_motion(axle_motion(nominal, TRUCK, MIN_SPEED))
     curves = np.concatenate([fit.front, fit.rear])
     tuning = {
-        condition: [measured_drive(each, curves) for each in part.reference_ranges(spans)]
+        condition: [measured_drive(drive, curves) for drive in part.reference_ranges(spans)]
         for condition, spans in by_condition.items()
     }
     every_drive = [measured for drives in tuning.values() for measured in drives]
@@ -113,13 +115,15 @@ def drawn_trucks(part: PartArtefacts) -> DrawnTrucks:
         outcome.slips[condition] = np.array([rear_slip([drive]) for drive in laps.recordings])
         outcome.pooled_slips[condition] = rear_slip(laps.recordings)
         fixed = {
-            name: [estimate(each) for each in laps.measured]
+            name: [estimate(drive) for drive in laps.measured]
             for name, estimate in of_baselines.items()
         }
         for part_name in TUNINGS:
             of_condition = levels[part_name][condition]
             estimates = fixed | {
-                name: [sideslip_of(name, of_condition[name].levels, each) for each in laps.measured]
+                name: [
+                    sideslip_of(name, of_condition[name].levels, drive) for drive in laps.measured
+                ]
                 for name in FILTERS
             }
             outcome.rows += _rows(part_name, condition, laps, estimates)
@@ -137,7 +141,7 @@ def _laps_of(part: PartArtefacts, condition: str, curves: FloatArray) -> Laps:
     spans = part.split.tests[condition]
     recordings = part.reference_ranges(spans)
     trucks = [f"truck {int(span.recording.rsplit('_', 1)[1])}" for span in spans]
-    return Laps(trucks, recordings, [measured_drive(each, curves) for each in recordings])
+    return Laps(trucks, recordings, [measured_drive(recording, curves) for recording in recordings])
 
 
 def _rows(

@@ -1,4 +1,6 @@
-"""The factorial experiment on the twin: every filter over rear slip, stiffness error and crossfall, 20 seeds a cell."""
+"""The factorial experiment on the twin: every filter over rear slip, stiffness error and crossfall,
+20 seeds a cell.
+"""
 
 from __future__ import annotations
 
@@ -109,13 +111,13 @@ def _cells(tunings: Mapping[str, Mapping[str, Tuned]], road: str, slip: float) -
         curves = mistaken(mismatch)
         measured = [measured_drive(recording, curves) for recording in recordings]
         of_baselines = {
-            name: _squared_errors(measured, [estimate(each) for each in measured])
+            name: _squared_errors(measured, [estimate(drive) for drive in measured])
             for name, estimate in _baselines().items()
         }
         for tuned_on, levels in tunings.items():
             squared = {
                 name: _squared_errors(
-                    measured, [sideslip_of(name, of_filter.levels, each) for each in measured]
+                    measured, [sideslip_of(name, of_filter.levels, drive) for drive in measured]
                 )
                 for name, of_filter in levels.items()
             }
@@ -126,7 +128,7 @@ def _cells(tunings: Mapping[str, Mapping[str, Tuned]], road: str, slip: float) -
 def _squared_errors(drives: Sequence[MeasuredDrive], estimates: Sequence[FloatArray]) -> FloatArray:
     """Mean squared error of β of each drive [deg²], (S,)."""
     return np.array(
-        [each.rmse(sideslip) ** 2 for each, sideslip in zip(drives, estimates, strict=True)]
+        [drive.rmse(sideslip) ** 2 for drive, sideslip in zip(drives, estimates, strict=True)]
     )
 
 
@@ -139,7 +141,7 @@ def _baselines():  # type: ignore[no-untyped-def]
 def changes(
     cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]
 ) -> dict[tuple[int, tuple[str, str]], Change]:
-    """(position of the cell, pair) -> change, paired over seeds; all corrected together by Holm, as one map."""
+    """(position of the cell, pair) -> change, paired over seeds, Holm-corrected over the map."""
     keys = [(position, pair) for position in range(len(cells)) for pair in pairs]
     contrasts = [
         mean_contrast(

@@ -22,8 +22,9 @@ HANDLING_SECONDS = 60.0
 STRAIGHT = "#b3122a"
 HANDLING = "#5b8c00"
 FIGURE_6 = (
-    "Three laps (Figure 6 of the paper), SIMULATED. a: track, with the calmest 25 s (red) and the 60 s "
-    "with the largest lateral acceleration (green). b: sideslip angle. c, d: both segments."
+    "Three laps (Figure 6 of the paper), SIMULATED. a: track, with the calmest 25 s (red) and "
+    "the 60 s with the largest lateral acceleration (green). b: sideslip angle. c, d: both "
+    "segments."
 )
 
 
@@ -44,7 +45,7 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
     with new_figure(DOUBLE_COLUMN, 5.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=(1.1, 1.2, 1.2))
         track = figure.add_subplot(grid[0, 0])
-        whole = figure.add_subplot(grid[1, :])
+        course = figure.add_subplot(grid[1, :])
         bends = figure.add_subplot(grid[2, :])
         calm = figure.add_subplot(grid[0, 1])
         track.plot(x, y, color="#888888", linewidth=0.8)
@@ -56,16 +57,16 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
         track.set_xlabel("x [m]")
         track.set_ylabel("y [m]")
         track.set_title("a", loc="left", fontweight="bold")
-        _sideslip(whole, drive, estimates, minimum_speed, None)
+        _sideslip(course, drive, estimates, minimum_speed, None)
         _sideslip(calm, drive, estimates, minimum_speed, straight)
         _sideslip(bends, drive, estimates, minimum_speed, handling)
         for axes, letter, colour in (
-            (whole, "b", "black"),
+            (course, "b", "black"),
             (calm, "c", STRAIGHT),
             (bends, "d", HANDLING),
         ):
             axes.set_title(letter, loc="left", fontweight="bold", color=colour)
-        legend_above(figure, whole)
+        legend_above(figure, course)
     return Figure("figure_6", FIGURE_6, figure)
 
 
@@ -80,10 +81,10 @@ def sideslip_figure(
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1))
         _sideslip(top, drive, estimates, minimum_speed, None)
-        shown = moving(drive, minimum_speed)
+        is_drawn = moving(drive, minimum_speed)
         for label, estimate in estimates.items():
             line = LINES[label]
-            error = np.degrees(estimate["sideslip"] - drive["sideslip_ref"]) * shown
+            error = np.degrees(estimate["sideslip"] - drive["sideslip_ref"]) * is_drawn
             below.plot(*decimated(drive.time, error, POINTS), color=line.colour, linewidth=0.8)
         top.set_xlabel("")
         below.axhline(0.0, color=MEASURED.colour, linewidth=0.6)
@@ -102,13 +103,13 @@ def _sideslip(
     stretch: tuple[float, float] | None,
 ) -> None:
     first, last = drive.index_range(*stretch) if stretch else (0, len(drive))
-    shown = moving(drive, minimum_speed)[first:last]
+    is_drawn = moving(drive, minimum_speed)[first:last]
     time = drive.time[first:last]
-    measured = np.degrees(drive["sideslip_ref"][first:last]) * shown
+    measured = np.degrees(drive["sideslip_ref"][first:last]) * is_drawn
     axes.plot(*decimated(time, measured, POINTS), color="#8a8a8a", linewidth=0.8, label="measured")
     for label, estimate in estimates.items():
         line = LINES[label]
-        values = np.degrees(estimate["sideslip"][first:last]) * shown
+        values = np.degrees(estimate["sideslip"][first:last]) * is_drawn
         axes.plot(
             *decimated(time, values, POINTS),
             color=line.colour,

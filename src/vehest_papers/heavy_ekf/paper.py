@@ -1,4 +1,6 @@
-"""Figures of Di Biase, Lenzo & Timpone 2020; their Table 3 is not legible, so its figures are those of the prose."""
+"""Figures of Di Biase, Lenzo & Timpone 2020; their Table 3 is not legible, so its figures are those
+of the prose.
+"""
 
 from __future__ import annotations
 

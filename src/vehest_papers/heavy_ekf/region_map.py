@@ -1,4 +1,6 @@
-"""The map over rear slip and stiffness error: where RATTE is significantly better, not different, significantly worse."""
+"""The map over rear slip and stiffness error: where RATTE is significantly better, not different,
+significantly worse.
+"""
 
 from __future__ import annotations
 
@@ -36,9 +38,9 @@ MAP = (
     "difference (Holm over the map)."
 )
 REGIONS = (
-    "Cells of the map (of 49) in which RATTE is significantly better / not different / significantly "
-    "worse, SIMULATED, and the lowest power of a cell to detect the paper's 44 % (RATT) and 65 % "
-    "(LINT). With the crossfall state, both filters of a pair have it."
+    "Cells of the map (of 49) in which RATTE is significantly better / not different / "
+    "significantly worse, SIMULATED, and the lowest power of a cell to detect the paper's 44 % "
+    "(RATT) and 65 % (LINT). With the crossfall state, both filters of a pair have it."
 )
 Changes = dict[tuple[int, tuple[str, str]], Change]
 

@@ -65,7 +65,8 @@ def filters_of(part: PartArtefacts) -> dict[str, Filter]:
     missing = [name for name in paper.ORDER if name not in filters]
     if missing:
         raise DataError(
-            f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three"
+            f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline "
+            "needs all three"
         )
     return filters
 
@@ -74,12 +75,12 @@ def titles_of(part: PartArtefacts) -> dict[Name, str]:
     """Estimator and variant -> what it is called in this report, for all models of a part."""
     titles = {}
     for model in part.models:
-        other = BASELINE_TITLES.get(model.estimator, ": ".join(model.name))
-        titles[model.name] = paper.VARIANTS.get(model.variant, other)
+        title = BASELINE_TITLES.get(model.estimator, ": ".join(model.name))
+        titles[model.name] = paper.VARIANTS.get(model.variant, title)
     return titles
 
 
-def whole_drive(part: PartArtefacts, test: str) -> Recording:
+def full_drive(part: PartArtefacts, test: str) -> Recording:
     """The whole recording of a test set at the evaluation rate, references included."""
     span = part.split.tests[test][0]
     return read_recording(part.references[span.dataset, span.recording])

@@ -1,14 +1,20 @@
-"""The paper's own single track with rational tyres as the plant: drives whose rear slip, load, friction and road are chosen.
+"""The paper's own single track with rational tyres as the plant: drives whose rear slip, load,
+friction and road are chosen.
 
-Every filter of the paper runs on its own model here, so that what it gains or loses comes from slip and from tyres it does not know.
+Every filter of the paper runs on its own model here, so that what it gains or loses comes from slip
+and from tyres it does not know.
 
-    β' = (F_F + F_R)/(M u) - r + g sin φ/u,   r' = (a_F F_F - a_R F_R)/J                  (Eqs. 1, 2; φ the crossfall)
-    F = c₂ μ F_z/F_z0 α c₁(μ + 1)/(α² + c₁(μ + 1)),  α_F = δ - β - a_F r/u,  α_R = -β + a_R r/u    (Eqs. 4 to 6)
+    β' = (F_F + F_R)/(M u) - r + g sin φ/u                    (Eq. 1; φ the crossfall)
+    r' = (a_F F_F - a_R F_R)/J                                (Eq. 2)
+    F = c₂ μ F_z/F_z0 α c₁(μ + 1)/(α² + c₁(μ + 1))            (Eq. 4)
+    α_F = δ - β - a_F r/u,  α_R = -β + a_R r/u                (Eqs. 5, 6)
     a_y = (F_F + F_R)/M = u (β' + r) - g sin φ
 
-The driver holds a wanted slip of the rear axle α* by two loops, one inside the other: the yaw rate that turns the rear axle's slip
-towards α*, r* = (F_R l/(M a_F) + g sin φ)/u + α*' + k (α* - α_R), is exact where J = M a_F a_R, and the front force that turns the car
-towards it, F_F = (J k_r (r* - r) + a_R F_R)/a_F. So a car beyond its rear axle's peak is held by countersteering, as a driver does.
+The driver holds a wanted slip of the rear axle α* by two loops, one inside the other: the yaw rate
+that turns the rear axle's slip towards α*, r* = (F_R l/(M a_F) + g sin φ)/u + α*' + k (α* - α_R),
+is exact where J = M a_F a_R, and the front force that turns the car towards it, F_F = (J k_r (r* -
+r) + a_R F_R)/a_F. So a car beyond its rear axle's peak is held by countersteering, as a driver
+does.
 """
 
 from __future__ import annotations
@@ -27,17 +33,14 @@ from vehest.vehicle.rational_tyres import rational_axle
 from vehest_papers.heavy_ekf import paper
 
 RATE = 20.0  # Hz, as in the paper
-FINER = 20  # steps of the plant a sample: 400 Hz
+SUBSTEPS = 20  # steps of the plant a sample: 400 Hz
 SECONDS = 120.0
 TRUCK = SingleTrackParameters(
     7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0
 )  # as in conf/vehicle/heavy_truck.yaml
 CURVES = np.array([paper.CURVES[name] for name in ("c1_front", "c2_front", "c1_rear", "c2_rear")])
-TRACK = 2.08
-CG_HEIGHT = 0.85  # m, likewise; both assumed there
-PAYLOAD = 1978.0
-PAYLOAD_BEHIND = 1.0
-PAYLOAD_HEIGHT = 1.4  # kg, a quarter; m behind the centre of gravity and above the road; assumed
+PAYLOAD = 1978.0  # kg, a quarter of the mass; assumed
+PAYLOAD_BEHIND = 1.0  # m behind the centre of gravity; assumed
 CROSSFALL = math.radians(1.0)
 DRY = 1.0
 WET = 0.6
@@ -49,15 +52,15 @@ NOISE = {
 }  # a sample, white; assumed
 SLIP_GAIN = 4.0
 TURN_GAIN = 10.0  # 1/s
-LARGEST_STEER = 0.7
-FASTEST_STEER = 1.0  # rad, rad/s
+MAX_STEER = 0.7  # rad
+MAX_STEER_RATE = 1.0  # rad/s
 FRONT_SHARE = 0.98  # of the front axle's largest force, which the driver does not ask more of
 SPEEDS = (12.5, 26.0)  # m/s, mean of a drive: from the laps at 45 km/h to the fast one
 BEND_SECONDS = (4.0, 9.0)
 REST_SECONDS = (1.0, 3.0)
 WET_SECONDS = (12.0, 25.0)
 RAMP_SECONDS = 1.5
-SMALLEST_BEND = 0.4  # of the largest rear slip of a drive
+MIN_BEND_SHARE = 0.4  # of the largest rear slip of a drive
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ class Conditions:
     """What a drive of the plant is like."""
 
     slip: float  # largest rear slip angle that the driver holds [deg]
-    payload: bool = False  # whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows
+    # whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows
+    payload: bool = False
     wet_patches: bool = False  # whether the friction steps from 1 to 0.6 and back along the road
     crossfall: bool = (
         False  # whether the road falls by 1° to the left all along, as on one side of a crown
@@ -74,18 +78,19 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Plant:
-    """Mass, inertia and places of the axles as they are, and what loads the axles carry over those at rest without payload."""
+    """Mass, inertia and places of the axles as they are, and what loads the axles carry over those
+    at rest without payload.
+    """
 
     car: SingleTrackParameters
     load_front: float
     load_rear: float
-    cg_height: float
 
     @classmethod
     def of(cls, *, payload: bool) -> Plant:
         """The truck, with or without its payload."""
         if not payload:
-            return cls(TRUCK, 1.0, 1.0, CG_HEIGHT)
+            return cls(TRUCK, 1.0, 1.0)
         mass = TRUCK.mass + PAYLOAD
         behind = PAYLOAD * PAYLOAD_BEHIND / mass
         inertia = (
@@ -93,26 +98,12 @@ class Plant:
         )
         front = TRUCK.cg_to_front_axle + behind
         rear = TRUCK.cg_to_rear_axle - behind
-        height = (TRUCK.mass * CG_HEIGHT + PAYLOAD * PAYLOAD_HEIGHT) / mass
         at_front = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle)
         at_rear = mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
         car = replace(
             TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear
         )
-        return cls(car, float(at_front), float(at_rear), float(height))
-
-    @property
-    def roll_over(self) -> float:
-        """Lateral acceleration at which the inner wheels lift, g t/(2 h) [m/s²]; neither springs nor tyres give."""
-        return GRAVITY * TRACK / (2.0 * self.cg_height)
-
-    @property
-    def slides_at(self) -> float:
-        """Lateral acceleration that the axles' largest forces can make on a dry road, Σ c₂ √(2c₁)/2 F_z/F_z0 / M [m/s²]."""
-        loads = np.array([self.load_front, self.load_rear])
-        return float(np.sum(loads * CURVES[1::2] * np.sqrt(2.0 * CURVES[::2]) / 2.0)) / float(
-            self.car.mass
-        )
+        return cls(car, float(at_front), float(at_rear))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +142,10 @@ class Drive:
 def course(
     conditions: Conditions, generator: np.random.Generator, seconds: float = SECONDS
 ) -> Course:
-    """A course of bends to either side, of which one at least asks for the whole slip, at a speed that wavers."""
-    step = 1.0 / (RATE * FINER)
+    """A course of bends to either side, of which one at least asks for the whole slip, at a speed
+    that wavers.
+    """
+    step = 1.0 / (RATE * SUBSTEPS)
     time = np.arange(round(seconds / step)) * step
     slip = np.zeros(len(time))
     at = 2.0
@@ -160,7 +153,7 @@ def course(
     n_bends = 0
     while at < seconds - BEND_SECONDS[0]:
         length = float(generator.uniform(*BEND_SECONDS))
-        share = 1.0 if n_bends % 4 == 0 else float(generator.uniform(SMALLEST_BEND, 1.0))
+        share = 1.0 if n_bends % 4 == 0 else float(generator.uniform(MIN_BEND_SHARE, 1.0))
         rise = (
             np.clip((time - at) / RAMP_SECONDS, 0.0, 1.0),
             np.clip((at + length - time) / RAMP_SECONDS, 0.0, 1.0),
@@ -191,15 +184,17 @@ def course(
 
 
 def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
-    """A drive of a course, and sensors, that the seed alone decides: the same for all plants of equal slip."""
+    """A drive of a course, and sensors, that the seed alone decides: the same for all plants of
+    equal slip.
+    """
     generator = np.random.default_rng([seed, 22])
     plant = Plant.of(payload=conditions.payload)
-    own = course(conditions, np.random.default_rng([seed, 4]), seconds)
-    states, steer, lateral = driven(plant, own)
-    kept = slice(None, None, FINER)
-    sideslip, yaw_rate = states[kept].T
-    speed = own.speed[kept]
-    clean = np.stack([yaw_rate, speed, lateral[kept], steer[kept]], axis=1)
+    planned = course(conditions, np.random.default_rng([seed, 4]), seconds)
+    states, steer, lateral = driven(plant, planned)
+    sampled = slice(None, None, SUBSTEPS)
+    sideslip, yaw_rate = states[sampled].T
+    speed = planned.speed[sampled]
+    clean = np.stack([yaw_rate, speed, lateral[sampled], steer[sampled]], axis=1)
     noise = np.array([NOISE[name] for name in ("yaw_rate", "vx", "ay", "steer")])
     samples = clean + noise * generator.standard_normal(clean.shape)
     rear_slip = -sideslip + float(plant.car.cg_to_rear_axle) * yaw_rate / speed
@@ -209,17 +204,19 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
         sideslip.copy(),
         yaw_rate.copy(),
         rear_slip,
-        lateral[kept].copy(),
-        own.friction[kept].copy(),
+        lateral[sampled].copy(),
+        planned.friction[sampled].copy(),
         plant,
     )
 
 
-def driven(plant: Plant, own: Course) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States (β, r), (K, 2), road-wheel angle and lateral acceleration (K,) along a course, by Runge and Kutta's fourth order."""
-    states = np.zeros((len(own.speed), 2))
-    steer = np.zeros(len(own.speed))
-    lateral = np.zeros(len(own.speed))
+def driven(plant: Plant, planned: Course) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """States (β, r), (K, 2), road-wheel angle and lateral acceleration (K,) along a course, by
+    Runge and Kutta's fourth order.
+    """
+    states = np.zeros((len(planned.speed), 2))
+    steer = np.zeros(len(planned.speed))
+    lateral = np.zeros(len(planned.speed))
     car = np.array(
         [
             plant.car.mass,
@@ -235,12 +232,12 @@ def driven(plant: Plant, own: Course) -> tuple[FloatArray, FloatArray, FloatArra
     _drive(
         car,
         tyres,
-        own.speed,
-        own.slip,
-        own.slip_rate,
-        own.friction,
-        own.road,
-        1.0 / (RATE * FINER),
+        planned.speed,
+        planned.slip,
+        planned.slip_rate,
+        planned.friction,
+        planned.road,
+        1.0 / (RATE * SUBSTEPS),
         states,
         steer,
         lateral,
@@ -252,18 +249,20 @@ _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _drive(car, tyres, speed, slip, slip_rate, friction, road, step, states, steer, lateral):  # type: ignore[no-untyped-def]
+def _drive(  # type: ignore[no-untyped-def]
+    car, tyres, speed, slip, slip_rate, friction, road, step, states, steer, lateral
+):
     """Driver and plant; the steering angle stands still during a step."""
     angle = 0.0
     for k in range(len(speed)):
         u = speed[k]
         mu = friction[k]
         pull = road[k]
-        wanted = _steering(
+        target = _steering(
             car, tyres, u, mu, pull, slip[k], slip_rate[k], states[k, 0], states[k, 1]
         )
-        moved = min(max(wanted - angle, -FASTEST_STEER * step), FASTEST_STEER * step)
-        angle = min(max(angle + moved, -LARGEST_STEER), LARGEST_STEER)
+        moved = min(max(target - angle, -MAX_STEER_RATE * step), MAX_STEER_RATE * step)
+        angle = min(max(angle + moved, -MAX_STEER), MAX_STEER)
         steer[k] = angle
         b0, r0, lateral[k] = rates(car, tyres, u, mu, pull, angle, states[k, 0], states[k, 1])
         if k + 1 == len(speed):
@@ -298,15 +297,17 @@ def rates(car, tyres, u, mu, pull, angle, sideslip, yaw_rate):  # type: ignore[n
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _steering(car, tyres, u, mu, pull, slip, slip_rate, sideslip, yaw_rate):  # type: ignore[no-untyped-def]
+def _steering(  # type: ignore[no-untyped-def]
+    car, tyres, u, mu, pull, slip, slip_rate, sideslip, yaw_rate
+):
     """Road-wheel angle by which the driver turns the rear axle's slip towards the wanted one."""
     mass, inertia, front_arm, rear_arm = car
-    own = rear_arm * yaw_rate / u - sideslip
-    rear = _axle(own, tyres[2], tyres[3], mu).force
+    rear_slip = rear_arm * yaw_rate / u - sideslip
+    rear = _axle(rear_slip, tyres[2], tyres[3], mu).force
     turn = (
         (rear * (front_arm + rear_arm) / (mass * front_arm) + pull) / u
         + slip_rate
-        + SLIP_GAIN * (slip - own)
+        + SLIP_GAIN * (slip - rear_slip)
     )
     bend = tyres[0] * (mu + 1.0)
     largest = FRONT_SHARE * tyres[1] * mu * math.sqrt(bend) / 2.0

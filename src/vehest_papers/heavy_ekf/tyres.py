@@ -85,8 +85,8 @@ def _band(
     nudged = values * (1.0 + 1e-4 * np.eye(len(values)))
     slopes = np.stack(
         [
-            (axle_force(fit.kind, own, grid) - curve) / (1e-4 * value)
-            for own, value in zip(nudged, values, strict=True)
+            (axle_force(fit.kind, varied, grid) - curve) / (1e-4 * value)
+            for varied, value in zip(nudged, values, strict=True)
         ]
     )
     half = 1.96 * np.sqrt(

@@ -13,22 +13,22 @@ from vehest_papers.kit.reading import recordings_of
 WHEELS = ("fl", "fr", "rl", "rr")
 RADIUS = 0.2972  # m, of the AV-21, as in conf/dataset/av21.yaml
 BLOCK_SECONDS = 10.0
-SLOWEST = 5.0  # m/s
+MIN_SPEED = 5.0  # m/s
 LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns as one
 
 
 def tracks_of(drive: Recording) -> tuple[float, float]:
     """Front and rear track by least squares of the wheels' difference on the yaw rate [m]."""
-    moving = drive["vx_ref"] > SLOWEST
+    moving = drive["vx_ref"] > MIN_SPEED
     turn = drive["yaw_rate"][moving]
-    found = []
+    tracks = []
     for left, right in (("fl", "fr"), ("rl", "rr")):
         scale = np.cos(drive["steer"][moving]) if left == "fl" else 1.0
         difference = (
             RADIUS * scale * (drive[f"wheel_speed_{right}"] - drive[f"wheel_speed_{left}"])[moving]
         )
-        found.append(float(difference @ turn / (turn @ turn)))
-    return found[0], found[1]
+        tracks.append(float(difference @ turn / (turn @ turn)))
+    return tracks[0], tracks[1]
 
 
 def trained_tracks(part: PartArtefacts) -> FloatArray:
@@ -38,7 +38,7 @@ def trained_tracks(part: PartArtefacts) -> FloatArray:
 
 
 def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...]]]:
-    """Test set -> name of a drive -> `block_sums` of it; an axle whose wheels turn as one is left as it is."""
+    """Test set -> name of a drive -> its `block_sums`, without axles whose wheels turn as one."""
     tracks = trained_tracks(part)
     turning = np.where(tracks > LOCKED, tracks, 0.0)
     wheels = SpeedFromWheels(
@@ -48,7 +48,7 @@ def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...
         test: {
             f"{drive.id} {drive.start_time:.2f} s": block_sums(drive, wheels)
             for drive in recordings_of(part, spans)
-            if (drive["vx_ref"] > SLOWEST).any()
+            if (drive["vx_ref"] > MIN_SPEED).any()
         }
         for test, spans in part.split.tests.items()
     }
@@ -57,8 +57,8 @@ def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...
 def block_sums(
     drive: Recording, wheels: SpeedFromWheels
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums over blocks of 10 s: variance of the wheels as measured and as corrected, and samples."""
-    is_moving = (drive["vx_ref"] > SLOWEST).astype(np.float64)
+    """Sums over blocks of 10 s: variances of the wheels, measured and corrected; samples."""
+    is_moving = (drive["vx_ref"] > MIN_SPEED).astype(np.float64)
     measured = wheels.wheel_radius * drive.stack([f"wheel_speed_{wheel}" for wheel in WHEELS]).T
     starts = np.arange(0, len(drive), round(BLOCK_SECONDS * drive.rate_hz))
     variances = [

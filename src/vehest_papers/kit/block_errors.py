@@ -1,4 +1,6 @@
-"""Errors of a study's candidates by block and seed, and how far they were trained: tables/blocks.csv and tables/training.csv."""
+"""Errors of a study's candidates by block and seed, and how far they were trained:
+tables/blocks.csv and tables/training.csv.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,7 @@ def read_blocks(path: Path) -> dict[Key, BlockErrors]:
     return blocks_of(rows, f"'{path}'")
 
 
-def blocks_of(rows: Iterable[BlockRow], where: str = "errors by block") -> dict[Key, BlockErrors]:
+def blocks_of(rows: Iterable[BlockRow], source: str = "errors by block") -> dict[Key, BlockErrors]:
     """Arrange rows by part, candidate, test set and metric.
 
     Parameters
@@ -104,13 +106,13 @@ def blocks_of(rows: Iterable[BlockRow], where: str = "errors by block") -> dict[
         cell = (str(row.seed), row.block)
         of_key = cells.setdefault(key, {})
         if cell in of_key:
-            raise DataError(f"{where}: {_named(key, *cell)} occurs twice; write one row for it")
+            raise DataError(f"{source}: {_named(key, *cell)} occurs twice; write one row for it")
         if not (np.isfinite(row.size) and row.size >= 0):
             raise DataError(
-                f"{where}: {_named(key, *cell)} has size {row.size:g}; write its samples"
+                f"{source}: {_named(key, *cell)} has size {row.size:g}; write its samples"
             )
         of_key[cell] = (row.value, row.size)
-    return {key: _arranged(key, of_key, where) for key, of_key in cells.items()}
+    return {key: _arranged(key, of_key, source) for key, of_key in cells.items()}
 
 
 def read_training(path: Path) -> dict[str, Training]:
@@ -152,7 +154,7 @@ def _named(key: Key, seed: str, block: str) -> str:
 
 
 def _arranged(
-    key: Key, cells: Mapping[tuple[str, str], tuple[float, float]], where: str
+    key: Key, cells: Mapping[tuple[str, str], tuple[float, float]], source: str
 ) -> BlockErrors:
     seeds = tuple(dict.fromkeys(seed for seed, _ in cells))
     blocks = tuple(dict.fromkeys(block for _, block in cells))
@@ -160,7 +162,7 @@ def _arranged(
         for block in blocks:
             if (seed, block) not in cells:
                 raise DataError(
-                    f"{where}: {_named(key, seed, block)} is missing; "
+                    f"{source}: {_named(key, seed, block)} is missing; "
                     "write inf as its value where the estimator diverged"
                 )
     table = np.array([[cells[seed, block] for block in blocks] for seed in seeds])
@@ -168,7 +170,7 @@ def _arranged(
     if not np.allclose(sizes, sizes[0], rtol=1e-6):
         position = int(np.flatnonzero((~np.isclose(sizes, sizes[0], rtol=1e-6)).any(axis=0))[0])
         raise DataError(
-            f"{where}: {_named(key, seeds[0], blocks[position])} has another size than with "
+            f"{source}: {_named(key, seeds[0], blocks[position])} has another size than with "
             "other seeds; the seeds must be scored on the same samples"
         )
     return BlockErrors(seeds, blocks, table[:, :, 0], sizes[0])

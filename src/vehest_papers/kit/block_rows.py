@@ -1,4 +1,6 @@
-"""Rows of tables/blocks.csv and tables/training.csv, from which claims are judged without models or recordings."""
+"""Rows of tables/blocks.csv and tables/training.csv, from which claims are judged without models or
+recordings.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ BASELINE_NAMES: Mapping[str, str] = {
     "zero": "zero",
     "static map": "static_map",
 }  # name in a report -> name in blocks.csv
-MOST_IMPROVED = 0.03  # by doubled epochs, up to which a training was long enough
+MAX_IMPROVEMENT = 0.03  # by doubled epochs, up to which a training was long enough
 
 TrainingState = Literal[
     "not trained", "insufficient", "not checked", "sufficient", "not applicable"
@@ -64,7 +66,8 @@ def block_rows(
     blocks
         Names of the blocks, B of them.
     values, sizes
-        Sum of the loss over each block and samples in it, (B,); one size for all blocks of equal length.
+        Sum of the loss over each block and samples in it, (B,); one size for all blocks of equal
+        length.
     """
     head = (row.part, row.candidate, row.seed, row.test_set, row.metric)
     of_blocks = zip(
@@ -100,9 +103,9 @@ def seed_rows(
     sizes = np.where(is_absent, 0, np.broadcast_to(sizes, len(blocks)))
     values = np.where(is_absent, 0.0, values)
     return [
-        own
+        block_row
         for seed, of_seed in zip(seeds, values, strict=True)
-        for own in block_rows(replace(row, seed=seed), blocks, of_seed, sizes)
+        for block_row in block_rows(replace(row, seed=seed), blocks, of_seed, sizes)
     ]
 
 
@@ -112,7 +115,9 @@ def columns_of(row_type: type[Any]) -> tuple[str, ...]:
 
 
 def frame(rows: Sequence[BlockRow] | Sequence[TrainingRow], row_type: type[Any]) -> pd.DataFrame:
-    """Rows as a table with the columns of their type; one without `SEEDS_PLANNED` where it is 0 in all rows."""
+    """Rows as a table with the columns of their type; one without `SEEDS_PLANNED` where it is 0 in
+    all rows.
+    """
     table = pd.DataFrame([astuple(row) for row in rows], columns=columns_of(row_type))
     if SEEDS_PLANNED in table and not table[SEEDS_PLANNED].any():
         return table.drop(columns=SEEDS_PLANNED)
@@ -133,16 +138,19 @@ def checked_training(
     candidate, epochs, epochs_paper
         Of the row.
     validation, doubled
-        Seed -> error on the validation range after the epochs of the tables, and after twice as many; compared over the seeds that both have.
+        Seed -> error on the validation range after the epochs of the tables, and after twice as
+        many; compared over the seeds that both have.
     """
     seeds = sorted(validation.keys() & doubled.keys())
     if not seeds:
         return TrainingRow(
             candidate, epochs, epochs_paper, "not checked", "not trained with twice the epochs"
         )
-    before, after = (float(np.mean([own[seed] for seed in seeds])) for own in (validation, doubled))
+    before, after = (
+        float(np.mean([errors[seed] for seed in seeds])) for errors in (validation, doubled)
+    )
     state: TrainingState = (
-        "sufficient" if after >= (1.0 - MOST_IMPROVED) * before else "insufficient"
+        "sufficient" if after >= (1.0 - MAX_IMPROVEMENT) * before else "insufficient"
     )
     words = (
         f"twice the epochs change the validation error by {100.0 * (after / before - 1.0):+.1f} %"

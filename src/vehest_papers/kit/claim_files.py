@@ -127,7 +127,7 @@ class Paper:
         return list(dict.fromkeys(keys))
 
 
-_NEEDED: Mapping[Kind, Sequence[str]] = {
+_REQUIRED: Mapping[Kind, Sequence[str]] = {
     "order": ("candidate", "other", "direction", "part", "test_set", "metric"),
     "equal": ("candidate", "part", "test_set", "metric"),
     "limit": ("candidate", "direction", "limit", "part", "test_set", "metric"),
@@ -157,35 +157,39 @@ def read_paper(path: Path) -> Paper:
     DataError
         In one line: the file, the claim or table, the key, and what it must be.
     """
-    where = f"'{path}'"
+    source = f"'{path}'"
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise DataError(f"{where} must be a mapping with the keys paper, reference, claims, tables")
+        raise DataError(
+            f"{source} must be a mapping with the keys paper, reference, claims, tables"
+        )
     entries = content.get("claims")
     tables = content.get("tables")
     for key, value in (("claims", entries), ("tables", tables)):
         if not isinstance(value, list):
-            raise DataError(f"{where}: {key} must be a list, empty ([]) where there are none")
-    paper = validated(Paper, {**content, "claims": [], "tables": []}, where)
-    claims = [_read_claim(entry, position, where) for position, entry in enumerate(entries or [])]
+            raise DataError(f"{source}: {key} must be a list, empty ([]) where there are none")
+    paper = validated(Paper, {**content, "claims": [], "tables": []}, source)
+    claims = [_read_claim(entry, position, source) for position, entry in enumerate(entries or [])]
     paper = replace(
         paper,
         claims=claims,
         tables=[
-            validated(Table, entry, f"{where}, table {position + 1}")
+            validated(Table, entry, f"{source}, table {position + 1}")
             for position, entry in enumerate(tables or [])
         ],
     )
-    _check_names(paper, where)
+    _check_names(paper, source)
     return paper
 
 
-def _read_claim(entry: Any, position: int, where: str) -> Claim:
+def _read_claim(entry: Any, position: int, source: str) -> Claim:
     name = entry.get("id") if isinstance(entry, dict) else None
-    here = f"{where}, claim {name!r}" if isinstance(name, str) else f"{where}, claim {position + 1}"
-    claim = validated(Claim, entry, here)
+    subject = (
+        f"{source}, claim {name!r}" if isinstance(name, str) else f"{source}, claim {position + 1}"
+    )
+    claim = validated(Claim, entry, subject)
     if fault := _fault_of(claim):
-        raise DataError(f"{here}: {fault}")
+        raise DataError(f"{subject}: {fault}")
     return claim
 
 
@@ -196,8 +200,8 @@ def _fault_of(claim: Claim) -> str:
     if claim.not_testable is not None:
         return "kind must be left out where not_testable is given" if claim.kind else ""
     if claim.kind is None:
-        return f"kind is missing; it is one of: {', '.join(_NEEDED)} (or give not_testable)"
-    for key in _NEEDED[claim.kind]:
+        return f"kind is missing; it is one of: {', '.join(_REQUIRED)} (or give not_testable)"
+    for key in _REQUIRED[claim.kind]:
         if getattr(claim, key) in (None, ""):
             return f"{key} is missing, which a claim of kind {claim.kind} needs"
     for key in _USELESS[claim.kind]:
@@ -222,31 +226,33 @@ def _fault_of_values(claim: Claim) -> str:
     return ""
 
 
-def _check_names(paper: Paper, where: str) -> None:
+def _check_names(paper: Paper, source: str) -> None:
     """Refuse ids that occur twice, and candidates and parts that are not declared."""
     ids = [claim.id for claim in paper.claims]
     for claim in paper.claims:
-        here = f"{where}, claim {claim.id!r}"
+        subject = f"{source}, claim {claim.id!r}"
         if ids.count(claim.id) > 1:
-            raise DataError(f"{here}: id occurs {ids.count(claim.id)} times; ids must be unique")
+            raise DataError(f"{subject}: id occurs {ids.count(claim.id)} times; ids must be unique")
         if claim.not_testable is None:
-            _check_declared(paper.candidates, claim.names, "candidates", here)
+            _check_declared(paper.candidates, claim.names, "candidates", subject)
             parts = [claim.part, *([claim.other_part] if claim.other_part else [])]
-            _check_declared(paper.parts, parts, "parts", here)
-            _check_declared(paper.test_sets, [claim.test_set], "test_sets", here)
+            _check_declared(paper.parts, parts, "parts", subject)
+            _check_declared(paper.test_sets, [claim.test_set], "test_sets", subject)
     for table in paper.tables:
-        here = f"{where}, table {table.table!r}"
-        _check_declared(paper.candidates, [row.candidate for row in table.rows], "candidates", here)
-        _check_declared(paper.parts, [table.part], "parts", here)
-        _check_declared(paper.test_sets, [table.test_set], "test_sets", here)
+        subject = f"{source}, table {table.table!r}"
+        _check_declared(
+            paper.candidates, [row.candidate for row in table.rows], "candidates", subject
+        )
+        _check_declared(paper.parts, [table.part], "parts", subject)
+        _check_declared(paper.test_sets, [table.test_set], "test_sets", subject)
 
 
 def _check_declared(
-    declared: Mapping[str, object], names: Sequence[str], key: str, here: str
+    declared: Mapping[str, object], names: Sequence[str], key: str, subject: str
 ) -> None:
     for name in names:
         if name not in declared:
             raise DataError(
-                f"{here}: {name!r} is not among the {key} declared at the top of the file "
+                f"{subject}: {name!r} is not among the {key} declared at the top of the file "
                 f"({', '.join(declared)}); add it there or correct the name"
             )

@@ -10,8 +10,8 @@ from vehest.report.style import MatplotlibFigure
 def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:
     """One legend over the figure with every label of some axes once."""
     entries: dict[str, Any] = {}
-    for own in axes:
-        for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
+    for panel in axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     figure.legend(
         list(entries.values()),

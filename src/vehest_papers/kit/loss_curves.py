@@ -1,4 +1,6 @@
-"""Losses of training and validation over the epochs of every candidate: a table of all, and one figure."""
+"""Losses of training and validation over the epochs of every candidate: a table of all, and one
+figure.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,8 @@ def loss_curves(models: Mapping[str, Sequence[EvaluatedModel]]) -> pd.DataFrame:
 
 
 def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
-    """Losses of each candidate's first seed over the epochs of its longest phase, the last of equally long
-    ones, a panel a candidate.
+    """Losses of each candidate's first seed over the epochs of its longest phase, the last of
+    equally long ones, a panel a candidate.
 
     Every curve is scaled to its own range, since losses have different units and may be negative.
     """
@@ -57,13 +59,13 @@ def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
         for axes in panels.flat[len(candidates) :]:
             axes.set_axis_off()
         for axes, candidate in zip(panels.flat, candidates, strict=False):
-            own = losses[losses["candidate"] == candidate]
-            own = own[own["seed"] == own["seed"].iloc[0]]
-            n_epochs = own.groupby("phase")["epoch"].transform("size")
-            own = own[own["phase"] == own.loc[n_epochs == n_epochs.max(), "phase"].iloc[-1]]
+            curve = losses[losses["candidate"] == candidate]
+            curve = curve[curve["seed"] == curve["seed"].iloc[0]]
+            n_epochs = curve.groupby("phase")["epoch"].transform("size")
+            curve = curve[curve["phase"] == curve.loc[n_epochs == n_epochs.max(), "phase"].iloc[-1]]
             for name, colour in LOSSES.items():
                 label = name.removesuffix("_loss")
-                losses_of_epochs = own[name].to_numpy(np.float64)
+                losses_of_epochs = curve[name].to_numpy(np.float64)
                 validated = np.isfinite(losses_of_epochs)  # not after every epoch
                 epochs = 1 + np.flatnonzero(validated)
                 scaled = _scaled(losses_of_epochs[validated])

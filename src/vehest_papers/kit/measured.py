@@ -1,4 +1,6 @@
-"""Values by block and seed of two candidates, combined so that their mean over blocks is what a claim states."""
+"""Values by block and seed of two candidates, combined so that their mean over blocks is what a
+claim states.
+"""
 
 from __future__ import annotations
 

@@ -1,38 +1,30 @@
-"""Data and methods in the reports of papers: kinds of data, missing parts, warnings, scoring, and the ranges that were used."""
+"""Data and methods in the reports of papers: kinds of data, missing parts, warnings, scoring, and
+the ranges that were used.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
-from vehest.report.document import Column, Table
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 
 def absent_parts(artefacts: StudyArtefacts) -> str:
     """A sentence after a space on the parts whose recordings are missing; empty where none is."""
-    absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
-    return f" Not in this report, since the recordings are missing: {absent}." if absent else ""
-
-
-def not_trained(artefacts: StudyArtefacts) -> str:
-    """A sentence after a space on planned trainings that are not done, by part; empty where all are."""
-    counts = {name: len(names) for name, names in artefacts.not_trained.items() if names}
-    if not counts:
-        return ""
-    parts = "; ".join(f"{artefacts.titles[name]}: {number}" for name, number in counts.items())
-    return f" **Not complete:** {sum(counts.values())} planned trainings are not done ({parts})."
+    titles = "; ".join(artefacts.titles[name] for name in artefacts.absent)
+    return f" Not in this report, since the recordings are missing: {titles}." if titles else ""
 
 
 def scoring(part: PartArtefacts, reading: str = "") -> str:
     """How estimates of a part are scored; ``reading`` follows the rate at which they are read."""
     protocol = part.protocol
     return (
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first {protocol.skip_seconds:g} s of each "
-        f"{protocol.piece} are not scored.{protocol.start_description}"
-        f"{protocol.describe_sideslip(part.split.datasets)}"
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first "
+        f"{protocol.skip_seconds:g} s of each {protocol.piece} are not "
+        f"scored.{protocol.start_description}{protocol.describe_sideslip(part.split.datasets)}"
     )
 
 
@@ -46,38 +38,24 @@ def bullets(heading: str, lines: Iterable[str]) -> str:
     return f"{heading}\n\n" + "\n".join(f"- {line}" for line in lines if line)
 
 
-def how_it_was_made(lines: Sequence[str]) -> str:
+def provenance(lines: Sequence[str]) -> str:
     """The appendix of that name."""
     return bullets("## Appendix: how it was made", lines)
 
 
-def ranges_table(
-    artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]
-) -> Table:
-    """Ranges of training, validation and tests, a row a part; ``tests``: test set -> what it is called, where that is another name."""
-    rows = [
-        {
-            "part": artefacts.titles[key],
-            "kind": words_of_kinds(part),
-            "train": spans_in_words(part.split.train),
-            "validation": spans_in_words(part.split.validation),
-            "tests": "; ".join(
-                f"{tests.get(test, test)}: {spans_in_words(spans)}"
-                for test, spans in part.split.tests.items()
-            ),
-        }
-        for key, part in artefacts.parts.items()
-    ]
-    titles = {
-        "part": "part",
-        "kind": "data",
-        "train": "training",
-        "validation": "validation",
-        "tests": "tests",
-    }
-    return Table(
-        name,
-        caption,
-        pd.DataFrame(rows),
-        {column: Column(title) for column, title in titles.items()},
+def ranges(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """Ranges of training, validation and tests, a row for each part."""
+    return pd.DataFrame(
+        [
+            {
+                "part": artefacts.titles[key],
+                "kind": words_of_kinds(part),
+                "train": spans_in_words(part.split.train),
+                "validation": spans_in_words(part.split.validation),
+                "tests": "; ".join(
+                    f"{test}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()
+                ),
+            }
+            for key, part in artefacts.parts.items()
+        ]
     )

@@ -1,14 +1,17 @@
 """What measurements over a short while can tell of a model's state, along a drive.
 
-A model is given by its functions, x[k+1] = f(x[k], u[k]) and z[k] = h(x[k], u[k]). To first order about the states along the drive, N
-measurements from sample k on depend on x[k] by the local observability matrix
+A model is given by its functions, x[k+1] = f(x[k], u[k]) and z[k] = h(x[k], u[k]). To first order
+about the states along the drive, N measurements from sample k on depend on x[k] by the local
+observability matrix
 
     O[k] = [H[k]; H[k+1] A[k]; …; H[k+N-1] A[k+N-2] … A[k]],   A = ∂f/∂x,  H = ∂h/∂x
 
-With states in units of their typical sizes and measurements in units of their noise, its smallest singular value is a ratio of signal to
-noise: below one, the N measurements tell less of some combination of states than was known before.
+With states in units of their typical sizes and measurements in units of their noise, its smallest
+singular value is a ratio of signal to noise: below one, the N measurements tell less of some
+combination of states than was known before.
 
-Source: Kou, Elliott & Tarn, Information and Control 22 (1), 1973; Krener & Ide, Measures of unobservability, CDC 2009.
+Source: Kou, Elliott & Tarn, Information and Control 22 (1), 1973; Krener & Ide, Measures of
+unobservability, CDC 2009.
 """
 
 from __future__ import annotations
@@ -30,8 +33,8 @@ class Observability(NamedTuple):
     """How well windows of measurements determine the state at their start; a row a window."""
 
     smallest: FloatArray  # smallest singular value of the local observability matrix, (T - N + 1,)
-    # standard deviation of each state from these measurements alone, in units of its size; infinite where they do not determine it, (T - N
-    # + 1, n)
+    # standard deviation of each state from these measurements alone, in units of its size; infinite
+    # where they do not determine it, (T - N + 1, n)
     deviation: FloatArray
     rank: NDArray[np.int64]  # of the local observability matrix, (T - N + 1,)
 
@@ -39,7 +42,9 @@ class Observability(NamedTuple):
 def jacobians_along(
     transition: StateFunction, observation: StateFunction, states: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A (T, n, n) and H (T, m, n) about the states (T, n) with inputs (T, p) along a drive, by automatic differentiation."""
+    """A (T, n, n) and H (T, m, n) about the states (T, n) with inputs (T, p) along a drive, by
+    automatic differentiation.
+    """
     from torch.func import jacrev, vmap
 
     at = (
@@ -51,7 +56,9 @@ def jacobians_along(
 
 
 def observability_matrices(A: FloatArray, H: FloatArray, steps: int) -> FloatArray:
-    """O of every window of N samples of A (T, n, n) and H (T, m, n), (T - N + 1, N m, n); raises ValueError unless N is between 1 and T."""
+    """O of every window of N samples of A (T, n, n) and H (T, m, n), (T - N + 1, N m, n); raises
+    ValueError unless N is between 1 and T.
+    """
     count = len(A) - steps + 1
     if not 1 <= steps <= len(A):
         raise ValueError(

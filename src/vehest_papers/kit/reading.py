@@ -17,7 +17,7 @@ from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
-MOST_NAMED = 12
+MAX_RANGES_NAMED = 12
 
 
 def recordings_of(part: PartArtefacts, spans: Iterable[Span]) -> list[Recording]:
@@ -47,7 +47,8 @@ def models_by_candidate(
     for name, models in groups.items():
         if len({model.seed for model in models}) != len(models):
             raise DataError(
-                f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own"
+                f"study '{part.study}': candidate {name} was trained twice with one seed; give "
+                "each variant a part of its own"
             )
     names = [
         *(name for name in order if name in groups),
@@ -67,13 +68,15 @@ def spans_in_words(spans: Sequence[Span]) -> str:
         return MISSING
     words = []
     for span in spans:
-        whole = span.start == -math.inf and span.stop == math.inf
+        is_complete = span.start == -math.inf and span.stop == math.inf
         words.append(
-            as_text(span.recording) if whole else f"{as_text(span.recording)} ({_times(span)})"
+            as_text(span.recording)
+            if is_complete
+            else f"{as_text(span.recording)} ({_times(span)})"
         )
     return (
         ", ".join(words)
-        if len(words) <= MOST_NAMED
+        if len(words) <= MAX_RANGES_NAMED
         else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
     )
 
@@ -92,7 +95,13 @@ def sideslip_error(part: Scored) -> FloatArray:
 
 
 def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], float]:
-    """(estimator, variant, seed, test set, metric) -> value, over all samples under nominal conditions."""
+    """Values over all samples under nominal conditions.
+
+    Returns
+    -------
+    dict
+        (estimator, variant, seed, test set, metric) -> value.
+    """
     metrics = part.metrics[
         (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")
     ]
@@ -109,18 +118,18 @@ def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], f
 
 
 def median_and_range(values: FloatArray, decimals: int) -> str:
-    """Median, lowest and highest of some seeds: ``0.0135 [0.0130, 0.0141]``; a single value alone."""
+    """Median and range of some seeds: ``0.0135 [0.0130, 0.0141]``; a single value alone."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return MISSING
-    words = fixed(float(np.median(finite)), decimals)
-    return (
-        words
-        if len(finite) == 1
-        else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"
-    )
+    median = float(np.median(finite))
+    if len(finite) == 1:
+        return fixed(median, decimals)
+    return with_interval(median, float(finite.min()), float(finite.max()), decimals)
 
 
 def with_interval(value: float, low: float, high: float, decimals: int, unit: str = "") -> str:
-    """A figure with its interval: ``0.0086 [0.0071, 0.0101]``, or with a unit ``0.12° [0.10, 0.15]``."""
+    """A figure with its interval: ``0.0086 [0.0071, 0.0101]``, or with a unit ``0.12° [0.10,
+    0.15]``.
+    """
     return f"{fixed(value, decimals)}{unit} [{fixed(low, decimals)}, {fixed(high, decimals)}]"

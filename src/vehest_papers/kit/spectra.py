@@ -1,4 +1,5 @@
-"""Welch periodograms of recordings and of estimation errors, and the process noise of the kinematic model.
+"""Welch periodograms of recordings and of estimation errors, and the process noise of the kinematic
+model.
 
 Source: Welch 1967; Da Lio et al. 2023, Sections VII-A and VIII-F.
 """
@@ -34,14 +35,16 @@ class Periodogram:
         return float(self.density.sum() * self.frequency[1])
 
     def level(self, hz: float) -> float:
-        """Mean density in the third of an octave around a frequency, or of the nearest line [unit²/Hz].
+        """Mean density in the third of an octave around a frequency, or of the nearest line
+        [unit²/Hz].
 
         Raises:
             DataError: the frequency lies outside the lines above 0.
         """
         if not self.frequency[1] <= hz <= self.frequency[-1]:
             raise DataError(
-                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz has no line at {hz:g} Hz"
+                f"a periodogram with lines from {self.frequency[1]:.3g} to "
+                f"{self.frequency[-1]:.3g} Hz has no line at {hz:g} Hz"
             )
         return float(self.density[third_octave(self.frequency, hz)].mean())
 
@@ -56,10 +59,12 @@ def third_octave(frequency: FloatArray, hz: float) -> NDArray[np.bool_]:
 def periodogram(
     series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS
 ) -> Periodogram:
-    """Welch's method over several series: Hann windows that overlap by half, each segment without its mean.
+    """Welch's method over several series: Hann windows that overlap by half, each segment without
+    its mean.
 
-    Series count by their number of segments; what is left over at the end of each counts nowhere. The line at 0 Hz and, because the
-    window spreads what slowly varies, the one beside it are not reliable.
+    Series count by their number of segments; what is left over at the end of each counts nowhere.
+    The line at 0 Hz and, because the window spreads what slowly varies, the one beside it are not
+    reliable.
 
     Args:
         series: uniformly sampled, finite, each of shape (T,).
@@ -77,8 +82,8 @@ def periodogram(
     for position, samples in enumerate(series):
         if len(samples) < length:
             raise DataError(
-                f"series {position} lasts {len(samples) / rate_hz:.1f} s, less than a segment of the periodogram ({segment_seconds:g} s); "
-                f"give longer ones or a shorter segment"
+                f"series {position} lasts {len(samples) / rate_hz:.1f} s, less than a segment of "
+                f"the periodogram ({segment_seconds:g} s); give longer ones or a shorter segment"
             )
         if not np.isfinite(samples).all():
             raise DataError(f"series {position} has gaps, which a periodogram cannot skip")
@@ -90,16 +95,18 @@ def periodogram(
             noverlap=length // 2,
             detrend="constant",
         )
-        own = 1 + (len(samples) - length) // (length - length // 2)
-        total += own * density
-        n_segments += own
+        n_of_series = 1 + (len(samples) - length) // (length - length // 2)
+        total += n_of_series * density
+        n_segments += n_of_series
     return Periodogram(frequency, total / n_segments, n_segments)
 
 
 def lateral_velocity_rate(recording: Recording) -> FloatArray:
-    """Central difference of ``vy_ref`` at all samples but the first and the last, shape (T - 2,) [m/s²].
+    """Central difference of ``vy_ref`` at all samples but the first and the last, shape (T - 2,)
+    [m/s²].
 
-    At frequency f it shows the rate times sin(2πf/rate)/(2πf/rate): 0.98 of it at 1 Hz and 0.64 at 5 Hz for 20 Hz.
+    At frequency f it shows the rate times sin(2πf/rate)/(2πf/rate): 0.98 of it at 1 Hz and 0.64 at
+    5 Hz for 20 Hz.
 
     Raises:
         DataError: the channel is missing or too short.
@@ -107,13 +114,15 @@ def lateral_velocity_rate(recording: Recording) -> FloatArray:
     velocity = recording["vy_ref"]
     if len(velocity) < 3:
         raise DataError(
-            f"recording '{recording.id}' has {len(velocity)} samples; a central difference needs three"
+            f"recording '{recording.id}' has {len(velocity)} samples; a central difference needs "
+            "three"
         )
     return (velocity[2:] - velocity[:-2]) * (0.5 * recording.rate_hz)
 
 
 def process_noise(recording: Recording) -> FloatArray:
-    """What the kinematic model leaves of the rate of v, v̇ - (a_y - ω u_m), at all samples but the ends, shape (T - 2,) [m/s²].
+    """What the kinematic model leaves of the rate of v, v̇ - (a_y - ω u_m), at all samples but the
+    ends, shape (T - 2,) [m/s²].
 
     Source: Da Lio et al. 2023, Section VII-A.
 
@@ -125,10 +134,12 @@ def process_noise(recording: Recording) -> FloatArray:
 
 
 def mean_bias(recordings: Sequence[Recording]) -> float:
-    """Mean of the process noise over all samples of all recordings [m/s²] (Da Lio et al. 2023, Section VII-A1)."""
+    """Mean of the process noise over all samples of all recordings [m/s²] (Da Lio et al. 2023,
+    Section VII-A1).
+    """
     return float(np.concatenate([process_noise(recording) for recording in recordings]).mean())
 
 
-def decibels(density: float, other: float) -> float:
+def decibels(density: float, reference: float) -> float:
     """By how much one power density lies above another [dB]."""
-    return float(10.0 * np.log10(density / other))
+    return float(10.0 * np.log10(density / reference))

@@ -1,4 +1,6 @@
-"""The engine's verdicts on a paper's claims in words, and the table of them that the report of its study shows."""
+"""The engine's verdicts on a paper's claims in words, and the table of them that the report of its
+study shows.
+"""
 
 from __future__ import annotations
 
@@ -58,8 +60,9 @@ def claims_table(
     numbers = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict])
     frame = pd.DataFrame(rows)
     caption = (
-        f"The paper's claims, judged from the errors by block and seed of tables/blocks.csv: {numbers}. What decided each is in "
-        "the CSV; `docs/scorecard.md` says what the verdicts mean."
+        "The paper's claims, judged from the errors by block and seed of tables/blocks.csv: "
+        f"{numbers}. What decided each is in the CSV; `docs/scorecard.md` says what the verdicts "
+        "mean."
     )
     return Table(CLAIMS, caption, frame, COLUMNS)
 
@@ -89,7 +92,7 @@ def _row(
     is_testable = claim.not_testable is None
     return {
         "id": claim.id,
-        "claim": one_line(claim.claim),
+        "claim": without_line_breaks(claim.claim),
         "source": claim.source,
         "published": published_in_words(claim),
         "ours": figures_in_words(judgement, unit_of(claim)),
@@ -106,10 +109,10 @@ def figures_in_words(judgement: Judgement, unit: str, named: Callable[[str], str
     for name, figure in judgement.values.items():
         label = f"{named(name)} " if len(judgement.values) > 1 else ""
         words.append(f"{label}{figure_in_words(figure)}{unit}")
-    if judgement.size is not None:
-        words.append(f"ratio {figure_in_words(judgement.size)}")
     if judgement.order is not None:
         words.append(f"mean of blocks' ratios {figure_in_words(judgement.order)}")
+    if judgement.size is not None:
+        words.append(f"ratio {figure_in_words(judgement.size)}")
     return "; ".join(words) or MISSING
 
 
@@ -148,6 +151,6 @@ def unit_of(claim: Claim) -> str:
     return f" {claim.unit}" if claim.unit not in (None, "1") else ""
 
 
-def one_line(text: str) -> str:
+def without_line_breaks(text: str) -> str:
     """Text without line breaks."""
     return " ".join(text.split())

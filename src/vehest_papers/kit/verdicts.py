@@ -1,20 +1,21 @@
 """Verdicts on the claims of a paper: one engine for all papers, on errors by block and seed.
 
-An order ("A has a lower error than B") is tested on the logarithm of the ratio of both errors in each block, whose mean over blocks
-and seeds all blocks enter alike. Its size is the ratio of the errors pooled over all blocks. The two may disagree where few blocks
-hold most of the error: then there is no significant difference. Verdicts, in this precedence:
+An order ("A has a lower error than B") is tested on the logarithm of the ratio of both errors in
+each block, whose mean over blocks and seeds all blocks enter alike. Its size is the ratio of the
+errors pooled over all blocks. The two may disagree where few blocks hold most of the error: then
+there is no significant difference. Verdicts, in this precedence:
 
-==========================  =========================================================================
+==========================  ======================================================================
 not testable                data that are not public would be needed
 not assessed                no errors by block are published of a candidate
-met by a trivial baseline   met, and would be with ``zero`` or ``static_map`` in the candidate's place;
-                            not of a claim that the candidate's error is higher
-reproduced                  met, and the paper's size lies in the interval of ours, or it states none
+met by a trivial baseline   met, and would be with ``zero`` or ``static_map`` in the candidate's
+                            place; not of a claim that the candidate's error is higher
+reproduced                  met, and our interval contains the paper's size, or it states none
 direction only              met, but the interval of our size excludes the paper's
-contradicted                significant in the other direction; an interval wholly off the claimed range
+contradicted                significant in the other direction; an interval off the claimed range
 no significant difference   of an order; with the power to detect the paper's size
-inconclusive                of a limit or an equality: the interval holds its boundary
-==========================  =========================================================================
+inconclusive                of a limit or an equality: the interval contains its boundary
+==========================  ======================================================================
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def exponent_of(metric: str) -> float:
     return 0.5 if "rmse" in metric else 1.0
 
 
-def paired_errors(first: BlockErrors, second: BlockErrors, metric: str, where: str) -> Pair:
+def paired_errors(first: BlockErrors, second: BlockErrors, metric: str, test_set: str) -> Pair:
     """Errors of two candidates in the blocks that both have samples in.
 
     Raises
@@ -171,10 +172,12 @@ def paired_errors(first: BlockErrors, second: BlockErrors, metric: str, where: s
         The blocks are not the same, or not of the same size.
     """
     if set(first.blocks) != set(second.blocks):
-        raise DataError(f"{where}: the two candidates have different blocks; write the same blocks")
+        raise DataError(
+            f"{test_set}: the two candidates have different blocks; write the same blocks"
+        )
     second = second.of_blocks(first.blocks)
     if not np.allclose(first.sizes, second.sizes, rtol=1e-6):
-        raise DataError(f"{where}: the two candidates' blocks have different sizes")
+        raise DataError(f"{test_set}: the two candidates' blocks have different sizes")
     scored = first.sizes > 0
     is_finite = [np.isfinite(side.sums).all(axis=0) for side in (first, second)]
     chosen = scored & is_finite[0] & is_finite[1]
@@ -207,7 +210,9 @@ def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]
 
 
 def ratio_of(pair: Pair) -> Figure:
-    """Ratio of the pooled errors with its 95 % interval; without one where there are too few blocks."""
+    """Ratio of the pooled errors with its 95 % interval; without one where there are too few
+    blocks.
+    """
     if pair.is_testable:
         return _exponential(pair.size(), CONFIDENCE)
     ratio = pair.first.mean(axis=0).sum() / pair.second.mean(axis=0).sum()
@@ -326,11 +331,11 @@ def _with_missing_trainings(
     """Names candidates of a claim that are not trained, or with fewer seeds than planned."""
     states = {name: training[name] for name in claim.names if name in training}
     if judgement.verdict == "not assessed":
-        absent = [name for name, state in states.items() if state.state == "not trained"]
-        if not absent:
+        not_trained = [name for name, state in states.items() if state.state == "not trained"]
+        if not not_trained:
             return judgement
-        verb = "is" if len(absent) == 1 else "are"
-        return replace(judgement, reason=f"{' and '.join(absent)} {verb} not trained")
+        verb = "is" if len(not_trained) == 1 else "are"
+        return replace(judgement, reason=f"{' and '.join(not_trained)} {verb} not trained")
     counts = judgement.n_seeds or {}
     fewer = [
         f"{name} with {counts[name]} of {state.seeds_planned} seeds"
@@ -356,7 +361,8 @@ def _without_single_trainings(
     """A verdict that rests on one training of a candidate is withdrawn: other seeds may differ.
 
     With one seed the interval does not contain what another seed would change: of 1,000 simulated
-    studies without any effect 7 to 14 % then had a significant one (results/scorecard/planted_truth.csv).
+    studies without any effect 7 to 14 % then had a significant one
+    (results/scorecard/planted_truth.csv).
     """
     names = [
         name
@@ -374,12 +380,12 @@ def _without_single_trainings(
 
 def _not_assessed(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Judgement:
     parts = [claim.part, claim.other_part or claim.part]
-    absent = [
+    missing = [
         name
         for name, part in zip(claim.names, parts, strict=False)
         if Key(part, name, claim.test_set, claim.metric) not in blocks
     ]
-    reason = f"no per-block errors of {' and '.join(absent)} in this metric are published"
+    reason = f"no per-block errors of {' and '.join(missing)} in this metric are published"
     return Judgement("not assessed", reason, {})
 
 
@@ -479,9 +485,12 @@ def _with_power(judgement: Judgement, claim: Claim, ordered: Ordered) -> Judgeme
     reason = f"{judgement.reason}; power {100 * power:.0f} % to detect the paper's {ratio:.3g}"
     if power >= TARGET_POWER:
         return replace(judgement, power=power, reason=reason)
-    needed = ordered.order.blocks_needed(effect, TARGET_POWER, ordered.level)
+    blocks_needed = ordered.order.blocks_needed(effect, TARGET_POWER, ordered.level)
     return replace(
-        judgement, power=power, blocks_needed=needed, reason=f"{reason}; {_needed(needed)}"
+        judgement,
+        power=power,
+        blocks_needed=blocks_needed,
+        reason=f"{reason}; {_blocks_needed_text(blocks_needed)}",
     )
 
 
@@ -532,8 +541,8 @@ def _verdict_of_range(claim: Claim, contrast: Contrast) -> tuple[Verdict, str]:
             return "reproduced", f"{words} on the claimed side"
         return _verdict_of_size(claim, contrast)
     if end < low or begin > high:
-        where = "outside the margin" if is_equality else "on the other side of the limit"
-        return "contradicted", f"{words} wholly {where}"
+        side = "outside the margin" if is_equality else "on the other side of the limit"
+        return "contradicted", f"{words} wholly {side}"
     return "inconclusive", f"{words} contains {'a margin' if is_equality else 'the limit'}"
 
 
@@ -566,14 +575,20 @@ def _is_met_by(name: str, claim: Claim, blocks: Mapping[Key, BlockErrors]) -> bo
 
 
 def _with_needed_blocks(judgement: Judgement, claim: Claim, contrast: Contrast) -> Judgement:
-    """Of what is inconclusive, the blocks with which it would be decided in four of five cases, if our value is the true one."""
+    """Of what is inconclusive, the blocks with which it would be decided in four of five cases, if
+    our value is the true one.
+    """
     if judgement.verdict != "inconclusive":
         return judgement
     low, high = _log_range(claim)
     distance = min(abs(contrast.value - edge) for edge in (low, high) if math.isfinite(edge))
     level = ALPHA if claim.direction is not None else 1.0 - EQUALITY_CONFIDENCE
-    needed = contrast.blocks_needed(distance, TARGET_POWER, level) if distance > 0 else None
-    return replace(judgement, blocks_needed=needed, reason=f"{judgement.reason}; {_needed(needed)}")
+    blocks_needed = contrast.blocks_needed(distance, TARGET_POWER, level) if distance > 0 else None
+    return replace(
+        judgement,
+        blocks_needed=blocks_needed,
+        reason=f"{judgement.reason}; {_blocks_needed_text(blocks_needed)}",
+    )
 
 
 @dataclass(frozen=True)
@@ -589,7 +604,8 @@ class Measured:
 
 
 def _measure(claim: Claim, errors: BlockErrors) -> Measured:
-    """Mean over blocks and seeds of a claim's measured values; a geometric one where ``other`` makes them ratios.
+    """Mean over blocks and seeds of a claim's measured values; a geometric one where ``other``
+    makes them ratios.
 
     Of values with a single block the seeds take the place of blocks.
     """
@@ -623,10 +639,10 @@ def _judge_measured(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Judgemen
         for key, errors in blocks.items()
         if (key.part, key.test_set, key.metric) == (claim.part, claim.test_set, claim.id)
     }
-    own = next((errors for name, errors in rows.items() if name not in BASELINES), None)
-    if own is None:
+    errors_of_claim = next((errors for name, errors in rows.items() if name not in BASELINES), None)
+    if errors_of_claim is None:
         return Judgement("not assessed", "the measured values are not published yet", {})
-    measured = _measure(claim, own)
+    measured = _measure(claim, errors_of_claim)
     name = claim.candidate or "measured"
     judgement = Judgement(
         "inconclusive",
@@ -730,7 +746,7 @@ def _counted_blocks(number: int) -> str:
     return f"{number} block" if number == 1 else f"{number} blocks"
 
 
-def _needed(number: int | None) -> str:
+def _blocks_needed_text(number: int | None) -> str:
     if number is None:
         return "no number of blocks reaches 80 %: more seeds are needed"
     return f"{_counted_blocks(number)} needed for 80 %"

@@ -1,4 +1,4 @@
-"""Behaviour of trained candidates beside their errors: at little yaw rate, and with biases removed."""
+"""Errors of trained candidates at little yaw rate, and with biases removed."""
 
 from __future__ import annotations
 
@@ -33,38 +33,31 @@ AT_LOW_YAW_RATE = (
     *paper.STRUCTURED,
 )
 BIASED = (paper.LSTM, *paper.STRUCTURED)
-HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
+MAX_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
 
 
 @dataclass(frozen=True, eq=False)
 class Behaviour:
-    """What candidates of a scheme do on the other car, beside their errors on the whole test set."""
+    """Errors of the candidates of a scheme on the other car under special conditions."""
 
-    observer: Luenberger | None
-    share: float  # of samples at which |ω| lies below the observer's threshold; NaN where there is no observer
     low_yaw_rate: SegmentErrors  # categories, where |ω| lies below it
     corrected: SegmentErrors  # categories, the mean bias of a_y taken off
-    biases: Mapping[str, float]  # as `mean_biases` gives them
 
     @classmethod
     def of(cls, scheme: Scheme) -> Behaviour:
         """Run the networks of a scheme again."""
         observer = luenberger_of(scheme)
-        test = scheme.other
+        test = scheme.other_test
         labels = scheme.labels.get(test)
         recordings = [span.recording for span in scheme.part.split.tests[test]]
         low: dict[str, list[Segments]] = {}
-        share = math.nan
         if observer is not None:
-            low, share = at_low_yaw_rate(scheme, observer.threshold, AT_LOW_YAW_RATE, test)
+            low, _ = at_low_yaw_rate(scheme, observer.threshold, AT_LOW_YAW_RATE, test)
         biases = mean_biases(scheme)
         corrected = {name: without_biases(scheme, name, biases, test) for name in BIASED}
         return cls(
-            observer,
-            share,
             SegmentErrors(low, labels, _seeds(scheme, low), recordings),
             SegmentErrors(corrected, labels, _seeds(scheme, corrected), recordings),
-            biases,
         )
 
 
@@ -84,7 +77,8 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
 def at_low_yaw_rate(
     scheme: Scheme, threshold: float, categories: Sequence[str], test: str
 ) -> tuple[dict[str, list[Segments]], float]:
-    """Segments of each category where |ω| lies below the observer's threshold [rad/s], and the share of such samples.
+    """Segments of each category where |ω| lies below the observer's threshold [rad/s], and the
+    share of such samples.
 
     None where the observer is reset never or (almost) always.
     """
@@ -102,11 +96,12 @@ def at_low_yaw_rate(
         for model in scheme.models(category):
             scored = part.scored(model, test)
             masks: list[FloatArray] = [
-                (np.abs(own) < threshold).astype(float) for own in yaw_rates(scored, recordings)
+                (np.abs(yaw_rate) < threshold).astype(float)
+                for yaw_rate in yaw_rates(scored, recordings)
             ]
             share = float(np.concatenate(masks).mean())
             segments.setdefault(category, []).append(masked_segments(scored, masks, rate))
-    return segments if 0.0 < share < HIGHEST_SHARE else {}, share
+    return segments if 0.0 < share < MAX_SHARE else {}, share
 
 
 def _reference(scheme: Scheme, span: Span) -> Recording:
@@ -114,7 +109,9 @@ def _reference(scheme: Scheme, span: Span) -> Recording:
 
 
 def mean_biases(scheme: Scheme) -> dict[str, float]:
-    """Mean of v̇ - (a_y - ωu_m) over the training set of the ``own`` car and over the validation set, of the ``other`` [m/s²]."""
+    """Mean of v̇ - (a_y - ωu_m) over the training set of the ``own`` car and over the validation
+    set, of the ``other`` [m/s²].
+    """
     part = scheme.part
     return {
         "own": mean_bias(recordings_of(part, part.split.train)),
@@ -125,10 +122,11 @@ def mean_biases(scheme: Scheme) -> dict[str, float]:
 def without_biases(
     scheme: Scheme, category: str, biases: Mapping[str, float], test: str
 ) -> list[Segments]:
-    """Segments of each seed of a category with the mean bias taken off a_y (Section IX-A), which takes the reference.
+    """Segments of each seed of a category with the mean bias taken off a_y (Section IX-A), which
+    takes the reference.
 
-    Nothing is trained again: a network that can hold an offset (with biases, GRU, LSTM) has learnt that of its own car, so that
-    the other's a_y is given the own car's.
+    Nothing is trained again: a network that can hold an offset (with biases, GRU, LSTM) has learnt
+    that of its own car, so that the other's a_y is given the own car's.
 
     Parameters
     ----------
@@ -153,7 +151,7 @@ def _corrected(
     for reference, piece in pieces_of(
         part.split.tests[test], lambda span: _reference(scheme, span), part.protocol
     ):
-        seen = reference.without_references()
-        shifted = replace(seen, channels={**seen.channels, "ay": seen["ay"] + shift})
+        measured = reference.without_references()
+        shifted = replace(measured, channels={**measured.channels, "ay": measured["ay"] + shift})
         scored.append(score(estimator.estimate([shifted])[0], reference, piece, part.protocol))
     return segments_of(scored, part.protocol.rate_hz)

@@ -1,7 +1,8 @@
-"""Errors of the candidates that claims and tables name, by block and seed, and how far each was trained: blocks.csv and training.csv.
+"""Errors of the candidates that claims and tables name, by block and seed, and how far each was
+trained: blocks.csv and training.csv.
 
-A block is a stretch of a test drive that is about independent of its neighbours, the same for all parts that are tested on the drive;
-25.6 s where spectra are compared.
+A block is a stretch of a test drive that is about independent of its neighbours, the same for all
+parts that are tested on the drive; 25.6 s where spectra are compared.
 """
 
 from __future__ import annotations
@@ -52,14 +53,17 @@ def error_rows(
     rows = []
     for (name, test, metric), candidates in compared_candidates(claimed).items():
         schemes = [
-            own for part, own in parts.items() if re.fullmatch(rf"{re.escape(name)}(_[a-z])?", part)
+            of_scheme
+            for part, of_scheme in parts.items()
+            if re.fullmatch(rf"{re.escape(name)}(_[a-z])?", part)
         ]
         for candidate in dict.fromkeys([*candidates, *BASELINES]):
             errors = [
-                own
+                of_scheme
                 for scheme in schemes
                 if test in scheme.part.split.tests
-                and (own := errors_of(scheme, behaviours, candidate, test, metric)) is not None
+                and (of_scheme := errors_of(scheme, behaviours, candidate, test, metric))
+                is not None
             ]
             if errors:
                 rows += _rows(name, candidate, test, metric, _joined(errors))
@@ -68,16 +72,16 @@ def error_rows(
 
 def compared_candidates(claimed: Paper) -> dict[Comparison, list[str]]:
     """Part, test set and metric -> candidates whose errors claims and tables compare there."""
-    found: dict[Comparison, list[str]] = {}
+    compared: dict[Comparison, list[str]] = {}
     for claim in claimed.claims:
         if claim.kind in ("order", "equal", "limit"):
             parts = [claim.part, claim.other_part or claim.part]
             for part, candidate in zip(parts, claim.names, strict=False):
-                found.setdefault((part, claim.test_set, claim.metric), []).append(candidate)
+                compared.setdefault((part, claim.test_set, claim.metric), []).append(candidate)
     for table in claimed.tables:
         for row in table.rows:
-            found.setdefault((table.part, table.test_set, row.metric), []).append(row.candidate)
-    return found
+            compared.setdefault((table.part, table.test_set, row.metric), []).append(row.candidate)
+    return compared
 
 
 def errors_of(
@@ -90,7 +94,7 @@ def errors_of(
     if metric in METRICS and not candidate.endswith(CORRECTED):
         key = scheme.key_of(candidate)
         errors = scheme.errors(test)
-    elif behaviour is None or test != scheme.other:
+    elif behaviour is None or test != scheme.other_test:
         return None
     elif metric == LOW_YAW_RATE:
         key = CANDIDATES.get(candidate, candidate)
@@ -109,7 +113,7 @@ def _band_power(scheme: Scheme, candidate: str, test: str, hz: float) -> BlockEr
         return None
     names = tuple(powers[0][0])
     sums = np.stack([values[:, band] for _, values in powers])
-    return BlockErrors(tuple(str(own.seed) for own in models), names, sums, np.ones(len(names)))
+    return BlockErrors(tuple(str(model.seed) for model in models), names, sums, np.ones(len(names)))
 
 
 def _joined(errors: Sequence[BlockErrors]) -> BlockErrors:
@@ -117,7 +121,7 @@ def _joined(errors: Sequence[BlockErrors]) -> BlockErrors:
     first = errors[0]
     if len(errors) == 1:
         return first
-    sums = np.concatenate([own.sums for own in errors])
+    sums = np.concatenate([of_part.sums for of_part in errors])
     return BlockErrors(tuple(map(str, range(len(sums)))), first.blocks, sums, first.sizes)
 
 
@@ -172,11 +176,18 @@ def training_rows(
         category = trained_as.split(",")[0]
         models += [
             model
-            for part in parts.values()
+            for name, part in parts.items()
+            if not DOUBLED.fullmatch(name)
             for model in part.models
             if category_of(model.estimator, model.variant) == category
         ]
-        budgets = sorted({own for model in models if (own := _most_epochs(model.training))})
+        budgets = sorted(
+            {
+                epochs_of_seeds
+                for model in models
+                if (epochs_of_seeds := _most_epochs(model.training))
+            }
+        )
         if not models:
             continue
         if candidate in BASELINES or not budgets:
@@ -184,7 +195,7 @@ def training_rows(
             continue
         words = f"{budgets[-1]} at most"
         stops = [_epochs(scheme, trained_as) for scheme in schemes.values()]
-        if any(len(own) for own in stops):
+        if any(len(epochs_of_seeds) for epochs_of_seeds in stops):
             epochs = np.concatenate(stops)
             words += f", {epochs.min():.0f} to {epochs.max():.0f} by early stopping"
         of_paper = "" if declared.epochs_paper is None else str(declared.epochs_paper)
@@ -210,8 +221,8 @@ def _validation_errors(
         converged = f"pair_{match[1]}_converged" if match else ""
         if match is None or converged not in parts:
             continue
-        for by_category, own in zip(errors, (parts[converged], part), strict=True):
-            for run in runs_of(own).to_dict("records"):
+        for by_category, trained_part in zip(errors, (parts[converged], part), strict=True):
+            for run in runs_of(trained_part).to_dict("records"):
                 value = float(run[f"rmse_vy.{VALIDATION}"])
                 by_category.setdefault(str(run["category"]), {})[int(match[1])] = value
     return errors[0], errors[1]
@@ -224,5 +235,5 @@ def _most_epochs(training: Mapping[str, Any]) -> int:
 
 def _epochs(scheme: Scheme, candidate: str) -> FloatArray:
     runs = scheme.runs
-    own = runs["estimator"] + "/" + runs["variant"] == scheme.key_of(candidate)
-    return np.asarray(runs[own]["epochs"], dtype=np.float64)
+    is_candidate = runs["estimator"] + "/" + runs["variant"] == scheme.key_of(candidate)
+    return np.asarray(runs[is_candidate]["epochs"], dtype=np.float64)

@@ -1,4 +1,6 @@
-"""Candidates of a comparison: every run with its metrics, the category it falls into, and which of them validation chooses."""
+"""Candidates of a comparison: every run with its metrics, the category it falls into, and which of
+them validation chooses.
+"""
 
 from __future__ import annotations
 
@@ -36,36 +38,45 @@ _NAMES = {
 def runs_of(part: artefacts.PartArtefacts) -> pd.DataFrame:
     """One row a run, in the order of the pipeline.
 
-    Columns: estimator, variant, title, category, structure, seed, ``n_parameters``, ``epochs``, and for each set
-    ``rmse_vy.SET`` [m/s], ``fvu.SET``, ``r2.SET``, ``rmse_sideslip.SET`` [deg], where SET is ``validation`` or a test set.
+    Columns: estimator, variant, title, category, structure, seed, ``n_parameters``, ``epochs``, and
+    for each set ``rmse_vy.SET`` [m/s], ``fvu.SET``, ``r2.SET``, ``rmse_sideslip.SET`` [deg], where
+    SET is ``validation`` or a test set.
 
     Raises:
         DataError: a metric is missing.
     """
-    known = metric_values(part)
+    values = metric_values(part)
     sets = [*([VALIDATION] if part.split.validation else []), *part.split.tests]
     rows = []
     for model in part.models:
-        own = (model.estimator, model.variant, model.seed)
-        row: dict[str, object] = {"estimator": own[0], "variant": own[1], "title": model.title}
+        run_key = (model.estimator, model.variant, model.seed)
+        row: dict[str, object] = {
+            "estimator": run_key[0],
+            "variant": run_key[1],
+            "title": model.title,
+        }
         row |= {
-            "category": category_of(*own[:2]),
-            "structure": structure_of(own[1]),
+            "category": category_of(*run_key[:2]),
+            "structure": structure_of(run_key[1]),
             "seed": model.seed,
         }
-        wanted = {f"{metric}.{name}": (*own, name, metric) for name in sets for metric in METRICS}
-        wanted |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
-        missing = [column for column, key in wanted.items() if key not in known]
+        keys = {f"{metric}.{name}": (*run_key, name, metric) for name in sets for metric in METRICS}
+        keys |= {metric: (*run_key, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
+        missing = [column for column, key in keys.items() if key not in values]
         if missing:
             raise DataError(
-                f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again"
+                f"study '{part.study}': {run_key[0]}-{run_key[1]}-seed{run_key[2]} has no "
+                f"{missing[0]}; "
+                "evaluate it again"
             )
-        rows.append(row | {column: known[key] for column, key in wanted.items()})
+        rows.append(row | {column: values[key] for column, key in keys.items()})
     return pd.DataFrame(rows)
 
 
 def category_of(estimator: str, variant: str) -> str:
-    """Category of Tables III to VI that a candidate falls into; the estimator's name if it is none of the paper's."""
+    """Category of Tables III to VI that a candidate falls into; the estimator's name if it is none
+    of the paper's.
+    """
     lag = re.search(r"_lag_([\d.]+s)", variant)
     if lag:
         return f"{paper.FIXED_LAG} {lag[1].removesuffix('s')} s"
@@ -79,7 +90,9 @@ def category_of(estimator: str, variant: str) -> str:
 
 
 def structure_of(variant: str) -> str:
-    """Hyperparameters in words, for example ``P = 2, Q = 3`` or ``5 states``; a dash if there are none to choose."""
+    """Hyperparameters in words, for example ``P = 2, Q = 3`` or ``5 states``; a dash if there are
+    none to choose.
+    """
     states = re.search(r"states_(\d+)", variant)
     if states:
         return f"{states[1]} states"
@@ -91,12 +104,15 @@ def structure_of(variant: str) -> str:
 
 
 def chosen(runs: pd.DataFrame) -> pd.Series:
-    """The run with the lowest RMSE of v on the validation range; the first of equals. Test sets choose nothing."""
+    """The run with the lowest RMSE of v on the validation range; the first of equals. Test sets
+    choose nothing.
+    """
     column = f"rmse_vy.{VALIDATION}"
     if column not in runs:
         if len(runs) > 1:
             raise DataError(
-                f"{len(runs)} runs of {runs.iloc[0]['title']} and no validation range to choose one by"
+                f"{len(runs)} runs of {runs.iloc[0]['title']} and no validation range to choose "
+                "one by"
             )
         return runs.iloc[0]
     values = runs[column].to_numpy(dtype=float)
@@ -104,11 +120,14 @@ def chosen(runs: pd.DataFrame) -> pd.Series:
 
 
 def chosen_by_category(runs: pd.DataFrame) -> dict[str, pd.Series]:
-    """Category -> the run that validation chooses among all its structures and seeds: baselines, then as in Tables IV and V."""
+    """Category -> the run that validation chooses among all its structures and seeds.
+
+    Baselines first, then in the order of Tables IV and V.
+    """
     present = dict.fromkeys(runs["category"])
-    known = (*paper.BASELINES, *paper.CATEGORIES)
+    ordered = (*paper.BASELINES, *paper.CATEGORIES)
     order = [
-        *(name for name in known if name in present),
-        *(name for name in present if name not in known),
+        *(name for name in ordered if name in present),
+        *(name for name in present if name not in ordered),
     ]
     return {name: chosen(runs[runs["category"] == name]) for name in order}

@@ -30,7 +30,8 @@ class SegmentErrors:
     segments
         Candidate -> sums over short segments of each of its seeds, all over the same samples.
     labels
-        Number of each segment's block, (K,); left out: the longest blocks that any seed's errors ask for.
+        Number of each segment's block, (K,); left out: the longest blocks that any seed's errors
+        ask for.
     seeds
         Candidate -> its seeds, by which rows of blocks.csv are called; left out: counted.
     recordings
@@ -46,13 +47,13 @@ class SegmentErrors:
     ) -> None:
         self.segments = {name: parts for name, parts in segments.items() if parts}
         self.seeds = seeds or {name: range(len(parts)) for name, parts in self.segments.items()}
-        every = [part for parts in self.segments.values() for part in parts]
-        self.labels = common_labels(every) if labels is None and every else labels
+        all_segments = [part for parts in self.segments.values() for part in parts]
+        self.labels = common_labels(all_segments) if labels is None and all_segments else labels
         self.names: list[str] = []
-        if self.labels is not None and every:
-            pieces = every[0].piece.astype(int).tolist()
+        if self.labels is not None and all_segments:
+            pieces = all_segments[0].piece.astype(int).tolist()
             names = [str(piece) if recordings is None else recordings[piece] for piece in pieces]
-            self.names = names_of_blocks(self.labels, names, every[0].start)
+            self.names = names_of_blocks(self.labels, names, all_segments[0].start)
 
     def __contains__(self, candidate: object) -> bool:
         """Whether it is there and all of its errors are finite."""
@@ -88,7 +89,9 @@ class SegmentErrors:
         return BlockErrors(seeds, tuple(self.names), sums, sizes)
 
     def figure(self, candidate: str, metric: str) -> Figure:
-        """An error over all seeds with its 95 % interval; NaN where the candidate is not there or not finite."""
+        """An error over all seeds with its 95 % interval; NaN where the candidate is not there or
+        not finite.
+        """
         if candidate not in self:
             return MISSING_FIGURE
         return value_of(self.block_errors(candidate, metric), metric)[1]
@@ -102,12 +105,14 @@ class SegmentErrors:
         return figure_in_words(self.figure(candidate, metric))
 
 
-def common_labels(every: Sequence[Segments]) -> NDArray[np.int64]:
-    """Number of each segment's block, (K,): the longest blocks that the finite errors of any of them ask for."""
-    counted = np.maximum(every[0].samples, 1.0)
-    losses = np.stack([part.squared_error_vy / counted for part in every])
+def common_labels(segments: Sequence[Segments]) -> NDArray[np.int64]:
+    """Number of each segment's block, (K,): the longest blocks that the finite errors of any of
+    them ask for.
+    """
+    counted = np.maximum(segments[0].samples, 1.0)
+    losses = np.stack([part.squared_error_vy / counted for part in segments])
     finite = losses[np.isfinite(losses).all(axis=1)]
-    return block_labels(every[0], finite if len(finite) else np.zeros_like(losses[:1]))
+    return block_labels(segments[0], finite if len(finite) else np.zeros_like(losses[:1]))
 
 
 def _about_mean(squares: FloatArray, sums: FloatArray, samples: FloatArray) -> FloatArray:
@@ -120,7 +125,9 @@ def _about_mean(squares: FloatArray, sums: FloatArray, samples: FloatArray) -> F
 def masked_segments(
     parts: Sequence[Scored], masks: Sequence[FloatArray], rate_hz: float
 ) -> Segments:
-    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them at ``rate_hz`` [Hz], of samples where masks (K,) are 1."""
+    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them at ``rate_hz`` [Hz],
+    of samples where masks (K,) are 1.
+    """
     marked = list(zip(parts, masks, strict=True))
     fields = ("vy", "vy_ref", "sideslip", "sideslip_ref")
     chosen = segments_of(

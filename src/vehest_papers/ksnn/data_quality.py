@@ -1,4 +1,6 @@
-"""Table I and Figures 4 and 5 of Da Lio et al. 2023: what the drives are like, and how much noise the kinematics see."""
+"""Table I and Figures 4 and 5 of Da Lio et al. 2023: what the drives are like, and how much noise
+the kinematics see.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,6 @@ from vehest_papers.kit.spectra import (
     periodogram,
     process_noise,
 )
-
-READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
-HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
-AY_WIDTH = 1.0
-LEAST_SAMPLES = 50
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ PUBLISHED_BIAS: Mapping[str, float] = {"corvette": 0.10, "ferrari": -0.03}
 def statistics(recordings: Sequence[Recording]) -> Statistics:
     """Table I's figures over all samples of some recordings with vx, yaw_rate, ay and vy_ref."""
     speed, yaw_rate, ay, velocity = (
-        np.concatenate([own[name] for own in recordings])
+        np.concatenate([recording[name] for recording in recordings])
         for name in ("vx", "yaw_rate", "ay", "vy_ref")
     )
     low, high = np.quantile(velocity, [0.01, 0.99])
@@ -68,17 +65,20 @@ def statistics(recordings: Sequence[Recording]) -> Statistics:
         yaw_rate_min=float(yaw_rate.min()),
         yaw_rate_max=float(yaw_rate.max()),
         ay=float(np.quantile(np.abs(ay), 0.99)),
-        length_km=sum(float(own["vx"].sum() / own.rate_hz) for own in recordings) / 1000.0,
-        minutes=sum(own.duration for own in recordings) / 60.0,
+        length_km=sum(float(recording["vx"].sum() / recording.rate_hz) for recording in recordings)
+        / 1000.0,
+        minutes=sum(recording.duration for recording in recordings) / 60.0,
     )
 
 
 def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
-    """Periodograms of dv/dt and of the process noise dv/dt - (a_y - ωu) [(m/s²)²/Hz] of recordings at one rate."""
+    """Periodograms of dv/dt and of the process noise dv/dt - (a_y - ωu) [(m/s²)²/Hz] of recordings
+    at one rate.
+    """
     rate_hz = recordings[0].rate_hz
     return (
-        periodogram([lateral_velocity_rate(own) for own in recordings], rate_hz),
-        periodogram([process_noise(own) for own in recordings], rate_hz),
+        periodogram([lateral_velocity_rate(recording) for recording in recordings], rate_hz),
+        periodogram([process_noise(recording) for recording in recordings], rate_hz),
     )
 
 

@@ -1,4 +1,6 @@
-"""The report: claims judged by the engine, errors on pairs of cars, sub-models, window lengths and real cars."""
+"""The report: claims judged by the engine, errors on pairs of cars, sub-models, window lengths and
+real cars.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,18 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_text
 from vehest.report.style import MISSING, fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import recordings_of, words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     DECIDED,
     claims_table,
     figure_in_words,
-    one_line,
+    without_line_breaks,
 )
 from vehest_papers.kit.verdicts import VERDICTS
 from vehest_papers.ksnn import block_errors, measures, paper
@@ -33,6 +35,7 @@ from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
 from vehest_papers.ksnn.pairs import (
     ORDER,
     PART,
+    TABLE_CANDIDATES,
     TRAININGS,
     detectable_ratio,
     errors_figure,
@@ -50,13 +53,14 @@ from vehest_papers.ksnn.sub_models import shares_of_parts, shares_table
 
 NAME = "ksnn"  # of the paper's package
 TEMPLATE = Path(__file__).with_name("report.md.j2")
-SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
-"""Part -> the paper's table, test set of the training car, test set of the other car."""
+SCHEMES = {"scheme_1": ("c2", "f2"), "scheme_2": ("f2", "c2")}
+"""Part -> test set of the training car, test set of the other car."""
 
 WINDOWS = re.compile(r"window_(\d+)_([12])")
-APART = re.compile(r"pair_|window_|doubled_")  # parts that are no `Scheme`
+NO_SCHEME = re.compile(r"pair_|window_|doubled_")  # parts that are no `Scheme`
 REAL = ("ferrari_drive", "simulated_to_ferrari", "devbot_ferrari", "ferrari_devbot")
 SMALL = ("f1tenth", "dart", "roboracer")
+REAL_CANDIDATES = ("static_map", paper.LUENBERGER, paper.GRU, paper.LSTM, paper.NONLINEAR)
 RATIO_SETS = {"Scheme 1": ("C-1", "F-2"), "Scheme 2": ("C-2", "F-1")}
 RATIO_MARGIN = 0.05
 
@@ -75,10 +79,11 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     for name in set(SCHEMES) & set(artefacts.parts):
         if not {"c2", "f2"} <= set(artefacts.parts[name].split.tests):
             raise DataError(
-                f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2"
+                f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and "
+                "f2"
             )
     schemes = with_common_blocks(
-        {name: scheme_of(artefacts, name) for name in artefacts.parts if not APART.match(name)}
+        {name: scheme_of(artefacts, name) for name in artefacts.parts if not NO_SCHEME.match(name)}
     )
     content = claims_of(NAME)
     errors = pair_errors(artefacts.parts)
@@ -103,10 +108,11 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     if len(shares):
         tables.append(shares_table(shares))
     gates = velocity_ratios(artefacts)
-    tables += [table for table in (gates, windows_table(artefacts), real_table(schemes)) if table]
+    tables += [table for table in (gates, real_table(schemes)) if table]
+    windows = windows_table(artefacts)
     verdicts = claims.frame["verdict"].value_counts()
     values = {
-        "recommendation": one_line(content.recommendation),
+        "recommendation": without_line_breaks(content.recommendation),
         "kinds": " and ".join(
             sorted({word for kind in kinds.values() for word in kind.split(" and ")})
         ).upper(),
@@ -117,16 +123,14 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "n_claims": len(claims.frame),
         "absent_parts": absent_parts(artefacts),
         "incomplete": incomplete(artefacts),
+        "has_windows": len(windows) > 0,
         "searches": [
-            {
-                "title": as_text(trial.title),
-                "value": f"{trial.validation:.4f}",
-                "chosen": trial.chosen,
-            }
+            {"title": as_text(trial.title), "value": f"{trial.validation:.4f}"}
             for trial in artefacts.trials
         ],
     }
-    data = {"pairs_ratios": ratios_table(errors).frame} if len(errors) else {}
+    data = {"pairs_ratios": ratios_table(errors)} if len(errors) else {}
+    data |= {"windows": windows} if len(windows) else {}
     data |= {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
     data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
@@ -135,30 +139,40 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
-    """A part with its cars: those of the paper by the name, others by the data set of the training."""
+    """A part with the test sets of its cars.
+
+    Cars of the paper follow from the name of the part, others from the data set of the training.
+    """
     part = artefacts.parts[name]
     title = as_text(artefacts.titles[name])
     if name in SCHEMES:
-        published, own, other = SCHEMES[name]
-        return Scheme(name, title, part, own, other, published)
+        return Scheme(name, title, part, *SCHEMES[name])
     tests = list(part.split.tests)
     if {"c2", "f2"} <= set(tests):
-        own = "c2" if name.endswith("_1") else "f2"
-        return Scheme(name, title, part, own, "f2" if own == "c2" else "c2")
+        training_test = "c2" if name.endswith("_1") else "f2"
+        return Scheme(name, title, part, training_test, "f2" if training_test == "c2" else "c2")
     datasets = {span.dataset for span in part.split.train}
-    own = next(
+    training_test = next(
         (test for test in tests if datasets & {span.dataset for span in part.split.tests[test]}),
         tests[0],
     )
-    return Scheme(name, title, part, own, next((test for test in tests if test != own), own))
+    return Scheme(
+        name,
+        title,
+        part,
+        training_test,
+        next((test for test in tests if test != training_test), training_test),
+    )
 
 
 def pair_claims(claims: Table) -> Table:
     """The claims that pairs of cars decide, without those that are open."""
     frame = claims.frame
     chosen = frame[frame["id"].str.endswith("_pairs") & frame["verdict"].isin(DECIDED)]
+    subjects = chosen["claim"].str.removeprefix("Over pairs of cars, ")
+    chosen = chosen.assign(claim=subjects.str.replace(" of the lateral velocity", ""))
     columns = {name: claims.columns[name] for name in ("claim", "published", "verdict")}
-    caption = "Claims that the pairs of cars decide; the CSV has the others too. SIMULATED."
+    caption = "Claims on the FVU of the lateral velocity that the pairs of cars decide. SIMULATED."
     return Table("pair_claims", caption, chosen, columns)
 
 
@@ -241,11 +255,10 @@ def incomplete(artefacts: StudyArtefacts) -> list[dict[str, object]]:
 
 def velocity_ratios(artefacts: StudyArtefacts) -> Table | None:
     """The gates on the pair of cars: v over ay of the Corvette over that of the Ferrari."""
-    found = next((artefacts.parts[name] for name in SCHEMES if name in artefacts.parts), None)
-    both = [artefacts.parts[name] for name in SCHEMES if name in artefacts.parts]
-    if found is None or len(both) < len(SCHEMES):
+    parts = [artefacts.parts[name] for name in SCHEMES if name in artefacts.parts]
+    if len(parts) < len(SCHEMES):
         return None
-    first, second = both
+    first, second = parts
     drives = {
         "C-1": recordings_of(first, first.split.train),
         "F-1": recordings_of(second, second.split.train),
@@ -272,14 +285,16 @@ def velocity_ratios(artefacts: StudyArtefacts) -> Table | None:
         "gate": Column("gate"),
     }
     caption = (
-        "Ratio of v over ay between the two cars: mean size of the 0.01 and 0.99 quantiles of v over the 0.99 "
-        "quantile of the magnitude of a_y. The gate was met before any network was trained."
+        "Ratio of v over ay between the two cars: mean size of the 0.01 and 0.99 quantiles of v "
+        "over the 0.99 quantile of the magnitude of a_y. The gate was met before any network was "
+        "trained."
     )
     return Table("velocity_ratios", caption, pd.DataFrame(rows), columns)
 
 
 def schemes_table(schemes: Mapping[str, Scheme]) -> Table:
-    """FVU on the other car of the structure that validation chooses of each kind: table ``schemes``.
+    """FVU on the other car of the structure that validation chooses of each kind: table
+    ``schemes``.
 
     Its CSV file has the training car and a third car too.
     """
@@ -290,28 +305,35 @@ def schemes_table(schemes: Mapping[str, Scheme]) -> Table:
         if scheme is None:
             continue
         columns[f"{name}_other"] = Column(scheme.title)
-        tests = {"other": scheme.other, "own": scheme.own, "third": THIRD}
-        for candidate in ORDER:
+        tests = {"other": scheme.other_test, "own": scheme.training_test, "third": THIRD}
+        for candidate in TABLE_CANDIDATES:
             key = scheme.key_of(candidate)
             for title, test in tests.items():
                 if test in scheme.part.split.tests and key in scheme.errors(test):
                     row = rows.setdefault(candidate, {"candidate": candidate})
                     row[f"{name}_{title}"] = scheme.errors(test).in_words(key, "fvu")
-    order = sorted(rows, key=ORDER.index)
+    order = sorted(rows, key=TABLE_CANDIDATES.index)
     table = pd.DataFrame([rows[name] for name in order]).fillna(MISSING)
-    caption = "FVU on the other car with 95 % intervals over blocks and seeds."
+    caption = "FVU on the other car, 95 % intervals over blocks and seeds; `zero` has 1."
     return Table("schemes", caption, table, columns if len(table) else {})
 
 
-def windows_table(artefacts: StudyArtefacts) -> Table | None:
-    """FVU of networks trained on windows of 15, 30 and 60 samples, on the samples that all estimate."""
+def windows_table(artefacts: StudyArtefacts) -> pd.DataFrame:
+    """FVU of networks trained on windows of N samples at the stop, mean over seeds.
+
+    Returns
+    -------
+    DataFrame
+        ``scheme``, ``candidate``, and ``own_N`` and ``other_N`` on the training and the other car,
+        on the samples that networks of all lengths estimate.
+    """
     schemes = {name: scheme_of(artefacts, name) for name in artefacts.parts if name in SCHEMES}
     windows = windows_of(artefacts)
     rows = []
     for number, (scheme_name, scheme) in enumerate(schemes.items(), start=1):
         lengths = {30: scheme} | {
-            int(match[1]): own
-            for name, own in windows.items()
+            int(match[1]): of_length
+            for name, of_length in windows.items()
             if (match := WINDOWS.fullmatch(name)) and match[2] == scheme_name[-1]
         }
         if len(lengths) < 2:
@@ -319,21 +341,11 @@ def windows_table(artefacts: StudyArtefacts) -> Table | None:
         for candidate in (paper.NONLINEAR, paper.GRU):
             row: dict[str, object] = {"scheme": f"Scheme {number}", "candidate": candidate}
             for length in sorted(lengths):
-                for test in (scheme.own, scheme.other):
+                for test in (scheme.training_test, scheme.other_test):
                     fvu = measures.fvu_after_longest_window(lengths[length], candidate, test)
-                    row[f"{'own' if test == scheme.own else 'other'}_{length}"] = fvu
+                    row[f"{'own' if test == scheme.training_test else 'other'}_{length}"] = fvu
             rows.append(row)
-    if not rows:
-        return None
-    table = pd.DataFrame(rows)
-    columns = {"scheme": Column("scheme"), "candidate": Column("candidate")} | {
-        name: Column(f"{name.split('_')[0]} car, N = {name.split('_')[1]}", decimals=3)
-        for name in table.columns[2:]
-    }
-    caption = (
-        "FVU at the stop of networks trained on windows of N samples at 20 Hz, mean over seeds."
-    )
-    return Table("windows", caption, table, columns)
+    return pd.DataFrame(rows)
 
 
 def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
@@ -342,7 +354,7 @@ def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
     rows = []
     for name in names:
         scheme = schemes[name]
-        for test in dict.fromkeys([scheme.own, scheme.other]):
+        for test in dict.fromkeys([scheme.training_test, scheme.other_test]):
             errors = scheme.errors(test)
             row: dict[str, object] = {"trained": scheme.title, "test": test}
             for candidate in ORDER:
@@ -352,6 +364,6 @@ def real_table(schemes: Mapping[str, Scheme]) -> Table | None:
     if not rows:
         return None
     columns = {"trained": Column("comparison"), "test": Column("test")}
-    columns |= {name: Column(name) for name in ORDER}
-    caption = "FVU, 95 % intervals over blocks and seeds; of each kind the structure that validation chooses."
+    columns |= {name: Column(name) for name in REAL_CANDIDATES}
+    caption = "FVU, 95 % intervals over blocks and seeds; `zero` has 1, the CSV has all candidates."
     return Table("real_cars", caption, pd.DataFrame(rows), columns)

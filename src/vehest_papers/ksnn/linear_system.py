@@ -1,4 +1,5 @@
-"""A trained KS-NN as what it is: local models, a linear parameter varying system, and three sub-models that add up.
+"""A trained KS-NN as what it is: local models, a linear parameter varying system, and three
+sub-models that add up.
 
 At constant yaw rate ω the linear network is, with e = û - u_m and s = a_y - u_m ω,
 
@@ -9,23 +10,26 @@ and, since û⁺ = e⁺ + u_m⁺, with the pseudo-measurement p = (u_m⁺ - u_m)
 
     e⁺ = (γ₂ - w₁₂)e + β₂τωv - β₂τp + (γ₂ - β₂)u_m - (1 - β₂)u_m⁺ - b₁₂.
 
-The state (v, e) starts from zero, so its three inputs s, p and {u_m, biases} are all that v̂ consists of. With
-(zI - A)⁻¹ = [[z - γ₂ + w₁₂, -ωw₁₁], [β₂τω, z - γ₁]]/D and D = det(zI - A) as in Eq. 12c,
+The state (v, e) starts from zero, so its three inputs s, p and {u_m, biases} are all that v̂
+consists of. With (zI - A)⁻¹ = [[z - γ₂ + w₁₂, -ωw₁₁], [β₂τω, z - γ₁]]/D and D = det(zI - A) as in
+Eq. 12c,
 
     v̂ = β₁τ(z - γ₂ + w₁₂)/D · s                                             first sub-model, A/D
       + β₂τw₁₁ω/D · p                                                       second sub-model, B/D
-      + ω[w₁₁(z - β₂z + β₂ - γ₂)u_m + (b₁₂w₁₁ - b₁₁(z + w₁₂ - γ₂)) z/(z - 1)]/D   third sub-model, C/D·ω
+      + ω[w₁₁(z - β₂z + β₂ - γ₂)u_m
+          + (b₁₂w₁₁ - b₁₁(z + w₁₂ - γ₂)) z/(z - 1)]/D                       third sub-model, C/D·ω
 
-which is Eq. 11 with Eqs. 12a-c. The biases are constant inputs from k = 0 on, so z/(z - 1) is their transform; the printed Eq. 12b has the
-same with its denominator lost.
+which is Eq. 11 with Eqs. 12a-c. The biases are constant inputs from k = 0 on, so z/(z - 1) is their
+transform; the printed Eq. 12b has the same with its denominator lost.
 
-Eq. 11 takes differences of u_m from rest, p(0) ∋ u_m(0)/τ, and starts from û = 0. The network starts from û = u_m(0), which adds
--ωw₁₁ z u_m(0)/D. That is what turns both differences into those from u_m(0) on: a share β₂ of it belongs to the second sub-model and
-1 - β₂ to the third. Here both belong there from the start, so no fourth part remains.
+Eq. 11 takes differences of u_m from rest, p(0) ∋ u_m(0)/τ, and starts from û = 0. The network
+starts from û = u_m(0), which adds -ωw₁₁ z u_m(0)/D. That is what turns both differences into those
+from u_m(0) on: a share β₂ of it belongs to the second sub-model and 1 - β₂ to the third. Here both
+belong there from the start, so no fourth part remains.
 
-Where ω varies, the same recursion in (v, e) has coefficients that vary with |ω|; driven by each input alone it gives three parts that
-add up to v̂ exactly. With nonlinear feedback superposition holds for the gains that were in force: f(e) = f(0) + g(e)e with
-g(e) = (f(e) - f(0))/e.
+Where ω varies, the same recursion in (v, e) has coefficients that vary with |ω|; driven by each
+input alone it gives three parts that add up to v̂ exactly. With nonlinear feedback superposition
+holds for the gains that were in force: f(e) = f(0) + g(e)e with g(e) = (f(e) - f(0))/e.
 
 Source: Da Lio et al. 2023, Section IV.
 """
@@ -49,7 +53,9 @@ SMALL_ERROR = (
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Coefficients of the blended recursion (Eqs. 14, 15); the last axis of each is the equation, v̂ then û."""
+    """Coefficients of the blended recursion (Eqs. 14, 15); the last axis of each is the equation,
+    v̂ then û.
+    """
 
     gamma: FloatArray  # γ₁, γ₂, shape (..., 2)
     beta: FloatArray  # β₁, β₂, shape (..., 2)
@@ -76,18 +82,18 @@ class LocalModels:
     def of(cls, estimator: Ksnn) -> LocalModels:
         """Copy them out of an estimator."""
         settings = estimator.settings
-        found = {name: values.astype(np.float64) for name, values in estimator.weights().items()}
+        weights = {name: values.astype(np.float64) for name, values in estimator.weights().items()}
         none = np.zeros((settings.n_local, 2))
         neurons = np.zeros((settings.n_local, 2, settings.n_hidden))
         return cls(
-            centres=np.linspace(0.0, float(found["yaw_rate_max"]), settings.n_local),
-            gamma=found["gamma"],
-            beta=found["beta"],
-            weight=found["linear_weight"],
-            bias=found.get("linear_bias", none) + found.get("output_bias", none),
-            hidden_weight=found.get("hidden_weight", neurons),
-            hidden_bias=found.get("hidden_bias", neurons),
-            output_weight=found.get("output_weight", neurons),
+            centres=np.linspace(0.0, float(weights["yaw_rate_max"]), settings.n_local),
+            gamma=weights["gamma"],
+            beta=weights["beta"],
+            weight=weights["linear_weight"],
+            bias=weights.get("linear_bias", none) + weights.get("output_bias", none),
+            hidden_weight=weights.get("hidden_weight", neurons),
+            hidden_bias=weights.get("hidden_bias", neurons),
+            output_weight=weights.get("output_weight", neurons),
             step=1.0 / settings.rate_hz,
             n_window=settings.window,
         )
@@ -124,7 +130,9 @@ class LocalModels:
         return np.where(small, self.slope(np.zeros(())), rise)
 
     def linearised(self, error: float = 0.0) -> LpvModel:
-        """The linear system that this is for linear feedback, and close to ``error`` e₀ [m/s] otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀)."""
+        """The linear system that this is for linear feedback, and close to ``error`` e₀ [m/s]
+        otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀).
+        """
         at = np.asarray(error)
         slope = self.slope(at)
         return LpvModel(
@@ -140,7 +148,9 @@ class LocalModels:
 
 @dataclass(frozen=True, eq=False)
 class LpvModel:
-    """A linear KS-NN: a linear system whose coefficients are piecewise linear in |ω| (Eqs. 14 and 15)."""
+    """A linear KS-NN: a linear system whose coefficients are piecewise linear in |ω| (Eqs. 14 and
+    15).
+    """
 
     centres: FloatArray  # breaks of the coefficients [rad/s], shape (P,)
     gamma: FloatArray  # γ₁, γ₂ at the breaks, shape (P, 2)
@@ -151,7 +161,9 @@ class LpvModel:
     n_window: int  # samples N of a window
 
     def gains(self, yaw_rate: FloatArray | float) -> Gains:
-        """Coefficients at yaw rates of any shape and sign [rad/s]; beyond the last break those of the last."""
+        """Coefficients at yaw rates of any shape and sign [rad/s]; beyond the last break those of
+        the last.
+        """
         size = np.abs(np.asarray(yaw_rate, dtype=np.float64))
         tables = (self.gamma, self.beta, self.weight, self.bias)
         return Gains(
@@ -160,16 +172,6 @@ class LpvModel:
                 for table in tables
             )
         )
-
-    def state_matrix(self, yaw_rate: FloatArray | float) -> FloatArray:
-        """A(ω) of the state (v, û - u_m), (...) -> (..., 2, 2)."""
-        omega = np.asarray(yaw_rate, dtype=np.float64)
-        own = self.gains(yaw_rate)
-        above = np.stack([own.gamma[..., 0], -omega * own.weight[..., 0]], axis=-1)
-        below = np.stack(
-            [own.beta[..., 1] * self.step * omega, own.gamma[..., 1] - own.weight[..., 1]], axis=-1
-        )
-        return np.stack([above, below], axis=-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +203,8 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
         measurements: yaw_rate, vx, ay, ax, shape (..., N, 4).
 
     Returns:
-        Parts one interval after each sample, each of shape (..., N); at constant ω they are the terms of Eq. 11.
+        Parts one interval after each sample, each of shape (..., N); at constant ω they are the
+        terms of Eq. 11.
     """
     omega, speed, ay, ax = np.moveaxis(np.asarray(measurements, dtype=np.float64), -1, 0)
     phi = models.activations(omega)
@@ -219,7 +222,7 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
         error = e.sum(axis=-1)
         gain = (phi[..., k, :, None] * models.secant(error)).sum(axis=-2)
         (gamma_1, gamma_2), (beta_1, beta_2) = (
-            np.moveaxis(own[..., k, :], -1, 0) for own in (gamma, beta)
+            np.moveaxis(gains[..., k, :], -1, 0) for gains in (gamma, beta)
         )
         pseudo = (speed[after] - speed[now]) / tau - ax[now]
         into_v = np.stack(
@@ -243,33 +246,38 @@ def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
 
 
 def decomposed_estimate(estimator: Ksnn, recording: Recording) -> SubModels:
-    """The parts of the estimate of a recording: every sample by a window of its own, as the network sees it.
+    """The parts of the estimate of a recording: every sample by a window of its own, as the network
+    sees it.
 
     Args:
         recording: at the estimator's rate.
 
     Returns:
-        Parts on the clock of the estimate, each of shape (T,), NaN until a window is full; their sum is the estimate up to the
-        precision that the network was trained in. ``error`` is û - u_m at the last sample of the window.
+        Parts on the clock of the estimate, each of shape (T,), NaN until a window is full; their
+        sum is the estimate up to the precision that the network was trained in. ``error`` is û -
+        u_m at the last sample of the window.
 
     Raises:
-        DataError: the rate is another, or the recording is shorter than a window and the sample after it.
+        DataError: the rate is another, or the recording is shorter than a window and the sample
+        after it.
     """
     models = LocalModels.of(estimator)
     if abs(recording.rate_hz * models.step - 1.0) > 1e-9:
         raise DataError(
-            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, the KS-NN works at {1.0 / models.step:g} Hz"
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, the KS-NN works "
+            f"at {1.0 / models.step:g} Hz"
         )
     if len(recording) <= models.n_window:
         raise DataError(
-            f"recording '{recording.id}' has {len(recording)} samples, a window and the one after it {models.n_window + 1}"
+            f"recording '{recording.id}' has {len(recording)} samples, a window and the one after "
+            f"it {models.n_window + 1}"
         )
     series = recording.stack(estimator.channels)
-    own = decomposed(
+    sub_models = decomposed(
         models, np.moveaxis(sliding_window_view(series, models.n_window, axis=0)[:-1], 1, 2)
     )
     padding = np.full(models.n_window, np.nan)
     names = ("slip_rate", "pseudo_measurement", "speed", "bias", "error")
     return SubModels(
-        **{name: np.concatenate([padding, getattr(own, name)[:, -1]]) for name in names}
+        **{name: np.concatenate([padding, getattr(sub_models, name)[:, -1]]) for name in names}
     )

@@ -1,8 +1,10 @@
-"""What claims of the paper measure beside errors: values by block and seed, one function a kind of claim.
+"""What claims of the paper measure beside errors: values by block and seed, one function a kind of
+claim.
 
-A ratio of two pooled errors is given by block as its linearisation: the mean over blocks is the ratio (or its logarithm), the spread
-that of a ratio of sums. Two tests have different blocks: both are cut into equally many segments, whose k-th are paired. As
-segments of two tests are independent, the variance of the difference is the sum of both.
+A ratio of two pooled errors is given by block as its linearisation: the mean over blocks is the
+ratio (or its logarithm), the spread that of a ratio of sums. Two tests have different blocks: both
+are cut into equally many segments, whose k-th are paired. As segments of two tests are independent,
+the variance of the difference is the sum of both.
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.linear_system import LocalModels, decomposed_estimate
 from vehest_papers.ksnn.schemes import Scheme, segments_on
-from vehest_papers.ksnn.sensitivities import CHANNELS, HIGHEST_HZ, YAW_RATES, sensitivity_of
+from vehest_papers.ksnn.sensitivities import CHANNELS, MAX_HZ, YAW_RATES, sensitivity_of
 
 BANDS_HZ = tuple(
     float(hz) for hz in 10.0 ** (np.arange(-10, 9) / 10.0)
 )  # centres of thirds of an octave, 0.1 to 6.3 Hz
-LEAST_SEGMENTS = 8  # of a spectrum
-LEAST_STRUCTURES = 8  # of a rank correlation
-LONGEST_WINDOW = 60  # samples of the longest windows that networks are trained on
+MIN_SEGMENTS = 8  # of a spectrum
+MIN_STRUCTURES = 8  # of a rank correlation
+MAX_WINDOW = 60  # samples of the longest windows that networks are trained on
 WEIGHTS = ("weights",)  # the only block of what is measured of trained weights
 
 
@@ -78,42 +80,46 @@ def as_ratio(logs: FloatArray) -> FloatArray:
     return np.asarray(np.exp(mean) * (1.0 + logs - mean), dtype=np.float64)
 
 
-def least_other_over_own(claim: Claim, parts: Parts) -> ByBlock | None:
-    """FVU on the other car over that on the own one, of the structure in which the ratio is smallest.
+def smallest_car_ratio(claim: Claim, parts: Parts) -> ByBlock | None:
+    """FVU on the other car over that on the own one, of the structure in which the ratio is
+    smallest.
 
     That all ratios lie above a limit is tested by the smallest alone (an intersection-union test).
     """
     scheme = parts[claim.part]
-    errors = scheme.errors(scheme.own)
+    errors = scheme.errors(scheme.training_test)
     ratios = [
-        _log_other_over_own(scheme, name)
+        _log_car_ratio(scheme, name)
         for name in scheme.structures()
-        if name in errors and name in scheme.errors(scheme.other)
+        if name in errors and name in scheme.errors(scheme.other_test)
     ]
     if not ratios:
         return None
-    least = min(ratios, key=lambda logs: float(logs.mean()))
-    return ByBlock(_segment_names(least.shape[1]), as_ratio(least))
+    smallest = min(ratios, key=lambda logs: float(logs.mean()))
+    return ByBlock(_segment_names(smallest.shape[1]), as_ratio(smallest))
 
 
-def other_over_own_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """FVU on the other car over that on the own one, of the candidate over that of the other candidate."""
+def relative_car_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
+    """FVU on the other car over that on the own one, of the candidate over that of the other
+    candidate.
+    """
     scheme = parts[claim.part]
     names = [scheme.name_of(name) for name in claim.names]
-    if not all(name in scheme.errors(scheme.own) for name in names):
+    if not all(name in scheme.errors(scheme.training_test) for name in names):
         return None
-    first, second = (_log_other_over_own(scheme, name) for name in names)
+    first, second = (_log_car_ratio(scheme, name) for name in names)
     logs = np.subtract(*paired_seeds(first, second))
     return ByBlock(_segment_names(logs.shape[1]), np.exp(logs))
 
 
-def _log_other_over_own(scheme: Scheme, name: str) -> FloatArray:
+def _log_car_ratio(scheme: Scheme, name: str) -> FloatArray:
     """Logarithm of the ratio of a structure's FVU on both cars, (S, stretches)."""
-    own, other = (
-        scheme.errors(test).block_errors(name, "fvu") for test in (scheme.own, scheme.other)
+    training_car, other_car = (
+        scheme.errors(test).block_errors(name, "fvu")
+        for test in (scheme.training_test, scheme.other_test)
     )
-    number = min(len(own.blocks), len(other.blocks))
-    return _log_of_segment_names(other, number) - _log_of_segment_names(own, number)
+    number = min(len(training_car.blocks), len(other_car.blocks))
+    return _log_of_segment_names(other_car, number) - _log_of_segment_names(training_car, number)
 
 
 def _log_of_segment_names(errors: BlockErrors, number: int) -> FloatArray:
@@ -127,7 +133,9 @@ def _segment_names(number: int) -> list[str]:
 
 
 def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Rank correlation over structures of the number of parameters and the error about its mean, in each block with each seed."""
+    """Rank correlation over structures of the number of parameters and the error about its mean, in
+    each block with each seed.
+    """
     scheme = parts[claim.part]
     errors = scheme.errors(claim.test_set)
     names = [
@@ -135,7 +143,7 @@ def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
         for name, category in scheme.structures().items()
         if category != paper.LUENBERGER and name in errors
     ]
-    if len(names) < LEAST_STRUCTURES:
+    if len(names) < MIN_STRUCTURES:
         return None
     counts = dict(
         zip(
@@ -145,8 +153,8 @@ def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
         )
     )
     by_structure = [errors.block_errors(name, "fvu") for name in names]
-    n_seeds = min(len(own.seeds) for own in by_structure)
-    sums = np.stack([own.sums[:n_seeds] for own in by_structure])
+    n_seeds = min(len(errors_of_structure.seeds) for errors_of_structure in by_structure)
+    sums = np.stack([errors_of_structure.sums[:n_seeds] for errors_of_structure in by_structure])
     n_parameters = [counts[name] for name in names]
     values = [
         [float(stats.spearmanr(n_parameters, column).statistic) for column in of_seed.T]
@@ -194,11 +202,11 @@ def _noise_ratios(claim: Claim, parts: Parts, channel: str) -> ByBlock | None:
     ratios = []
     for yaw_rate in YAW_RATES if observer is not None else ():
         assert observer is not None
-        passed = sensitivity_of(observer, yaw_rate).band_gains(HIGHEST_HZ)[place]
+        passed = sensitivity_of(observer, yaw_rate).band_gains(MAX_HZ)[place]
         if passed:  # an observer that is reset at this yaw rate passes nothing
             ratios.append(
                 [
-                    sensitivity_of(network, yaw_rate).band_gains(HIGHEST_HZ)[place] / passed
+                    sensitivity_of(network, yaw_rate).band_gains(MAX_HZ)[place] / passed
                     for network in networks
                 ]
             )
@@ -233,13 +241,17 @@ def band_powers(scheme: Scheme, model: EvaluatedModel, test: str) -> tuple[list[
 
 
 def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Power of the errors over that of Luenberger or LSTM, of the band and benchmark in which the ratio is largest."""
+    """Power of the errors over that of Luenberger or LSTM, of the band and benchmark in which the
+    ratio is largest.
+    """
     scheme = parts[claim.part]
     powers = []
     names: list[str] = []
     for category in (claim.candidate, paper.LUENBERGER, paper.LSTM):
-        of_seeds = [band_powers(scheme, own, claim.test_set) for own in _models(scheme, category)]
-        if not of_seeds or len(of_seeds[0][0]) < LEAST_SEGMENTS:
+        of_seeds = [
+            band_powers(scheme, model, claim.test_set) for model in _models(scheme, category)
+        ]
+        if not of_seeds or len(of_seeds[0][0]) < MIN_SEGMENTS:
             return None
         names = of_seeds[0][0]
         powers.append(np.stack([values for _, values in of_seeds]))
@@ -257,7 +269,9 @@ def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Operations of a step over the smaller number of GRU and LSTM, of the structures that validation chooses in scheme 1."""
+    """Operations of a step over the smaller number of GRU and LSTM, of the structures that
+    validation chooses in scheme 1.
+    """
     scheme = parts.get("scheme_1")
     if scheme is None:
         return None
@@ -266,15 +280,19 @@ def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
         for category, run in scheme.chosen.items()
         if category in (claim.candidate, *paper.PLAIN)
     }
-    own = counted.get(str(claim.candidate))
+    operations = counted.get(str(claim.candidate))
     benchmarks = [counts[0] for name in paper.PLAIN if (counts := counted.get(name)) is not None]
-    if own is None or not benchmarks:
+    if operations is None or not benchmarks:
         return None
-    return _of_weights(np.full(len(_models(scheme, claim.candidate)), own[0] / min(benchmarks)))
+    return _of_weights(
+        np.full(len(_models(scheme, claim.candidate)), operations[0] / min(benchmarks))
+    )
 
 
 def regularisation_loss_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """FVU without over FVU with validation on the other car, of the candidate over that of the other candidate."""
+    """FVU without over FVU with validation on the other car, of the candidate over that of the
+    other candidate.
+    """
     without, regularised = parts[claim.part], parts.get("scheme_2")
     if regularised is None:
         return None
@@ -315,7 +333,9 @@ def slip_rate_weights(claim: Claim, parts: Parts) -> ByBlock | None:
 def _of_local_models(
     claim: Claim, parts: Parts, value: Callable[[LocalModels], float]
 ) -> ByBlock | None:
-    networks = [load_model(own.model_folder) for own in _models(parts[claim.part], claim.candidate)]
+    networks = [
+        load_model(model.model_folder) for model in _models(parts[claim.part], claim.candidate)
+    ]
     values = [value(LocalModels.of(network)) for network in networks if isinstance(network, Ksnn)]
     return _of_weights(np.array(values)) if values else None
 
@@ -336,12 +356,16 @@ def first_sub_model_shares(claim: Claim, parts: Parts) -> ByBlock | None:
         assert isinstance(network, Ksnn)
         squares = np.zeros((2, len(first)))
         for piece, recording in enumerate(recordings):
-            own = np.flatnonzero(first.piece == piece)
+            of_piece = np.flatnonzero(first.piece == piece)
             parts_of_estimate = decomposed_estimate(network, recording)
-            known = np.isfinite(parts_of_estimate.total) & (recording.time >= first.start[own[0]])
-            segment = np.searchsorted(first.start[own], recording.time[known], "right") - 1
+            is_scored = np.isfinite(parts_of_estimate.total) & (
+                recording.time >= first.start[of_piece[0]]
+            )
+            segment = np.searchsorted(first.start[of_piece], recording.time[is_scored], "right") - 1
             for row, values in enumerate((parts_of_estimate.slip_rate, parts_of_estimate.total)):
-                squares[row, own] = np.bincount(segment, np.square(values[known]), len(own))
+                squares[row, of_piece] = np.bincount(
+                    segment, np.square(values[is_scored]), len(of_piece)
+                )
         sums.append(block_sums(squares, errors.labels))
     slip_rate, total = np.moveaxis(np.array(sums), 1, 0)
     return ByBlock(errors.names, as_ratio(0.5 * log_values(slip_rate, total)))
@@ -352,8 +376,8 @@ def stopping_epochs(claim: Claim, parts: Parts) -> ByBlock | None:
     scheme = parts[claim.part]
     name = scheme.key_of(str(claim.candidate))
     runs = scheme.runs
-    own = runs[(runs["estimator"] + "/" + runs["variant"] == name) & (runs["epochs"] > 0)]
-    if not len(own):
+    of_candidate = runs[(runs["estimator"] + "/" + runs["variant"] == name) & (runs["epochs"] > 0)]
+    if not len(of_candidate):
         return None
     training = _models(scheme, claim.candidate)[0].training
     windows_of_epoch = int(training.get("epoch_steps") or 0) * int(training.get("batch_size") or 64)
@@ -361,7 +385,7 @@ def stopping_epochs(claim: Claim, parts: Parts) -> ByBlock | None:
     if windows_of_epoch:
         drives = recordings_of(scheme.part, scheme.part.split.train)
         passes = windows_of_epoch / sum(len(drive) for drive in drives)
-    return _of_weights(passes * own["epochs"].to_numpy(dtype=float))
+    return _of_weights(passes * of_candidate["epochs"].to_numpy(dtype=float))
 
 
 def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
@@ -372,21 +396,24 @@ def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     if longer is None or not (_models(longer, candidate) and _models(scheme, candidate)):
         return None
     logs = []
-    for own in (longer, scheme):
-        sums = [_block_squares(own, model, claim.test_set) for model in _models(own, candidate)]
+    for of_length in (longer, scheme):
+        sums = [
+            _block_squares(of_length, model, claim.test_set)
+            for model in _models(of_length, candidate)
+        ]
         logs.append(0.5 * log_values(np.stack([squares for squares, _ in sums]), sums[0][1]))
     ratios = np.subtract(*paired_seeds(*logs))
     return ByBlock(_segment_names(ratios.shape[1]), as_ratio(ratios))
 
 
 def after_longest_window(scheme: Scheme, model: EvaluatedModel, test: str) -> list[Scored]:
-    """Estimate and reference where a window of `LONGEST_WINDOW` samples is full."""
+    """Estimate and reference where a window of `MAX_WINDOW` samples is full."""
     spans = scheme.part.split.tests[test]
     recordings = recordings_of(scheme.part, spans)
-    seconds = LONGEST_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
+    seconds = MAX_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
     return [
-        own.at(own.time > recording.start_time + seconds)
-        for own, recording in zip(scheme.part.scored(model, test), recordings, strict=True)
+        scored.at(scored.time > recording.start_time + seconds)
+        for scored, recording in zip(scheme.part.scored(model, test), recordings, strict=True)
     ]
 
 
@@ -395,8 +422,8 @@ def fvu_after_longest_window(scheme: Scheme, candidate: str, test: str) -> float
     values = []
     for model in _models(scheme, candidate):
         scored = after_longest_window(scheme, model, test)
-        errors = np.concatenate([own.vy - own.vy_ref for own in scored])
-        values.append(np.var(errors) / np.var(np.concatenate([own.vy_ref for own in scored])))
+        errors = np.concatenate([piece.vy - piece.vy_ref for piece in scored])
+        values.append(np.var(errors) / np.var(np.concatenate([piece.vy_ref for piece in scored])))
     return float(np.mean(values)) if values else np.nan
 
 
@@ -407,10 +434,10 @@ def _block_squares(
     length = round(SEGMENT_SECONDS * scheme.part.protocol.rate_hz)
     squares = []
     samples = []
-    for own in after_longest_window(scheme, model, test):
-        starts = np.arange(0, len(own.vy), length)
-        squares.append(np.add.reduceat(np.square(own.vy - own.vy_ref), starts))
-        samples.append(np.diff([*starts, len(own.vy)]).astype(np.float64))
+    for scored in after_longest_window(scheme, model, test):
+        starts = np.arange(0, len(scored.vy), length)
+        squares.append(np.add.reduceat(np.square(scored.vy - scored.vy_ref), starts))
+        samples.append(np.diff([*starts, len(scored.vy)]).astype(np.float64))
     return np.concatenate(squares), np.concatenate(samples)
 
 

@@ -1,26 +1,29 @@
-"""How noise of the accelerations comes through to v̂ at constant yaw rate: KS-NN and Luenberger observer in closed form.
+"""How noise of the accelerations comes through to v̂ at constant yaw rate: KS-NN and Luenberger
+observer in closed form.
 
-KS-NN. With A, D and the first two sub-models of `vehest_papers.ksnn.linear_system`, δa_y enters s = a_y - ωu_m and δa_x enters -p:
+KS-NN. With A, D and the first two sub-models of `vehest_papers.ksnn.linear_system`, δa_y enters s =
+a_y - ωu_m and δa_x enters -p:
 
     H_Y(z) = β₁τ(z + w₁₂ - γ₂)/D(z),   H_X(z) = -β₂τω w₁₁/D(z),
     D(z) = z² + (w₁₂ - γ₁ - γ₂)z + β₂ω²τw₁₁ - w₁₂γ₁ + γ₂γ₁
 
-Luenberger, implicit Euler: (M - z⁻¹I)x = τ(a_y, a_x) with M = [[1, α²ωτ], [-ωτ, 1 + d]], d = 2α|ω|τ, whence
+Luenberger, implicit Euler: (M - z⁻¹I)x = τ(a_y, a_x) with M = [[1, α²ωτ], [-ωτ, 1 + d]], d =
+2α|ω|τ, whence
 
-    H_Y(z) = τz((1 + d)z - 1)/D(z),   H_X(z) = -α²ωτ²z²/D(z),   D(z) = (1 + d + α²ω²τ²)z² - (2 + d)z + 1
+    H_Y(z) = τz((1 + d)z - 1)/D(z),   H_X(z) = -α²ωτ²z²/D(z),
+    D(z) = (1 + d + α²ω²τ²)z² - (2 + d)z + 1
 
-Both agree with the printed Eq. 18 in every sign; the Luenberger's do so only with the gains of Eq. 17 exchanged, as
-`vehest.estimators.luenberger` has them.
+Both agree with the printed Eq. 18 in every sign; the Luenberger's do so only with the gains of Eq.
+17 exchanged, as `vehest.estimators.luenberger` has them.
 
-The network forgets what is older than its window: its response to noise is the impulse response of the first N lags
-(`NoiseSensitivity.truncated`); Appendix B approximates it by the whole one.
+The network forgets what is older than its window: its response to noise is the impulse response of
+the first N lags (`NoiseSensitivity.truncated`); Appendix B approximates it by the whole one.
 
 Source: Da Lio et al. 2023, Section VIII-E and Appendix B.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,13 +36,12 @@ from vehest_papers.ksnn.linear_system import LpvModel
 
 ComplexArray = NDArray[np.complex128]
 
-NEGLIGIBLE = 1e-9  # part of an impulse response that is left out at its end
-LONGEST = 1_000_000  # samples after which an impulse response is no longer followed
-
 
 @dataclass(frozen=True, eq=False)
 class NoiseSensitivity:
-    """Transfer functions from δa_y and δa_x [m/s²] to δv̂ [m/s] as polynomials in z, highest power first."""
+    """Transfer functions from δa_y and δa_x [m/s²] to δv̂ [m/s] as polynomials in z, highest power
+    first.
+    """
 
     numerator_ay: FloatArray  # shape (3,)
     numerator_ax: FloatArray  # shape (3,)
@@ -48,14 +50,10 @@ class NoiseSensitivity:
     memory: int | None = None  # lags after which the response ends; none for one without end
 
     def truncated(self, n_window: int) -> NoiseSensitivity:
-        """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse response."""
+        """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse
+        response.
+        """
         return replace(self, memory=n_window)
-
-    @property
-    def poles(self) -> ComplexArray:
-        """Poles of the recursion, the larger first."""
-        roots = np.asarray(np.roots(self.denominator), dtype=np.complex128)
-        return roots[np.argsort(-np.abs(roots))]
 
     def response(self, frequency: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """H_Y and H_X at frequencies [Hz], each of their shape [(m/s)/(m/s²)]."""
@@ -86,32 +84,12 @@ class NoiseSensitivity:
             to_ax[self.memory + 1 :] = 0.0
         return to_ay, to_ax
 
-    def whole_impulse_responses(self) -> tuple[FloatArray, FloatArray]:
-        """As `impulse_responses`, up to where nothing worth mentioning follows; a growing response is cut off."""
-        if self.memory is not None:
-            return self.impulse_responses(self.memory + 1)
-        radius = float(np.abs(self.poles[0])) if np.any(self.denominator[1:]) else 0.0
-        length = (
-            LONGEST
-            if radius >= 1.0
-            else min(100 + math.ceil(math.log(NEGLIGIBLE) / math.log(max(radius, 1e-3))), LONGEST)
-        )
-        return self.impulse_responses(length)
-
-    def white_noise_gains(self) -> tuple[float, float]:
-        """Standard deviation of δv̂ for white noise of one m/s² a sample in a_y, and in a_x [m/s].
-
-        The square is Σh² = ∫|H|²df/rate over all frequencies from -rate/2 to rate/2; infinite where the response grows.
-        """
-        if self.memory is None and float(np.abs(self.poles[0])) >= 1.0:
-            return math.inf, math.inf
-        to_ay, to_ax = self.whole_impulse_responses()
-        return float(np.sqrt(np.sum(to_ay**2))), float(np.sqrt(np.sum(to_ax**2)))
-
     def band_gains(self, highest_hz: float, n_lines: int = 4001) -> tuple[float, float]:
-        """Standard deviation of δv̂ for noise of density 1 (m/s²)/√Hz from 0 to a frequency, for a_y and for a_x [m/s].
+        """Standard deviation of δv̂ for noise of density 1 (m/s²)/√Hz from 0 to a frequency, for
+        a_y and for a_x [m/s].
 
-        So estimators of different rates compare: the noise is that of the sensor, not of the sample.
+        So estimators of different rates compare: the noise is that of the sensor, not of the
+        sample.
         """
         frequency = np.linspace(0.0, highest_hz, n_lines)
         to_ay, to_ax = self.response(frequency)
@@ -121,12 +99,14 @@ class NoiseSensitivity:
 
 
 def ksnn_sensitivity(model: LpvModel, yaw_rate: float) -> NoiseSensitivity:
-    """Of a linear KS-NN without end, at constant yaw rate [rad/s]; `NoiseSensitivity.truncated` makes it that of its windows."""
-    own = model.gains(yaw_rate)
+    """Of a linear KS-NN without end, at constant yaw rate [rad/s]; `NoiseSensitivity.truncated`
+    makes it that of its windows.
+    """
+    gains = model.gains(yaw_rate)
     tau = model.step
-    (gamma_1, gamma_2) = own.gamma
-    (beta_1, beta_2) = own.beta
-    (weight_1, weight_2) = own.weight
+    (gamma_1, gamma_2) = gains.gamma
+    (beta_1, beta_2) = gains.beta
+    (weight_1, weight_2) = gains.weight
     constant = beta_2 * yaw_rate**2 * tau * weight_1 - weight_2 * gamma_1 + gamma_2 * gamma_1
     return NoiseSensitivity(
         numerator_ay=np.array([0.0, beta_1 * tau, beta_1 * tau * (weight_2 - gamma_2)]),
@@ -137,7 +117,9 @@ def ksnn_sensitivity(model: LpvModel, yaw_rate: float) -> NoiseSensitivity:
 
 
 def luenberger_sensitivity(estimator: Luenberger, yaw_rate: float) -> NoiseSensitivity:
-    """Of a fitted Luenberger observer at its own rate; zero where the yaw rate is so small that it resets its state."""
+    """Of a fitted Luenberger observer at its own rate; zero where the yaw rate is so small that it
+    resets its state.
+    """
     tau = 1.0 / estimator.settings.rate_hz
     gain = estimator.gain
     damping = 2.0 * gain * abs(yaw_rate) * tau

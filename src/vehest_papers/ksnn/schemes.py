@@ -1,4 +1,6 @@
-"""A comparison across vehicles: what learns on one car, stops on another and is tested on both, with all errors of its candidates."""
+"""A comparison across vehicles: what learns on one car, stops on another and is tested on both,
+with all errors of its candidates.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,6 @@ from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
 from vehest_papers.ksnn.comparing import SegmentErrors, common_labels
-from vehest_papers.ksnn.paper import Published
 
 CANDIDATES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP}  # name in blocks.csv -> category
 STEERING = ("GRU with steering angle", "GRU without steering angle")  # each in parts of its own
@@ -33,8 +34,8 @@ def _read(path: Path) -> dict[str, Segments]:
 
 def segments_on(model: EvaluatedModel, test: str) -> Segments:
     """Errors of a model by segments of a test set, its file read once for all tests."""
-    found = _read(model.evaluation_folder / "blocks.csv")
-    return found[test] if test in found else model.segments(test)
+    segments = _read(model.evaluation_folder / "blocks.csv")
+    return segments[test] if test in segments else model.segments(test)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +45,8 @@ class Scheme:
     name: str  # of the part
     title: str  # for people
     part: PartArtefacts  # what was compared
-    own: str  # test set of the car that is learnt on
-    other: str  # test set of the car that is stopped on
-    published: Mapping[str, Published] = field(
-        default_factory=dict
-    )  # the paper's table of this scheme; empty where it has none
+    training_test: str  # test set of the training car
+    other_test: str  # test set of the car that is early-stopped on
     labels: Mapping[str, NDArray[np.int64]] = field(
         default_factory=dict
     )  # test set -> block of each segment; empty: by the errors of this part alone
@@ -69,7 +67,9 @@ class Scheme:
         return words_of_kinds(self.part)
 
     def models(self, category: str) -> list[EvaluatedModel]:
-        """All seeds of the structure that validation chooses of a category; none where it is not there."""
+        """All seeds of the structure that validation chooses of a category; none where it is not
+        there.
+        """
         return self.models_of(self.name_of(category))
 
     def models_of(self, name: str) -> list[EvaluatedModel]:
@@ -79,7 +79,8 @@ class Scheme:
     def key_of(self, candidate: str) -> str:
         """Name in `errors` of a candidate of claims.yaml; empty where it is not there.
 
-        A category stands for the structure that validation chooses, ``CATEGORY, STRUCTURE`` for that structure.
+        A category stands for the structure that validation chooses, ``CATEGORY, STRUCTURE`` for
+        that structure.
         """
         if candidate in CANDIDATES:
             return self.name_of(CANDIDATES[candidate])
@@ -135,8 +136,8 @@ class Scheme:
 
     def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:
         """Name in `errors` -> category, of all structures of these categories."""
-        wanted = set(categories)
-        rows = self.runs[self.runs["category"].isin(wanted)].drop_duplicates(
+        chosen = set(categories)
+        rows = self.runs[self.runs["category"].isin(chosen)].drop_duplicates(
             ["estimator", "variant"]
         )
         return {
@@ -146,7 +147,9 @@ class Scheme:
 
 
 def with_common_blocks(schemes: Mapping[str, Scheme]) -> dict[str, Scheme]:
-    """The same parts, those that share a test range on the same blocks, so that candidates of two parts can be compared."""
+    """The same parts, those that share a test range on the same blocks, so that candidates of two
+    parts can be compared.
+    """
     groups: dict[tuple[Span, ...], list[tuple[str, str]]] = {}
     for name, scheme in schemes.items():
         for test, spans in scheme.part.split.tests.items():

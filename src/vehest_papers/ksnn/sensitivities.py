@@ -1,4 +1,6 @@
-"""How noise of the accelerations comes through an estimator (Figure 7 of Da Lio et al. 2023), in closed form."""
+"""How noise of the accelerations comes through an estimator (Figure 7 of Da Lio et al. 2023), in
+closed form.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,13 @@ from vehest_papers.ksnn.noise_sensitivity import (
 
 # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
 YAW_RATES = (0.2, 0.4)
-HIGHEST_HZ = 10.0
+MAX_HZ = 10.0
 CHANNELS = ("ay", "ax")
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
+    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error``
+    where it is not linear.
 
     Raises `ConfigurationError` where it is neither a KS-NN nor a Luenberger observer.
     """

@@ -1,4 +1,4 @@
-"""What trained KS-NNs do: shares of the three sub-models of Eq. 11 in the variance of the estimate."""
+"""Shares of the three sub-models of Eq. 11 in the variance of the estimate of trained KS-NNs."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ def variance_shares(estimator: Ksnn, recordings: Sequence[Recording]) -> dict[st
         ``slip_rate``, ``pseudo_measurement`` and ``third``, which add up to 1.
     """
     parts = [decomposed_estimate(estimator, recording) for recording in recordings]
-    total = np.concatenate([own.total for own in parts])
-    is_known = np.isfinite(total)
-    total = total[is_known] - total[is_known].mean()
+    total = np.concatenate([part.total for part in parts])
+    is_finite = np.isfinite(total)
+    total = total[is_finite] - total[is_finite].mean()
     return {
-        name: float(np.concatenate([getattr(own, name) for own in parts])[is_known] @ total)
+        name: float(np.concatenate([getattr(part, name) for part in parts])[is_finite] @ total)
         / float(total @ total)
         for name in NAMES
     }
 
 
-def shares_of_parts(parts: Mapping[str, PartArtefacts], test: str, where: str) -> pd.DataFrame:
+def shares_of_parts(parts: Mapping[str, PartArtefacts], test: str, data: str) -> pd.DataFrame:
     """Shares of every trained KS-NN of some parts on one test set, a row each network."""
     rows = []
     for name, part in parts.items():
@@ -58,7 +58,7 @@ def shares_of_parts(parts: Mapping[str, PartArtefacts], test: str, where: str) -
             assert isinstance(estimator, Ksnn)
             rows.append(
                 {
-                    "data": where,
+                    "data": data,
                     "training": match[2] if match else "",
                     "candidate": candidate_of(model),
                     "part": name,
@@ -85,7 +85,7 @@ def shares_table(shares: pd.DataFrame) -> Table:
         "third": Column("third: map of ω and u [%]", decimals=0),
     }
     caption = (
-        "Shares of the three sub-models of the paper's Eq. 11 in the variance of the estimate on the training car, "
-        "medians over networks; a negative share works against the others."
+        "Shares of the three sub-models of the paper's Eq. 11 in the variance of the estimate on "
+        "the training car, medians over networks; a negative share works against the others."
     )
     return Table("sub_model_shares", caption, pd.DataFrame(rows, columns=[*columns]), columns)

@@ -1,4 +1,6 @@
-"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the ranges of the recordings."""
+"""The appendices: errors by state, consistency, slip angles, budgets, trials, settings, and the
+ranges of the recordings.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,13 @@ from typing import Any
 import pandas as pd
 
 from vehest.data.splits import Span
-from vehest.report.document import Block, Column, Table, as_code
+from vehest.report.document import Block, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.kit import methods
 from vehest_papers.kit.block_rows import TRAINING
 from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
-from vehest_papers.learned_ukf import paper, slips, tables
+from vehest_papers.learned_ukf import slips, tables
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.filtering import loaded
 from vehest_papers.learned_ukf.trials import trials_table
@@ -25,34 +27,29 @@ def appendix_of_part(
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    where: str,
+    source: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """Consistency of the filters and slip angles; errors by state and budgets of the main part as files."""
+    """Consistency of the filters and slip angles; errors by state and budgets of the main part as
+    files.
+    """
     kind = words_of_kinds(part).upper()
-    state = f"Root mean square errors by state, median and range of seeds; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
-        f"Consistency of the filters: normalised estimation errors squared over vx, vy and yaw rate (NEES) and normalised innovations "
-        f"squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of vy's errors within one and two of "
-        f"the filter's own standard deviations. Data: {kind}."
+        "Consistency of the filters: normalised estimation errors squared over vx, vy and yaw "
+        "rate (NEES) and normalised innovations squared (NIS), 1 for a consistent filter and "
+        "above 1 for one too sure of itself; share of vy's errors within one and two of the "
+        f"filter's own standard deviations. Data: {kind}."
     )
-    budget = (
-        f"What was spent: seeds, and epochs as medians of seeds. {paper.NNTF_UH_LOW} is {paper.NNTF_UH} with another start and shares its "
-        f"training. Data: {kind}."
-    )
-    for table in (
-        tables.by_state(runs, list(SETS), f"by_state_{name}", state),
-        tables.budget(part, runs, f"budget_{name}", budget),
-    ):
-        data[table.name] = table.frame
+    data[f"by_state_{name}"] = tables.by_state(runs, list(SETS))
+    data[f"budget_{name}"] = tables.budget(part, runs)
     return [
         "## Appendix: consistency of the filters",
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
-        *_slips(part, name, where, data),
+        *_slips(part, name, source, data),
     ]
 
 
-def how_it_was_made(
+def provenance(
     artefacts: StudyArtefacts,
     main: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
@@ -64,10 +61,12 @@ def how_it_was_made(
     lines = [
         f"Command: {as_code(artefacts.command)}",
         methods.scoring(first),
-        "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
-        "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
+        "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted "
+        "0.2225, 0.5064 and 0.1566 and summed at each sample; their means are MSE (weighted) and "
+        "MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
-        "Figures that show one seed show the one with the lowest MSE (weighted) on the validation range. Test data choose nothing.",
+        "Figures that show one seed show the one with the lowest MSE (weighted) on the "
+        "validation range. Test data choose nothing.",
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
     ]
     blocks: list[Block] = []
@@ -75,11 +74,10 @@ def how_it_was_made(
         remarks = " ".join(f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks)
         table = trials_table(artefacts.trials)
         blocks += ["## Appendix: trials", *([remarks] if remarks else []), table]
-    ranges = _ranges(artefacts, main)
-    data[ranges.name] = ranges.frame
+    data["data"] = _ranges(artefacts, main)
     names = sorted({*data, TRAINING})
     files = ", ".join(f"[{name}](tables/{name}.csv)" for name in names)
-    return [*blocks, methods.how_it_was_made(lines), f"Further tables: {files}."]
+    return [*blocks, methods.provenance(lines), f"Further tables: {files}."]
 
 
 def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
@@ -101,7 +99,8 @@ def _flat(settings: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, An
             yield f"{head}{key}", value
 
 
-def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Table:
+def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> pd.DataFrame:
+    """Ranges of each part with their minutes and sequences."""
     rows: list[dict[str, object]] = []
     for name, part in main.items():
         row: dict[str, object] = {
@@ -114,21 +113,11 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
             *part.split.tests.items(),
         ):
             row[label] = (
-                f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} min{_sequences(part, label)}"
+                f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} "
+                f"min{_sequences(part, label)}"
             )
         rows.append(row)
-    columns = {
-        "part": Column("part"),
-        "kind": Column("data"),
-        "train": Column("training"),
-        "validation": Column("validation"),
-    }
-    columns |= {test: Column(f"test, {tyre}") for test, tyre in SETS.items()}
-    caption = (
-        f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in all and learns on about "
-        f"{fixed(paper.MINUTES_LEARNT, 1)} min of tyre A ({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
-    )
-    return Table("data", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def minutes(part: PartArtefacts, spans: Sequence[Span]) -> float:
@@ -148,7 +137,7 @@ def _sequences(part: PartArtefacts, test: str) -> str:
 
 
 def _slips(
-    part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]
+    part: PartArtefacts, name: str, source: str, data: dict[str, pd.DataFrame]
 ) -> list[Block]:
     filters = [model for model in part.models if model.estimator == "learned_ukf"]
     if not filters:
@@ -159,9 +148,13 @@ def _slips(
         **{f"test, {tyre}": part.split.tests[test] for test, tyre in SETS.items()},
     }
     angles = {
-        label: slips.rear_slip(recordings_of(part, own), distance) for label, own in sets.items()
+        label: slips.rear_slip(recordings_of(part, spans), distance)
+        for label, spans in sets.items()
     }
-    note = f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts from."
-    figure, table, drawn = slips.distribution(angles, name, where, note)
-    data |= {f"slip_density_{name}": drawn, table.name: table.frame}
+    note = (
+        f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts "
+        "from."
+    )
+    figure, percentiles, drawn = slips.distribution(angles, name, source, note)
+    data |= {f"slip_density_{name}": drawn, f"slip_percentiles_{name}": percentiles}
     return ["## Appendix: slip angles", figure]

@@ -1,6 +1,8 @@
-"""Errors of every candidate, sequence by sequence and seed by seed, and how far each was trained: blocks.csv and training.csv.
+"""Errors of every candidate, sequence by sequence and seed by seed, and how far each was trained:
+blocks.csv and training.csv.
 
-A block is a sequence of 10 s, as the paper scores it. The four folds over tyre A are one part, ``tyre_a_folds``.
+A block is a sequence of 10 s, as the paper scores it. The four folds over tyre A are one part,
+``tyre_a_folds``.
 """
 
 from __future__ import annotations
@@ -40,11 +42,15 @@ from vehest_papers.learned_ukf.prediction import AFTER, BEFORE, Compared
 DOUBLED = "doubled"
 FOLD = re.compile(r"(tyre_a_fold)_\d+")
 LIKELIHOOD = "likelihood"
-GIVEN_NOISE = "given_noise"
-NAMED_ALIKE = (DOUBLED, LIKELIHOOD, GIVEN_NOISE)  # parts whose candidates have the names of others
+AUTHORS_NOISE = "given_noise"
+DUPLICATE_NAMES = (
+    DOUBLED,
+    LIKELIHOOD,
+    AUTHORS_NOISE,
+)  # parts whose candidates have the names of others
 SCRATCH = "scratch"
 LENGTH = re.compile(r"length_(\d+)(_samples)?")
-LONGEST = 500  # samples of a sequence, which both ways of Figure 7 share
+MAX_STEPS = 500  # samples of a sequence, which both ways of Figure 7 share
 WHEEL_SPEED = {"rim_speed": "wheel_speed"}  # name of a state -> name in a metric
 SWAPPED = f"{AFTER} predicting, {BEFORE} observing"
 
@@ -56,12 +62,14 @@ def part_name(name: str) -> str:
 
 
 def candidate_name(part: str, candidate: str) -> str:
-    """Candidate of a part as blocks.csv has it: with the length of its training sequences where parts differ in it."""
+    """Candidate of a part as blocks.csv has it: with the length of its training sequences where
+    parts differ in it.
+    """
     length = LENGTH.fullmatch(part)
     if length is None:
         return BASELINE_NAMES.get(candidate, candidate)
     steps, by_samples = length.groups()
-    if int(steps) == LONGEST:
+    if int(steps) == MAX_STEPS:
         return f"{candidate}, {steps} steps"
     return f"{candidate}, {steps} steps, constant {'samples' if by_samples else 'batch'}"
 
@@ -69,8 +77,8 @@ def candidate_name(part: str, candidate: str) -> str:
 def losses_of(scored: Scored) -> Iterator[tuple[str, float, int]]:
     """Metric, sum of its loss over a sequence, and samples in the sum.
 
-    The weighted losses of Tables I and II; squared errors of vx, vy [m²/s²], yaw rate [rad²/s²] and sideslip [deg²]. ``ae99_weighted`` is the
-    sequence's 99th percentile times its samples.
+    The weighted losses of Tables I and II; squared errors of vx, vy [m²/s²], yaw rate [rad²/s²] and
+    sideslip [deg²]. ``ae99_weighted`` is the sequence's 99th percentile times its samples.
     """
     samples = len(scored.vy)
     absolute = weighted_errors(scored, np.abs)
@@ -85,7 +93,7 @@ def losses_of(scored: Scored) -> Iterator[tuple[str, float, int]]:
 
 
 def sequence_names(part: PartArtefacts, test: str) -> list[str]:
-    """Name of each sequence of a test set, or of the validation: its recording and when it begins."""
+    """Name of each sequence of a test set or the validation: its recording and first time."""
     pieces = pieces_of(
         part.split.validation if test == VALIDATION else part.split.tests[test],
         lambda span: read_recording(part.references[span.dataset, span.recording]),
@@ -128,7 +136,8 @@ def prediction_rows(
     drives: Mapping[str, Drive],
     seeds: Sequence[int],
 ) -> list[BlockRow]:
-    """Squared errors of one-step predictions, and the weighted loss of a filter that observes with another model than it predicts with.
+    """Squared errors of one-step predictions, and the weighted loss of a filter that observes with
+    another model than it predicts with.
 
     Parameters
     ----------
@@ -143,18 +152,18 @@ def prediction_rows(
     """
     rows = []
     skip = round(part.protocol.skip_seconds * part.protocol.rate_hz)
-    for test, own in compared.items():
+    for test, of_test in compared.items():
         names = sequence_names(part, test)
         samples = drives[test].states.shape[1]
         for place, seed in enumerate(seeds):
-            for candidate, squares in zip((BEFORE, AFTER), own.one_step[:, place], strict=True):
+            for candidate, squares in zip((BEFORE, AFTER), of_test.one_step[:, place], strict=True):
                 for k, state in enumerate(MOVING):
                     metric = f"one_step_rmse_{WHEEL_SPEED.get(state, state)}"
                     head = BlockRow(name, candidate, seed, test, metric, "", 0.0, 0)
                     rows += block_rows(head, names, (samples - 1) * squares[:, k], samples - 1)
             head = BlockRow(name, SWAPPED, seed, test, "mse_weighted", "", 0.0, 0)
             scored = samples - skip
-            rows += block_rows(head, names, scored * own.swaps[1, 0][place], scored)
+            rows += block_rows(head, names, scored * of_test.swaps[1, 0][place], scored)
     return rows
 
 
@@ -165,7 +174,13 @@ def measured_rows(
     measured: Mapping[tuple[str, str], FloatArray],
     seeds: Sequence[int],
 ) -> list[BlockRow]:
-    """Values of claims that need a measurement of their own: (claim's id, candidate) -> value of each seed and sequence, (S, B)."""
+    """Rows of the claims that are not comparisons of errors.
+
+    Parameters
+    ----------
+    measured
+        (id of the claim, candidate) -> value of each seed and sequence, (S, B).
+    """
     names = sequence_names(part, test)
     rows = []
     for (claim, candidate), values in measured.items():
@@ -175,12 +190,14 @@ def measured_rows(
 
 
 def scratch_rows(name: str, part: PartArtefacts, main: PartArtefacts) -> list[BlockRow]:
-    """Validation losses of trainings from scratch over the highest of the pre-trained ones, by validation sequence."""
+    """Validation losses of trainings from scratch over the highest of the pre-trained ones, by
+    validation sequence.
+    """
     (candidate,) = models_by_candidate(part)
-    pre_trained = models_by_candidate(main).get(paper.NNTF_UH)
-    if pre_trained is None:
+    models_of_main = models_by_candidate(main).get(paper.NNTF_UH)
+    if models_of_main is None:
         return []
-    scratch, others = (
+    scratch, pre_trained = (
         np.array(
             [
                 [
@@ -190,16 +207,16 @@ def scratch_rows(name: str, part: PartArtefacts, main: PartArtefacts) -> list[Bl
                 for model in models
             ]
         )
-        for of, models in ((part, part.models), (main, pre_trained))
+        for of, models in ((part, part.models), (main, models_of_main))
     )
-    values = measures.validation_over_worst_pre_trained(scratch, others)
+    values = measures.validation_over_worst_pre_trained(scratch, pre_trained)
     measured = {("from_scratch_in_local_minima", candidate): values}
     seeds = [model.seed for model in part.models]
     return measured_rows(name, part, VALIDATION, measured, seeds)
 
 
 def rise_rows(name: str, part: PartArtefacts, rows: Sequence[BlockRow]) -> list[BlockRow]:
-    """Rise of the MSE of NNTF_UH on the unseen tyre over that of the others, where all are trained."""
+    """Rise of the MSE of NNTF_UH on tyre D over that of the others, where all are trained."""
     values = measures.rise_over_least_rise_of_others(blocks_of(rows), name)
     if values is None:
         return []
@@ -210,7 +227,7 @@ def rise_rows(name: str, part: PartArtefacts, rows: Sequence[BlockRow]) -> list[
 def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int]:
     """Candidate as blocks.csv has it -> number of its trainings that are planned and not done.
 
-    Those of `NAMED_ALIKE` and of folds belong to no candidate of their own.
+    Those of `DUPLICATE_NAMES` and of folds belong to no candidate of their own.
 
     Parameters
     ----------
@@ -219,7 +236,7 @@ def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int
     """
     counts: Counter[str] = Counter()
     for part, names in not_trained.items():
-        if part in NAMED_ALIKE or FOLD.fullmatch(part):
+        if part in DUPLICATE_NAMES or FOLD.fullmatch(part):
             continue
         for name in names:
             from_scratch = paper.FROM_SCRATCH if part == SCRATCH else ""
@@ -230,7 +247,8 @@ def seeds_not_trained(not_trained: Mapping[str, Sequence[str]]) -> dict[str, int
 def training_rows(
     parts: Mapping[str, PartArtefacts], main: str, not_trained: Mapping[str, int]
 ) -> list[TrainingRow]:
-    """How far every candidate was trained; those of the main part are checked by the part with twice the epochs.
+    """How far every candidate was trained; those of the main part are checked by the part with
+    twice the epochs.
 
     ``not_trained``: candidate -> number of its seeds that are not trained yet.
     """

@@ -1,4 +1,6 @@
-"""What the candidates of the parts beside the main one were trained on, and their validation losses."""
+"""What the candidates of the parts beside the main one were trained on, and their validation
+losses.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +11,13 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.data.splits import VALIDATION
-from vehest.report.document import Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit.reading import lengths_of, median_and_range, metric_values
 
 Candidate = tuple[PartArtefacts, Sequence[EvaluatedModel]]  # part and the candidate's seeds
 
 
-def budgets_table(candidates: Mapping[str, Candidate], name: str, data: str) -> Table:
+def budgets(candidates: Mapping[str, Candidate]) -> pd.DataFrame:
     """Epochs, batches, samples and validation losses, a row for each candidate, by its title."""
     rows: list[dict[str, object]] = []
     for title, (part, models) in candidates.items():
@@ -39,22 +40,7 @@ def budgets_table(candidates: Mapping[str, Candidate], name: str, data: str) -> 
                 for model, loss in zip(models, losses, strict=True)
             }
         )
-    columns = {
-        "title": Column("candidate"),
-        "seeds": Column("seeds", decimals=0),
-        "one_step": Column("epochs, one-step", decimals=0),
-        "through": Column("epochs, through the filter", decimals=0),
-        "steps": Column("samples of a sequence", decimals=0),
-        "batch": Column("sequences in a batch", decimals=0),
-        "step_size": Column("step size through the filter", digits=1, each=True),
-        "samples": Column("samples trained on in all", decimals=0),
-        "validation": Column("MSE, validation"),
-    }
-    caption = (
-        "Trainings of the parts beside the tables: samples count each time they are used, one-step and through the filter. "
-        f"Validation: weighted MSE on tyre A, run 0, median and range of seeds. Data: {data}."
-    )
-    return Table(f"budgets_{name}", caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def validation_losses(part: PartArtefacts, models: Sequence[EvaluatedModel]) -> FloatArray:
@@ -69,14 +55,16 @@ def validation_losses(part: PartArtefacts, models: Sequence[EvaluatedModel]) -> 
 
 
 def samples_trained_on(part: PartArtefacts, model: EvaluatedModel) -> int:
-    """Samples that a seed is trained on, each counted as often as it is used: pairs one-step, sequences through the filter."""
+    """Samples that a seed is trained on, each counted as often as it is used: pairs one-step,
+    sequences through the filter.
+    """
     training = model.training
     drives = lengths_of(part, part.split.train)
     steps = int(training["steps"])
     pairs = sum(length - 1 for length in drives)
     samples = sum(length // steps * steps for length in drives)
-    one_step = int(training["one_step"]["max_epochs"]) * pairs
-    return one_step + int(_second_phase(model)["max_epochs"]) * samples
+    prediction_samples = int(training["one_step"]["max_epochs"]) * pairs
+    return prediction_samples + int(_second_phase(model)["max_epochs"]) * samples
 
 
 def _second_phase(model: EvaluatedModel) -> Mapping[str, float]:

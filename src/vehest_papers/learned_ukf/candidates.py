@@ -1,4 +1,6 @@
-"""Candidates of a part: every run with its metrics, by what the paper calls it, and its losses sample by sample."""
+"""Candidates of a part: every run with its metrics, by what the paper calls it, and its losses
+sample by sample.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def candidate_of(model: EvaluatedModel | Trial) -> str:
 
 
 def candidate_of_training(name: str) -> str:
-    """What the paper calls a training that is planned, ``learned_ukf-nntf_u-seed0``; itself if the paper has none like it."""
+    """What the paper calls a training that is planned, ``learned_ukf-nntf_u-seed0``; itself if the
+    paper has none like it.
+    """
     estimator, _, variant = name.rpartition("-seed")[0].partition("-")
     return _name_of(estimator, variant, name)
 
@@ -75,48 +79,59 @@ def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
 def runs_of(part: PartArtefacts) -> pd.DataFrame:
     """One row a run, candidates in the order of Table II.
 
-    Columns: candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and for each test set ``METRIC.SET`` of
-    `ACCURACY` and `CONSISTENCY`; the latter are NaN for methods without.
+    Columns: candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and for
+    each test set ``METRIC.SET`` of `ACCURACY` and `CONSISTENCY`; the latter are NaN for methods
+    without.
 
     Raises:
         DataError: a metric is missing.
     """
-    known = metric_values(part)
+    values = metric_values(part)
     rows = []
     for candidate, models in models_by_candidate(part).items():
         for model in models:
-            own = (model.estimator, model.variant, model.seed)
-            needed = {
-                f"{metric}.{test}": (*own, test, metric)
+            run_key = (model.estimator, model.variant, model.seed)
+            required = {
+                f"{metric}.{test}": (*run_key, test, metric)
                 for test in part.split.tests
                 for metric in ACCURACY
             }
-            needed |= {f"mse_weighted.{VALIDATION}": (*own, VALIDATION, "mse_weighted")}
-            needed |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
+            required |= {f"mse_weighted.{VALIDATION}": (*run_key, VALIDATION, "mse_weighted")}
+            required |= {
+                metric: (*run_key, next(iter(part.split.tests)), metric) for metric in OF_MODEL
+            }
             if candidate in paper.BASELINES:
                 for test in (*part.split.tests, VALIDATION):
                     figures = accuracy(scored_of(part, model, test))
-                    known |= {(*own, test, metric): figures[metric] for metric in ACCURACY}
-                known |= {(*own, next(iter(part.split.tests)), "epochs"): math.nan}
-            missing = [column for column, key in needed.items() if key not in known]
+                    values |= {(*run_key, test, metric): figures[metric] for metric in ACCURACY}
+                values |= {(*run_key, next(iter(part.split.tests)), "epochs"): math.nan}
+            missing = [column for column, key in required.items() if key not in values]
             if missing:
                 raise DataError(
-                    f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again"
+                    f"study '{part.study}': {run_key[0]}-{run_key[1]}-seed{run_key[2]} has no "
+                    f"{missing[0]}; "
+                    "evaluate it again"
                 )
-            wanted = needed | {
-                f"{metric}.{test}": (*own, test, metric)
+            keys = required | {
+                f"{metric}.{test}": (*run_key, test, metric)
                 for test in part.split.tests
                 for metric in CONSISTENCY
             }
-            row = {"candidate": candidate, "estimator": own[0], "variant": own[1], "seed": own[2]}
-            rows.append(row | {column: known.get(key, math.nan) for column, key in wanted.items()})
+            row = {
+                "candidate": candidate,
+                "estimator": run_key[0],
+                "variant": run_key[1],
+                "seed": run_key[2],
+            }
+            rows.append(row | {column: values.get(key, math.nan) for column, key in keys.items()})
     return pd.DataFrame(rows)
 
 
 def scored_of(part: PartArtefacts, model: EvaluatedModel, test: str) -> list[Scored]:
     """Estimate and reference of a model on each sequence of a test set, or of ``validation``.
 
-    Baselines estimate the lateral velocity alone; their forward velocity is the measured rim speed, their yaw rate the gyroscope's.
+    Baselines estimate the lateral velocity alone; their forward velocity is the measured rim speed,
+    their yaw rate the gyroscope's.
     """
     scored = part.scored(model, test)
     if model.estimator not in _BASELINES:
@@ -128,13 +143,13 @@ def scored_of(part: PartArtefacts, model: EvaluatedModel, test: str) -> list[Sco
         part.protocol,
     )
     completed = []
-    for own, (reference, piece) in zip(scored, pieces, strict=True):
+    for estimate, (reference, piece) in zip(scored, pieces, strict=True):
         first, end = scored_range(reference, piece, part.protocol)
-        others = {
+        other_states = {
             name: (reference[name][first:end], reference[REFERENCES[name]][first:end])
             for name in ("vx", "yaw_rate")
         }
-        completed.append(replace(own, other_states=others))
+        completed.append(replace(estimate, other_states=other_states))
     return completed
 
 
@@ -145,7 +160,7 @@ def of_candidate(runs: pd.DataFrame, candidate: str, column: str) -> FloatArray:
 
 def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> EvaluatedModel:
     """The seed with the lowest weighted MSE on the validation range. Test sets choose nothing."""
-    own = of_candidate(runs, candidate, f"mse_weighted.{VALIDATION}")
+    errors = of_candidate(runs, candidate, f"mse_weighted.{VALIDATION}")
     return models_by_candidate(part)[candidate][
-        int(np.argmin(np.where(np.isfinite(own), own, np.inf)))
+        int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
     ]

@@ -1,4 +1,6 @@
-"""How much of the errors the filters' bands cover, with and without a likelihood term in their training."""
+"""How much of the errors the filters' bands cover, with and without a likelihood term in their
+training.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def coverage_table(
     name: str,
     data: str,
 ) -> Table:
-    """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two deviations, with 95 % intervals."""
+    """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two
+    deviations, with 95 % intervals.
+    """
     rows: list[dict[str, object]] = []
     for test, tyre in SETS.items():
         for words, (part, models) in trained.items():
@@ -32,18 +36,25 @@ def coverage_table(
                 "tyre": tyre,
                 "training": words,
                 "mse_words": figure_in_words(
-                    _mean([[weighted_errors(piece, np.square) for piece in own] for own in scored])
+                    _mean(
+                        [
+                            [weighted_errors(piece, np.square) for piece in of_seed]
+                            for of_seed in scored
+                        ]
+                    )
                 ),
             }
             for sigma, expected in COVERAGE.items():
-                share = _mean([[_within(piece, sigma) for piece in own] for own in scored])
+                share = _mean([[_within(piece, sigma) for piece in of_seed] for of_seed in scored])
                 row |= {
                     f"inside_{sigma}": share.value,
                     f"words_{sigma}": figure_in_words(share),
                     f"expected_{sigma}": expected,
                 }
             row["width"] = float(
-                np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own])
+                np.mean(
+                    [np.sqrt(_variance(piece)).mean() for of_seed in scored for piece in of_seed]
+                )
             )
             rows.append(row)
     columns = {
@@ -57,16 +68,17 @@ def coverage_table(
         "width": Column("mean σ of vy [m/s]", decimals=3),
     }
     caption = (
-        f"Bands of {candidate}: share of vy's errors within the filter's own deviations, 95 % intervals over sequences and seeds. "
-        f"Likelihood: a second term in the loss of the training through the filter, not in the paper. Data: {data}."
+        f"Bands of {candidate}: share of vy's errors within the filter's own deviations, 95 % "
+        "intervals over sequences and seeds. Likelihood: a second term in the loss of the "
+        f"training through the filter, not in the paper. Data: {data}."
     )
     return Table(f"coverage_{name}", caption, pd.DataFrame(rows), columns)
 
 
 def _mean(values: Sequence[Sequence[FloatArray]]) -> Figure:
     """Mean of values by seed, sequence and sample, with its interval over sequences and seeds."""
-    sums = np.array([[own.sum() for own in seed] for seed in values])
-    sizes = np.array([float(len(own)) for own in values[0]])
+    sums = np.array([[sequence.sum() for sequence in seed] for seed in values])
+    sizes = np.array([float(len(sequence)) for sequence in values[0]])
     names = [tuple(str(number) for number in range(count)) for count in sums.shape]
     return value_of(BlockErrors(names[0], names[1], sums, sizes), "mean")[1]
 

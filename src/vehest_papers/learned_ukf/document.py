@@ -1,4 +1,6 @@
-"""The report: claims judged by the engine, Tables I and II, friction, bands and what training through the filter changes."""
+"""The report: claims judged by the engine, Tables I and II, friction, bands and what training
+through the filter changes.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import MISSING, fixed, listed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import (
@@ -27,13 +30,12 @@ from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
-from vehest_papers.kit.report_template import fill_template
 from vehest_papers.kit.verdict_table import (
     CLAIMS,
     claims_table,
     decided_claims,
     figure_in_words,
-    one_line,
+    without_line_breaks,
 )
 from vehest_papers.kit.verdicts import paired_errors, ratio_of
 from vehest_papers.learned_ukf import (
@@ -46,8 +48,8 @@ from vehest_papers.learned_ukf import (
     tables,
     traces,
 )
-from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
-from vehest_papers.learned_ukf.budgets import Candidate, budgets_table
+from vehest_papers.learned_ukf.appendix import appendix_of_part, minutes, provenance
+from vehest_papers.learned_ukf.budgets import Candidate, budgets
 from vehest_papers.learned_ukf.candidates import SETS, chosen, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.filtering import drives_of, loaded, lost_sequences
 from vehest_papers.learned_ukf.lengths import figure_7, lengths
@@ -57,9 +59,8 @@ TEMPLATE = Path(__file__).with_name("report.md.j2")
 MAIN = "real"
 LENGTH = "length_"
 VARIANTS = ("diagonal", block_errors.SCRATCH, "curvature")  # parts with a variant of a candidate
-ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 COMPARED_FIRST = (paper.GRU, paper.NNTF)  # with NNTF_UH, in the answer
-SHOWN_FIRST = (
+OVERVIEW_CANDIDATES = (
     paper.NNTF_UH,
     paper.NNTF,
     paper.NN_U,
@@ -68,7 +69,7 @@ SHOWN_FIRST = (
     paper.LSTM,
     *BASELINE_NAMES.values(),
 )
-SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
+FIGURE_4_CANDIDATES = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 
 
 @dataclass
@@ -81,7 +82,8 @@ class Outcome:
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of the study; candidates that are not trained yet are named, and claims on them not assessed.
+    """The report of the study; candidates that are not trained yet are named, and claims on them
+    not assessed.
 
     Raises
     ------
@@ -96,7 +98,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         raise DataError(f"study '{artefacts.study}' needs the part '{MAIN}'")
     if set(part.split.tests) != set(SETS):
         raise DataError(
-            f"study '{artefacts.study}': the test sets of part '{MAIN}' must be called {' and '.join(SETS)}"
+            f"study '{artefacts.study}': the test sets of part '{MAIN}' must be called "
+            f"{' and '.join(SETS)}"
         )
     content = claims_of(NAME)
     data: dict[str, pd.DataFrame] = {}
@@ -109,14 +112,15 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     not_trained = block_errors.seeds_not_trained(artefacts.not_trained)
     trained = block_errors.training_rows(artefacts.parts, MAIN, not_trained)
     kinds = {
-        block_errors.part_name(name): words_of_kinds(own) for name, own in artefacts.parts.items()
+        block_errors.part_name(name): words_of_kinds(study_part)
+        for name, study_part in artefacts.parts.items()
     }
     claims = claims_table(content, rows, trained, kinds)
     values = _values(artefacts, part, content, rows, trained)
     blocks = [
         *fill_template(TEMPLATE, values, [*outcome.front, decided_claims(claims)]),
         *outcome.appendix,
-        *how_it_was_made(artefacts, {MAIN: part}, data),
+        *provenance(artefacts, {MAIN: part}, data),
     ]
     data |= {CLAIMS: claims.frame}
     data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
@@ -136,11 +140,11 @@ def _values(
     main_rows = [
         {"name": name, "seeds": seeds[name]}
         | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
-        for name in SHOWN_FIRST
+        for name in OVERVIEW_CANDIDATES
         if name in seeds
     ]
     return {
-        "recommendation": one_line(content.recommendation),
+        "recommendation": without_line_breaks(content.recommendation),
         "kind": words_of_kinds(part).upper(),
         "minutes": fixed(minutes(part, part.split.train), 1),
         "minutes_paper": fixed(paper.MINUTES_LEARNT, 1),
@@ -148,16 +152,19 @@ def _values(
         "authors": {test: fixed(value, 4) for test, value in paper.AUTHORS_CODE.items()},
         "absent_parts": absent_parts(artefacts),
         "ratios": {
-            other: {test: _ratio(blocks, other, test) for test in SETS} for other in COMPARED_FIRST
+            reference: {test: _ratio(blocks, reference, test) for test in SETS}
+            for reference in COMPARED_FIRST
         },
         "incomplete": _incomplete(artefacts, trained, seeds),
     }
 
 
-def _ratio(blocks: Mapping[Key, BlockErrors], other: str, test: str) -> str:
-    """Weighted MSE of NNTF_UH over that of another with its interval; a dash where one is not trained."""
+def _ratio(blocks: Mapping[Key, BlockErrors], reference: str, test: str) -> str:
+    """Weighted MSE of NNTF_UH over that of another with its interval; a dash where one is not
+    trained.
+    """
     first, second = (
-        blocks.get(Key(MAIN, name, test, "mse_weighted")) for name in (paper.NNTF_UH, other)
+        blocks.get(Key(MAIN, name, test, "mse_weighted")) for name in (paper.NNTF_UH, reference)
     )
     if first is None or second is None:
         return MISSING
@@ -176,13 +183,13 @@ def _incomplete(
         for row in trained
         if row.seeds_planned and row.training != "not trained"
     ]
-    absent = [row.candidate for row in trained if row.training == "not trained"]
+    not_trained = [row.candidate for row in trained if row.training == "not trained"]
     parts = [name for name in artefacts.titles if name not in artefacts.parts]
     return [
         {
             "number": number,
             "fewer": "; ".join(fewer) or MISSING,
-            "candidates": "; ".join(absent) or MISSING,
+            "candidates": "; ".join(not_trained) or MISSING,
             "parts": sum(name in artefacts.not_trained for name in parts),
         }
     ]
@@ -198,59 +205,54 @@ def _outcome(
     """Everything of the main part and of those beside it on data of the same kind."""
     runs = runs_of(part)
     kind = words_of_kinds(part)
-    where = f"{kind.upper()}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
-    own = Outcome()
-    _accuracy(own, name, blocks, kind, data)
-    _friction(own, name, part, where, kind)
-    _instability(own, name, artefacts.parts, data)
+    titles = [as_text(part.data_titles.get(name, name)) for name in part.split.datasets]
+    source = f"{kind.upper()}, {listed(titles)}"
+    outcome = Outcome()
+    _accuracy(outcome, name, blocks, kind, data)
+    _friction(outcome, name, part, source, kind)
+    _instability(outcome, name, artefacts.parts, data)
     beside = {
-        title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind
+        title: study_part
+        for title, study_part in artefacts.parts.items()
+        if words_of_kinds(study_part) == kind
     }
-    _likelihood(own, name, part, beside, kind)
-    _prediction(own, name, part, where, data)
-    _variants(name, part, beside, kind, data)
-    _lengths(own, beside, blocks, kind, data)
+    _likelihood(outcome, name, part, beside, kind)
+    _prediction(outcome, name, part, source, data)
+    _variants(name, part, beside, data)
+    _lengths(outcome, beside, blocks, kind, data)
     groups = models_by_candidate(part)
-    shown: dict[str, EvaluatedModel] = {
-        method: chosen(part, runs, method) for method in SHOWN_IN_FIGURE_4 if method in groups
+    drawn_models: dict[str, EvaluatedModel] = {
+        method: chosen(part, runs, method) for method in FIGURE_4_CANDIDATES if method in groups
     }
-    if shown:
-        figure, drawn = traces.hard_sequence(part, shown, "tyre_d", name, where)
+    if drawn_models:
+        figure, drawn = traces.hard_sequence(part, drawn_models, "tyre_d", name, source)
         data[f"traces_{name}"] = drawn
-        own.front.append(figure)
+        outcome.front.append(figure)
     losses = loss_curves(groups)
     data[LOSS_CURVES] = losses
     if len(losses):
-        caption = f"Losses of the longest phase of each method's first seed, scaled. Data: {kind.upper()}."
-        own.appendix += ["## Appendix: loss curves", loss_figure(losses, caption)]
-    own.appendix += appendix_of_part(name, part, runs, where, data)
-    return own
+        caption = (
+            "Losses of the longest phase of each method's first seed, scaled. Data: "
+            f"{kind.upper()}."
+        )
+        outcome.appendix += ["## Appendix: loss curves", loss_figure(losses, caption)]
+    outcome.appendix += appendix_of_part(name, part, runs, source, data)
+    return outcome
 
 
 def _accuracy(
-    own: Outcome,
+    outcome: Outcome,
     name: str,
     blocks: Mapping[Key, BlockErrors],
     kind: str,
     data: dict[str, pd.DataFrame],
 ) -> None:
-    own.front.append(tables.overview(blocks, name, kind))
-    for test, tyre in SETS.items():
-        which = (
-            "which was trained on"
-            if test == "tyre_a"
-            else "unseen; the paper's are of tyre C and do not compare"
-        )
-        caption = (
-            f"Table {ROMAN[test]} of the paper: {tyre}, {which}. Ours: {kind.upper()}, means over seeds, 95 % intervals over sequences "
-            "and seeds; the 99th percentile is that of each sequence, averaged. Baselines take vx from the rims and the yaw rate from the "
-            "gyroscope."
-        )
-        table = f"table_{1 if test == 'tyre_a' else 2}_{name}"
-        data[table] = tables.accuracy(blocks, name, test, table, caption).frame
+    outcome.front.append(tables.overview(blocks, name, kind))
+    for number, test in enumerate(SETS, start=1):
+        data[f"table_{number}_{name}"] = tables.accuracy(blocks, name, test)
 
 
-def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: str) -> None:
+def _friction(outcome: Outcome, name: str, part: PartArtefacts, source: str, kind: str) -> None:
     """Friction over time, what is measured of it, and what its start changes."""
     models = models_by_candidate(part).get(paper.NNTF_UH)
     if not models:
@@ -258,8 +260,8 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     filters = [loaded(model) for model in models]
     drives = {test: drives_of(part, filters[0], test) for test in SETS}
     tracks = {
-        test: {start: friction.tracks_of(filters, own_drives, start) for start in friction.STARTS}
-        for test, own_drives in drives.items()
+        test: {start: friction.tracks_of(filters, of_test, start) for start in friction.STARTS}
+        for test, of_test in drives.items()
     }
     times = {
         test: (
@@ -277,27 +279,29 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
         ),
     }
     seeds = [model.seed for model in models]
-    own.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
-    own.front += [
-        friction.figure(tracks, part.protocol.skip_seconds, name, where),
+    outcome.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
+    outcome.front += [
+        friction.figure(tracks, part.protocol.skip_seconds, name, source),
         friction.convergence_table(tracks, times, part.protocol.skip_seconds, name, kind.upper()),
     ]
-    own.appendix += [
+    outcome.appendix += [
         f"## Appendix: the start of the friction, {kind}",
         friction.start_table(filters, drives, part.protocol, name, kind.upper()),
     ]
 
 
 def _instability(
-    own: Outcome,
+    outcome: Outcome,
     name: str,
     parts: Mapping[str, PartArtefacts],
     data: dict[str, pd.DataFrame],
 ) -> None:
-    """Sequences of tyre D whose covariance loses definiteness, with both starts of the noise; the main part decides the claims."""
+    """Sequences of tyre D whose covariance loses definiteness, with both starts of the noise; the
+    main part decides the claims.
+    """
     claim = {paper.NNT: "nnt_becomes_unstable", paper.NNT_U: "nnt_u_becomes_unstable"}
     shares = []
-    for title in (name, block_errors.GIVEN_NOISE):
+    for title in (name, block_errors.AUTHORS_NOISE):
         groups = models_by_candidate(parts[title]) if title in parts else {}
         for method, models in groups.items():
             if method not in claim:
@@ -312,7 +316,9 @@ def _instability(
             if title == name:
                 measured = {(claim[method], method): is_lost.astype(np.float64)}
                 seeds = [model.seed for model in models]
-                own.rows += block_errors.measured_rows(name, parts[name], "tyre_d", measured, seeds)
+                outcome.rows += block_errors.measured_rows(
+                    name, parts[name], "tyre_d", measured, seeds
+                )
     if shares:
         data["unstable"] = pd.DataFrame(shares)
 
@@ -321,10 +327,11 @@ def _variants(
     name: str,
     part: PartArtefacts,
     beside: Mapping[str, PartArtefacts],
-    kind: str,
     data: dict[str, pd.DataFrame],
 ) -> None:
-    """What the variants of a candidate were trained on, with the candidates that they are compared with."""
+    """What the variants of a candidate were trained on, with the candidates that they are compared
+    with.
+    """
     groups = models_by_candidate(part)
     variants = {
         candidate: (beside[title], models)
@@ -337,49 +344,49 @@ def _variants(
     compared: dict[str, Candidate] = {
         title: (part, groups[title]) for title in (paper.NNTF_UH, paper.PC) if title in groups
     }
-    table = budgets_table(compared | variants, name, kind.upper())
-    data[table.name] = table.frame
+    data[f"budgets_{name}"] = budgets(compared | variants)
 
 
 def _lengths(
-    own: Outcome,
+    outcome: Outcome,
     beside: Mapping[str, PartArtefacts],
     blocks: Mapping[Key, BlockErrors],
     kind: str,
     data: dict[str, pd.DataFrame],
 ) -> None:
-    trained = {title: other for title, other in beside.items() if title.startswith(LENGTH)}
+    trained = {
+        title: study_part for title, study_part in beside.items() if title.startswith(LENGTH)
+    }
     if trained:
-        figure, table = figure_7(lengths(trained), blocks, kind.upper())
-        own.appendix += ["## Appendix: length of the training sequences", figure]
-        data[table.name] = table.frame
+        figure, data["sequence_length"] = figure_7(lengths(trained), blocks, kind.upper())
+        outcome.appendix += ["## Appendix: length of the training sequences", figure]
 
 
 def _likelihood(
-    own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str
+    outcome: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str
 ) -> None:
     if block_errors.LIKELIHOOD not in beside:
         return
     trained = {
-        words: (which, models_by_candidate(which)[paper.NNTF_UH])
-        for words, which in (
+        words: (study_part, models_by_candidate(study_part)[paper.NNTF_UH])
+        for words, study_part in (
             ("squared errors", part),
             ("with likelihood", beside[block_errors.LIKELIHOOD]),
         )
-        if paper.NNTF_UH in models_by_candidate(which)
+        if paper.NNTF_UH in models_by_candidate(study_part)
     }
     if trained:
-        own.appendix += [
+        outcome.appendix += [
             "## Appendix: bands",
             coverage.coverage_table(trained, paper.NNTF_UH, name, kind.upper()),
         ]
 
 
 def _prediction(
-    own: Outcome,
+    outcome: Outcome,
     name: str,
     part: PartArtefacts,
-    where: str,
+    source: str,
     data: dict[str, pd.DataFrame],
 ) -> None:
     groups = models_by_candidate(part)
@@ -392,12 +399,12 @@ def _prediction(
         return
     pairs = {seed: (loaded(by_seed[0][seed]), loaded(by_seed[1][seed])) for seed in seeds}
     drives = {test: drives_of(part, pairs[seeds[0]][0], test) for test in SETS}
-    found = prediction.compared(pairs, drives, part.protocol)
-    states, swaps = prediction.frames(found, seeds)
-    own.rows += block_errors.prediction_rows(name, part, found, drives, seeds)
+    comparisons = prediction.compared(pairs, drives, part.protocol)
+    states, swaps = prediction.frames(comparisons, seeds)
+    outcome.rows += block_errors.prediction_rows(name, part, comparisons, drives, seeds)
     data |= {f"figure_5_{name}": states, f"figure_6_{name}": swaps}
-    own.appendix += [
+    outcome.appendix += [
         "## Appendix: what training through the filter changes",
-        prediction.figure_5(states, name, where),
-        prediction.figure_6(swaps, name, where),
+        prediction.figure_5(states, name, source),
+        prediction.figure_6(swaps, name, source),
     ]

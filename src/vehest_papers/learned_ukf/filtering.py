@@ -1,4 +1,6 @@
-"""Trained filters at work on the sequences of a test set, beyond their stored estimates: unrepaired, as predictors, with swapped models."""
+"""Trained filters at work on the sequences of a test set, beyond their stored estimates:
+unrepaired, as predictors, with swapped models.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ MOVING = STATES[:4]  # states that are measured or referenced: all but the frict
 
 
 class Swapped(PointModel):
-    """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained."""
+    """Moves points by one model and expects measurements by another; without adjoints, so it cannot
+    be trained.
+    """
 
     def __init__(self, predicting: PointModel, observing: PointModel) -> None:
         self.working = predicting.working  # type: ignore[method-assign]
@@ -40,27 +44,33 @@ def _with_its_car(model: PointModel, entry: int) -> Callable[..., None]:
 
 
 def loaded(model: EvaluatedModel) -> LearnedUkf:
-    """The filter of an evaluated model; raises `MissingError` where there is none, `DataError` where it is damaged or another's."""
+    """The filter of an evaluated model; raises `MissingError` where there is none, `DataError`
+    where it is damaged or another's.
+    """
     estimator = load_model(model.model_folder)
     if not isinstance(estimator, LearnedUkf):
         raise DataError(
-            f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'"
+            f"'{model.model_folder}' holds a model of '{estimator.name}', not of "
+            f"'{LearnedUkf.name}'"
         )
     return estimator
 
 
 def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
-    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...); raises `ConfigurationError` or `DataError`."""
+    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...); raises
+    `ConfigurationError` or `DataError`.
+    """
     if (
         part.protocol.sequence_seconds is None
         or part.protocol.rate_hz != estimator.settings.rate_hz
     ):
         raise ConfigurationError(
-            f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "
-            f"have it, not {part.protocol.rate_hz:g}"
+            f"study '{part.study}' needs evaluation.sequence_seconds, and "
+            f"evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters have it, not "
+            f"{part.protocol.rate_hz:g}"
         )
-    wanted = dict.fromkeys((span.dataset, span.recording) for span in part.split.tests[test])
-    recordings = {key: read_recording(part.references[key]) for key in wanted}
+    names = dict.fromkeys((span.dataset, span.recording) for span in part.split.tests[test])
+    recordings = {key: read_recording(part.references[key]) for key in names}
     pieces = sequences(
         part.split.tests[test], lambda span: recordings[span.dataset, span.recording], part.protocol
     )
@@ -83,32 +93,33 @@ def filtered(
     friction: float | None = None,
     deviation: float | None = None,
 ) -> NonlinearFiltered:
-    """All sequences filtered together from the true state of their first sample, as the protocol has it.
+    """All sequences filtered together from the true state of their first sample, as the protocol
+    has it.
 
     Args:
-        estimator: its noise is used, and its models unless another is given.
-        model: that moves and observes points instead.
-        repair: whether covariances that lose definiteness are repaired; otherwise their sequences become NaN.
-        friction: that the filter starts from; none: as its settings say.
-        deviation: standard deviation of the friction at the start; none: what was learnt.
+        estimator: its noise is used, and its models unless another is given. model: that moves and
+        observes points instead. repair: whether covariances that lose definiteness are repaired;
+        otherwise their sequences become NaN. friction: that the filter starts from; none: as its
+        settings say. deviation: standard deviation of the friction at the start; none: what was
+        learnt.
     """
     s = estimator.settings
     start = drives.states[:, 0].clone()
     start[:, -1] = friction or (s.friction if s.start_friction is None else s.start_friction)
-    own = estimator.filter
-    kept = own.repair
-    own.repair = repair
+    kalman = estimator.filter
+    repaired = kalman.repair
+    kalman.repair = repair
     try:
         with torch.no_grad():
-            covariance = own.initial_covariance().clone()
+            covariance = kalman.initial_covariance().clone()
             if deviation is not None:
                 covariance[-1, :] = covariance[:, -1] = 0.0
                 covariance[-1, -1] = deviation**2
-            return own.filtered(
+            return kalman.filtered(
                 drives.measurements, drives.inputs, Gaussian(start, covariance), model=model
             )
     finally:
-        own.repair = kept
+        kalman.repair = repaired
 
 
 def lost_sequences(estimator: LearnedUkf, drives: Drive) -> NDArray[np.bool_]:
@@ -125,7 +136,9 @@ def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> Non
 
 
 def squares_of(means: torch.Tensor, drives: Drive, skip: int) -> FloatArray:
-    """Mean squared error of each of `MOVING` in each sequence, the first steps of it left out; (B, 4)."""
+    """Mean squared error of each of `MOVING` in each sequence, the first steps of it left out; (B,
+    4).
+    """
     errors = (means - drives.states)[:, skip:, : len(MOVING)].double()
     return np.asarray(errors.square().mean(dim=1).numpy(), dtype=np.float64)
 
@@ -136,7 +149,9 @@ def weighted(squares: FloatArray) -> FloatArray:
 
 
 def one_step_squares(estimator: LearnedUkf, drives: Drive) -> FloatArray:
-    """Mean squared error of the prediction of the next sample from each true state; of `MOVING` in each sequence, (B, 4)."""
+    """Mean squared error of the prediction of the next sample from each true state; of `MOVING` in
+    each sequence, (B, 4).
+    """
     states, inputs = (
         part[:, :-1].reshape(-1, part.shape[-1]) for part in (drives.states, drives.inputs)
     )

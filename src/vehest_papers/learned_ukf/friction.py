@@ -1,4 +1,6 @@
-"""The friction over time from several starts, how long until they agree, and what the start changes."""
+"""The friction over time from several starts, how long until they agree, and what the start
+changes.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +30,9 @@ STARTS = (0.3, 0.6, 0.9)
 COLOURS = ("#0b4f9c", "#444444", "#b3122a")
 TRAINED_FROM = 0.6
 LOW = 0.4  # starts of NNTF_UH and NNTF_UH*
-DEVIATIONS = (
-    None,
-    0.03,
-    0.003,
-)  # of the friction at the start: as trained, and two smaller ones, the last that of the authors' code
+DEVIATIONS = (None, 0.03, 0.003)
+"""Deviation of the friction at the start: as trained, a smaller one, that of the authors' code."""
+
 LAST_SECONDS = 2.0
 AGREEMENT = 0.05  # of the friction
 
@@ -48,11 +48,13 @@ class Tracks:
     @property
     def final(self) -> FloatArray:
         """Mean over the last two seconds, (S, B)."""
-        own: FloatArray = self.mean[..., -round(LAST_SECONDS * self.rate_hz) :].mean(axis=-1)
-        return own
+        friction: FloatArray = self.mean[..., -round(LAST_SECONDS * self.rate_hz) :].mean(axis=-1)
+        return friction
 
     def covered(self, nominal: float, skip_seconds: float, deviations: float = 1.0) -> FloatArray:
-        """Share of the samples after ``skip_seconds`` whose distance from a friction is within the filter's deviations, (S, B)."""
+        """Share of the samples after ``skip_seconds`` whose distance from a friction is within the
+        filter's deviations, (S, B).
+        """
         first = round(skip_seconds * self.rate_hz)
         distance = np.abs(self.mean[..., first:] - nominal)
         is_within = distance <= deviations * self.deviation[..., first:]
@@ -68,7 +70,7 @@ def settled(outside: np.ndarray, rate_hz: float) -> FloatArray:
 
 def tracks_of(filters: Sequence[LearnedUkf], drives: Drive, start: float) -> Tracks:
     """Filter all sequences with every seed from a friction."""
-    parts = [filtered(own, drives, friction=start).steps.filtered for own in filters]
+    parts = [filtered(estimator, drives, friction=start).steps.filtered for estimator in filters]
     means = np.stack([part.mean[..., -1].double().numpy() for part in parts])
     variances = np.stack([part.covariance[..., -1, -1].double().numpy() for part in parts])
     return Tracks(means, np.sqrt(np.maximum(variances, 0.0)), filters[0].settings.rate_hz)
@@ -81,7 +83,8 @@ def convergence_table(
     name: str,
     data: str,
 ) -> Table:
-    """A row for each tyre: how long until the starts agree, and the final value with the filter's deviation.
+    """A row for each tyre: how long until the starts agree, and the final value with the filter's
+    deviation.
 
     Parameters
     ----------
@@ -120,8 +123,9 @@ def convergence_table(
     }
     starts = ", ".join(f"{start:g}" for start in STARTS)
     caption = (
-        f"The friction of {paper.NNTF_UH} started from {starts}: time until the three estimates agree and stay so, and mean over the last "
-        f"{LAST_SECONDS:g} s from {TRAINED_FROM:g}; means with 95 % intervals over sequences and seeds. Data: {data}."
+        f"The friction of {paper.NNTF_UH} started from {starts}: time until the three estimates "
+        f"agree and stay so, and mean over the last {LAST_SECONDS:g} s from {TRAINED_FROM:g}; "
+        f"means with 95 % intervals over sequences and seeds. Data: {data}."
     )
     return Table(f"friction_{name}", caption, pd.DataFrame(rows), columns)
 
@@ -139,9 +143,9 @@ def figure(
     with new_figure(DOUBLE_COLUMN, 2.8) as drawn:
         grid = drawn.subplots(1, len(tracks), sharey=True, squeeze=False)[0]
         for axes, (test, by_start) in zip(grid, tracks.items(), strict=True):
-            for (start, own), colour in zip(by_start.items(), COLOURS, strict=True):
-                time = np.arange(own.mean.shape[-1]) / own.rate_hz
-                of_sequences = own.mean.mean(axis=0)
+            for (start, of_start), colour in zip(by_start.items(), COLOURS, strict=True):
+                time = np.arange(of_start.mean.shape[-1]) / of_start.rate_hz
+                of_sequences = of_start.mean.mean(axis=0)
                 middle = of_sequences.mean(axis=0)
                 n = len(of_sequences)
                 half = stats.t.ppf(0.975, n - 1) * of_sequences.std(axis=0, ddof=1) / np.sqrt(n)
@@ -166,8 +170,8 @@ def figure(
     n_seeds = len(first.mean)
     seeds = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
     caption = (
-        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {seeds}; shaded: 95 % interval of the mean over "
-        f"sequences. Grey: not scored. Data: {data}."
+        f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {seeds}; shaded: 95 % "
+        f"interval of the mean over sequences. Grey: not scored. Data: {data}."
     )
     return Figure(f"friction_{name}", caption, drawn)
 
@@ -179,13 +183,20 @@ def start_table(
     name: str,
     data: str,
 ) -> Table:
-    """NNTF_UH* against NNTF_UH at several deviations of the friction at the start: errors and their ratio with its interval."""
+    """NNTF_UH* against NNTF_UH at several deviations of the friction at the start: errors and their
+    ratio with its interval.
+    """
     skip = round(protocol.skip_seconds * protocol.rate_hz)
     trained = float(
-        np.mean([float(own.filter.initial_covariance()[-1, -1].detach()) ** 0.5 for own in filters])
+        np.mean(
+            [
+                float(of_test.filter.initial_covariance()[-1, -1].detach()) ** 0.5
+                for of_test in filters
+            ]
+        )
     )
     rows = []
-    for test, own in drives.items():
+    for test, of_test in drives.items():
         for deviation in DEVIATIONS:
             squares = {
                 start: np.stack(
@@ -193,13 +204,13 @@ def start_table(
                         weighted(
                             squares_of(
                                 filtered(
-                                    one, own, friction=start, deviation=deviation
+                                    estimator, of_test, friction=start, deviation=deviation
                                 ).steps.filtered.mean,
-                                own,
+                                of_test,
                                 skip,
                             )
                         )
-                        for one in filters
+                        for estimator in filters
                     ]
                 )
                 for start in (TRAINED_FROM, LOW)
@@ -236,7 +247,8 @@ def start_table(
         "ratio": Column("ratio [95 % interval]"),
     }
     caption = (
-        f"Effect of the friction at the start: {paper.NNTF_UH_LOW} against {paper.NNTF_UH}, same weights, at several deviations of the "
-        f"friction at the start. Deviations other than {fixed(trained, 3)} are set in use, not trained with. Data: {data}."
+        f"Effect of the friction at the start: {paper.NNTF_UH_LOW} against {paper.NNTF_UH}, same "
+        "weights, at several deviations of the friction at the start. Deviations other than "
+        f"{fixed(trained, 3)} are set in use, not trained with. Data: {data}."
     )
     return Table(f"start_{name}", caption, pd.DataFrame(rows), columns)

@@ -1,4 +1,6 @@
-"""Figure 7: the length of training sequences against the error, at a constant batch and at constant samples a batch."""
+"""Figure 7: the length of training sequences against the error, at a constant batch and at constant
+samples a batch.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.block_errors import BlockErrors, Key
@@ -44,20 +46,27 @@ class Length:
 
 
 def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
-    """By length, then batch; raises `DataError` where a model was not trained through the filter."""
-    found = []
+    """Trainings by length, then batch.
+
+    Raises
+    ------
+    DataError
+        A model was not trained through the filter.
+    """
+    trained = []
     for name, part in parts.items():
         for model in part.models:
             if "steps" not in model.training or not _SUBSCRIPT_U.search(model.variant):
                 raise DataError(
-                    f"part '{name}': {model.title} was not trained through the filter; set estimator.through_filter=true"
+                    f"part '{name}': {model.title} was not trained through the filter; set "
+                    "estimator.through_filter=true"
                 )
         training = part.models[0].training
         steps = int(training["steps"])
         batch = int(training["batch_size"])
         candidate = next(iter(models_by_candidate(part)))
         sequences = sum(length // steps for length in lengths_of(part, part.split.train))
-        found.append(
+        trained.append(
             Length(
                 name,
                 candidate,
@@ -68,38 +77,42 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
                 sequences,
             )
         )
-    return sorted(found, key=lambda own: (own.steps, own.batch))
+    return sorted(trained, key=lambda entry: (entry.steps, entry.batch))
 
 
-def of_way(found: Sequence[Length], way: str) -> list[Length]:
+def of_way(trained: Sequence[Length], way: str) -> list[Length]:
     """Those with the batch, or with the samples a batch, of the longest sequences."""
-    longest = found[-1]
+    longest = trained[-1]
     if way == "batch":
-        return [own for own in found if own.batch == longest.batch]
-    return [own for own in found if own.steps * own.batch == longest.steps * longest.batch]
+        return [length for length in trained if length.batch == longest.batch]
+    return [
+        length for length in trained if length.steps * length.batch == longest.steps * longest.batch
+    ]
 
 
 def figure_7(
-    found: Sequence[Length], blocks: Mapping[Key, BlockErrors], data: str
-) -> tuple[Figure, Table]:
+    trained: Sequence[Length], blocks: Mapping[Key, BlockErrors], data: str
+) -> tuple[Figure, pd.DataFrame]:
     """The figure and its table, with 95 % intervals over sequences and seeds."""
     rows = []
     for way, words in WAYS.items():
-        for own in of_way(found, way):
+        for length in of_way(trained, way):
             row: dict[str, object] = {
                 "way": words,
-                "steps": own.steps,
-                "batch": own.batch,
-                "epochs": own.epochs,
+                "steps": length.steps,
+                "batch": length.batch,
+                "epochs": length.epochs,
             }
             row |= {
-                "epoch_samples": own.sequences * own.steps,
-                "batches": own.batches,
-                "in_a_row": own.batches * own.steps,
+                "epoch_samples": length.sequences * length.steps,
+                "batches": length.batches,
+                "in_a_row": length.batches * length.steps,
             }
-            name = candidate_name(own.part, own.candidate)
+            name = candidate_name(length.part, length.candidate)
             for test in SETS:
-                _, mse = value_of(blocks[Key(own.part, name, test, "mse_weighted")], "mse_weighted")
+                _, mse = value_of(
+                    blocks[Key(length.part, name, test, "mse_weighted")], "mse_weighted"
+                )
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
                 row[f"words.{test}"] = figure_in_words(mse)
             rows.append(row)
@@ -127,33 +140,18 @@ def figure_7(
                 )
             steps = sorted(set(frame["steps"]))
             axes.set_xscale("log")
-            axes.set_xticks(steps, [f"{own:g}" for own in steps])
+            axes.set_xticks(steps, [f"{length:g}" for length in steps])
             axes.minorticks_off()
             axes.set_title(SETS[test], loc="left")
             axes.set_xlabel("samples of a training sequence")
             axes.set_ylim(bottom=0.0)
         grid[0].set_ylabel("MSE (weighted)")
         legend_above(figure, grid[0])
-    seeds = sorted({own.n_seeds for own in found})
+    seeds = listed([str(number) for number in sorted({length.n_seeds for length in trained})])
     caption = (
-        f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].candidate}, "
-        f"{listed([str(own) for own in seeds])} seeds, {found[0].epochs} epochs through the filter. An epoch goes once through the drives, "
-        f"so a smaller batch takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
+        "Length of training sequences against MSE (weighted), Figure 7 of the paper: "
+        f"{trained[0].candidate}, {seeds} seeds, {trained[0].epochs} epochs "
+        "through the filter. An epoch goes once through the drives, so a smaller batch "
+        f"takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
-    columns = {
-        "way": Column("held constant"),
-        "steps": Column("samples", decimals=0),
-        "batch": Column("sequences in a batch", decimals=0),
-    }
-    columns |= {
-        "epochs": Column("epochs", decimals=0),
-        "batches": Column("batches an epoch", decimals=0),
-    }
-    columns |= {
-        "epoch_samples": Column("filter steps an epoch", decimals=0),
-        "in_a_row": Column("of them one after another", decimals=0),
-    }
-    columns |= {f"words.{test}": Column(f"MSE (weighted), {SETS[test]}") for test in tests}
-    return Figure("figure_7", caption, figure), Table(
-        "sequence_length", "What Figure 7 draws.", frame, columns
-    )
+    return Figure("figure_7", caption, figure), frame

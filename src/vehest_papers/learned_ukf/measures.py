@@ -1,4 +1,5 @@
-"""Values by seed and sequence for those claims that are not comparisons of errors (``measure`` in claims.yaml).
+"""Values by seed and sequence for those claims that are not comparisons of errors (``measure`` in
+claims.yaml).
 
 Each function returns an array of shape (S, B), S seeds by B sequences.
 """
@@ -30,7 +31,9 @@ def agreement_times(by_start: Mapping[float, Tracks]) -> FloatArray:
 
 
 def agreement_times_in_deviations(by_start: Mapping[float, Tracks]) -> FloatArray:
-    """The same where agreement means one standard deviation that the filter gives, started from `TRAINED_FROM`."""
+    """The same where agreement means one standard deviation that the filter gives, started from
+    `TRAINED_FROM`.
+    """
     return settled(_spread(by_start) > by_start[TRAINED_FROM].deviation, _rate(by_start))
 
 
@@ -45,7 +48,7 @@ def _rate(by_start: Mapping[float, Tracks]) -> float:
 
 
 def final_deviations(tracks: Tracks, nominal: float) -> FloatArray:
-    """Absolute difference of the mean friction over the last two seconds from the nominal friction."""
+    """Absolute difference of the mean friction over the last two seconds from the nominal."""
     return np.abs(tracks.final - nominal)
 
 
@@ -58,13 +61,14 @@ def validation_over_worst_pre_trained(scratch: FloatArray, pre_trained: FloatArr
         Loss of each seed over each validation sequence, (S, B) and (S', B).
     """
     worst = pre_trained[int(np.argmax(pre_trained.mean(axis=1)))][None]
-    return np.concatenate([linearised_ratio(own[None], worst) for own in scratch])
+    return np.concatenate([linearised_ratio(of_seed[None], worst) for of_seed in scratch])
 
 
 def rise_over_least_rise_of_others(
     blocks: Mapping[Key, BlockErrors], part: str
 ) -> FloatArray | None:
-    """Rise of the MSE of NNTF_UH from tyre A to tyre D over the smallest rise of a model without friction.
+    """Rise of the MSE of NNTF_UH from tyre A to tyre D over the smallest rise of a model without
+    friction.
 
     Each sequence of tyre D is compared with the mean over the sequences of tyre A, whose sampling
     error is therefore not in the interval. None where a model is missing.
@@ -78,5 +82,5 @@ def rise_over_least_rise_of_others(
             return None
         before = trained.sums.sum(axis=1, keepdims=True) / trained.sizes.sum()
         rises[name] = unseen.sums / unseen.sizes - before
-    least = min(WITHOUT_FRICTION, key=lambda name: float(rises[name].mean()))
-    return linearised_ratio(rises[paper.NNTF_UH], rises[least])
+    smallest = min(WITHOUT_FRICTION, key=lambda name: float(rises[name].mean()))
+    return linearised_ratio(rises[paper.NNTF_UH], rises[smallest])

@@ -1,6 +1,8 @@
-"""Whether methods trained anew have the order of the published first table (`make learned_ukf_quick`).
+"""Whether methods trained anew have the order of the published first table (`make
+learned_ukf_quick`).
 
-``vehest run learned_ukf_quick --json`` -> weighted MSE of each method -> results/learned_ukf/tables/overview.csv -> a line a tyre
+``vehest run learned_ukf_quick --json`` -> weighted MSE of each method
+-> results/learned_ukf/tables/overview.csv -> a line a tyre
 """
 
 from __future__ import annotations
@@ -20,12 +22,14 @@ PUBLISHED = Path("results/learned_ukf/tables/overview.csv")
 
 
 def order_lines(trained: Sequence[Mapping[str, object]], published: Path) -> list[str]:
-    """A line for each test set: the order of the methods now, and where it differs from the published one.
+    """A line for each test set: the order of the methods now, and where it differs from the
+    published one.
 
     Parameters
     ----------
     trained
-        Rows of the table ``overview``: ``candidate`` and ``ours_TEST``, the weighted MSE on each test set.
+        Rows of the table ``overview``: ``candidate`` and ``ours_TEST``, the weighted MSE on each
+        test set.
     published
         CSV file of the published table ``overview``.
 
@@ -43,14 +47,14 @@ def order_lines(trained: Sequence[Mapping[str, object]], published: Path) -> lis
             name: number_in(row, column, published) for name, row in rows.items() if name in now
         }
         ranked = " < ".join(f"{name} {now[name]:.4f}" for name in sorted(now, key=now.__getitem__))
-        absent = sorted(now.keys() - before.keys())
+        not_published = sorted(now.keys() - before.keys())
         swapped = [
             f"{first} and {second}"
             for first, second in combinations(sorted(before), 2)
             if (now[first] < now[second]) is not (before[first] < before[second])
         ]
         verdict = f"another order of {', '.join(swapped)}" if swapped else "same order"
-        missing = f"; not published: {', '.join(absent)}" if absent else ""
+        missing = f"; not published: {', '.join(not_published)}" if not_published else ""
         lines.append(f"{tyre}: {ranked}; {verdict} as in {published}{missing}")
     return lines
 

@@ -1,4 +1,6 @@
-"""Figures of Węgrzynowski et al. 2024 by table, and errors of their public code on the files of this study."""
+"""Figures of Węgrzynowski et al. 2024 by table, and errors of their public code on the files of
+this study.
+"""
 
 from __future__ import annotations
 
@@ -89,12 +91,15 @@ RMS: Mapping[tuple[str, str], tuple[float, float]] = {
 """(test set, candidate) -> root mean square errors of vx and vy [m/s] (Sections IV-B and IV-C)."""
 
 AUTHORS_CODE: Mapping[str, float] = {"tyre_a": 0.0158, "tyre_d": 0.0441}
-"""Test set -> weighted MSE of NNTF_UH by the authors' public code on the files of split ``f1tenth_tyres``, as printed when it was run: 1000
-and 1000 epochs, one seed, on a CPU."""
+"""Test set -> weighted MSE of NNTF_UH by the authors' public code on split ``f1tenth_tyres``.
+
+As printed when it was run: 1000 and 1000 epochs, one seed, on a CPU.
+"""
 
 MINUTES = 52.0  # of driving in the paper's data set (Section III-C), of which ..
 SHARE_OF_TYRE_A = 0.201
-SHARE_LEARNT = 0.7  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
+# ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
+SHARE_LEARNT = 0.7
 MINUTES_LEARNT = MINUTES * SHARE_OF_TYRE_A * SHARE_LEARNT
 
 NOMINAL_FRICTION: Mapping[str, float] = {
@@ -102,11 +107,15 @@ NOMINAL_FRICTION: Mapping[str, float] = {
     "tyre_d": 0.45,
 }  # friction of the tyres (Section III-C)
 
-SLIP_99 = 40.0  # [deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)
+# [deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile
+# (Section III-C)
+SLIP_99 = 40.0
 
 
 def epochs(candidate: str) -> str:
-    """Epochs of the paper's training (Section IV-A): one-step, then through the filter for those that learn through it."""
+    """Epochs of the paper's training (Section IV-A): one-step, then through the filter for those
+    that learn through it.
+    """
     if candidate in (GRU, LSTM):
         return "not stated"
     if candidate in (NN_U, NNT_U, NNTF_U, NNTF_UH, NNTF_UH_LOW):

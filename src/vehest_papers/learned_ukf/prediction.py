@@ -1,4 +1,6 @@
-"""Figures 5 and 6: what learning through the filter changes about the model, and in which half of the filter that matters."""
+"""Figures 5 and 6: what learning through the filter changes about the model, and in which half of
+the filter that matters.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ Pair = tuple[LearnedUkf, LearnedUkf]  # NNTF and NNTF_U of one seed
 class Compared:
     """NNTF and NNTF_U on a test set."""
 
-    one_step: FloatArray  # of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4)
+    # of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4)
+    one_step: FloatArray
     estimation: FloatArray  # the same of their filters
     swaps: Mapping[
         tuple[int, int], FloatArray
@@ -48,46 +51,49 @@ class Compared:
 def compared(
     pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol
 ) -> dict[str, Compared]:
-    """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them."""
+    """Losses of both models as predictors and in their filters, and of all four filters that can be
+    put together of them.
+    """
     skip = round(protocol.skip_seconds * protocol.rate_hz)
-    found = {}
-    for test, own in drives.items():
+    by_test = {}
+    for test, sequences in drives.items():
         predicted = np.array(
-            [[one_step_squares(pair[k], own) for pair in pairs.values()] for k in (0, 1)]
+            [[one_step_squares(pair[k], sequences) for pair in pairs.values()] for k in (0, 1)]
         )
         estimated: dict[tuple[int, int], list[FloatArray]] = {}
         for pair in pairs.values():
-            results = {(0, 0): filtered(pair[0], own), (1, 1): filtered(pair[1], own)}
-            results |= {(a, b): swapped(pair[a], pair[b], own) for a, b in ((0, 1), (1, 0))}
+            results = {(0, 0): filtered(pair[0], sequences), (1, 1): filtered(pair[1], sequences)}
+            results |= {(a, b): swapped(pair[a], pair[b], sequences) for a, b in ((0, 1), (1, 0))}
             for key, result in results.items():
                 estimated.setdefault(key, []).append(
-                    squares_of(result.steps.filtered.mean, own, skip)
+                    squares_of(result.steps.filtered.mean, sequences, skip)
                 )
         estimation = np.array([estimated[0, 0], estimated[1, 1]])
-        found[test] = Compared(
+        by_test[test] = Compared(
             predicted,
             estimation,
             {key: weighted(np.array(squares)) for key, squares in estimated.items()},
         )
-    return found
+    return by_test
 
 
 def frames(
-    found: Mapping[str, Compared], seeds: Sequence[int]
+    by_test: Mapping[str, Compared], seeds: Sequence[int]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """What is drawn.
 
     Returns:
-        One row a test set, seed, state and task: ``before``, ``after`` (mean squared errors of NNTF and NNTF_U), ``decrease`` [%].
-        One row a test set, seed, ``predicts`` and ``observes``: ``mse`` (weighted).
+        One row a test set, seed, state and task: ``before``, ``after`` (mean squared errors of NNTF
+        and NNTF_U), ``decrease`` [%]. One row a test set, seed, ``predicts`` and ``observes``:
+        ``mse`` (weighted).
     """
     names = (BEFORE, AFTER)
     states = []
     swaps = []
-    for test, own in found.items():
+    for test, of_test in by_test.items():
         for place, seed in enumerate(seeds):
             for task in TASKS:
-                before, after = (part[place].mean(axis=0) for part in getattr(own, task))
+                before, after = (part[place].mean(axis=0) for part in getattr(of_test, task))
                 for state, first, second in zip(MOVING, before, after, strict=True):
                     row = {
                         "test_set": test,
@@ -106,13 +112,15 @@ def frames(
                     "observes": names[b],
                     "mse": float(mse[place].mean()),
                 }
-                for (a, b), mse in own.swaps.items()
+                for (a, b), mse in of_test.swaps.items()
             ]
     return pd.DataFrame(states), pd.DataFrame(swaps)
 
 
 def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
-    """By how much learning through the filter lowers each state's error, as a predictor and as an estimator."""
+    """By how much learning through the filter lowers each state's error, as a predictor and as an
+    estimator.
+    """
     tests = list(dict.fromkeys(states["test_set"]))
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), sharey=True, squeeze=False)[0]
@@ -120,9 +128,9 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
             for offset, (task, label), colour in zip(
                 (-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True
             ):
-                own = states[(states["test_set"] == test) & (states["task"] == task)]
+                of_task = states[(states["test_set"] == test) & (states["task"] == task)]
                 for place, state in enumerate(MOVING):
-                    values = own[own["state"] == state]["decrease"].to_numpy()
+                    values = of_task[of_task["state"] == state]["decrease"].to_numpy()
                     axes.bar(
                         place + offset,
                         np.median(values),
@@ -151,10 +159,11 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
         grid[0].set_ylabel(f"decrease of the MSE, {BEFORE} to {AFTER} [%]")
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
     caption = (
-        f"By how much the mean squared error is lower with {AFTER} than with {BEFORE}, Figure 5 of the paper; negative: higher. Prediction "
-        f"of the next sample from the true state, and estimation by the filter. Bars: median of seeds, dots: seeds; where values go below "
-        f"−100 %, the axis is logarithmic beyond. The paper draws differences; here they are divided by the error of {BEFORE}. "
-        f"Data: {data}."
+        f"By how much the mean squared error is lower with {AFTER} than with {BEFORE}, Figure 5 "
+        "of the paper; negative: higher. Prediction of the next sample from the true state, and "
+        "estimation by the filter. Bars: median of seeds, dots: seeds; where values go below "
+        "−100 %, the axis is logarithmic beyond. The paper draws differences; here they are "
+        f"divided by the error of {BEFORE}. Data: {data}."
     )
     return Figure(f"figure_5_{name}", caption, figure)
 
@@ -169,7 +178,7 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
             for place, (predicts, observes) in enumerate(combinations):
                 values = _of(swaps, test, predicts, observes)
                 border, hatch = (
-                    PLAIN_BLUE if one == BEFORE else THROUGH_RED for one in (predicts, observes)
+                    PLAIN_BLUE if role == BEFORE else THROUGH_RED for role in (predicts, observes)
                 )
                 axes.bar(
                     place,
@@ -201,9 +210,10 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
             fontsize=7.5,
         )
     caption = (
-        f"MSE (weighted) of filters that predict with one model and observe with another, Figure 6 of the paper: border, the model of the "
-        f"prediction step; hatching, that of the observation; blue {BEFORE}, red {AFTER}, of one seed each. Noise is that of the "
-        f"filter whose model predicts. Bars: median of seeds, dots: seeds. Data: {data}."
+        "MSE (weighted) of filters that predict with one model and observe with another, Figure "
+        "6 of the paper: border, the model of the prediction step; hatching, that of the "
+        f"observation; blue {BEFORE}, red {AFTER}, of one seed each. Noise is that of the filter "
+        f"whose model predicts. Bars: median of seeds, dots: seeds. Data: {data}."
     )
     return Figure(f"figure_6_{name}", caption, figure)
 
@@ -211,16 +221,16 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
 def _of(
     swaps: pd.DataFrame, test: str, predicts: str, observes: str
 ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    own = swaps[
+    rows = swaps[
         (swaps["test_set"] == test)
         & (swaps["predicts"] == predicts)
         & (swaps["observes"] == observes)
     ]
-    return own["mse"].to_numpy(dtype=np.float64)
+    return rows["mse"].to_numpy(dtype=np.float64)
 
 
 def _ticks(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[float]:
     """Marks of an axis that is linear to 100 and logarithmic beyond."""
     low = float(np.min(values, initial=0.0))
-    beyond = [-(10.0**power) for power in range(3, 9) if -(10.0**power) >= 10.0 * low]
-    return [*reversed(beyond), -100.0, -50.0, 0.0, 50.0, 100.0]
+    decades = [-(10.0**power) for power in range(3, 9) if -(10.0**power) >= 10.0 * low]
+    return [*reversed(decades), -100.0, -50.0, 0.0, 50.0, 100.0]

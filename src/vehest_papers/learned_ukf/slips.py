@@ -9,19 +9,20 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.report.document import Column, Figure, Table
+from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
 
-LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise
+MIN_SPEED = 0.5  # [m/s] below which a slip angle is noise
 LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)
 
 
 def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatArray:
-    """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves; (K,) [deg].
+    """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves;
+    (K,) [deg].
 
     Args:
         recordings: with ``vx_ref``, ``vy_ref``, ``yaw_rate_ref``.
@@ -32,14 +33,14 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
     parts = []
     for recording in recordings:
         vx, vy, yaw_rate = (recording[name] for name in ("vx_ref", "vy_ref", "yaw_rate_ref"))
-        moving = vx >= LEAST_SPEED
+        moving = vx >= MIN_SPEED
         parts.append(np.degrees(np.arctan2(vy - cg_to_rear_axle * yaw_rate, vx))[moving])
     return np.concatenate(parts)
 
 
 def distribution(
     slips: Mapping[str, FloatArray], name: str, data: str, note: str
-) -> tuple[Figure, Table, pd.DataFrame]:
+) -> tuple[Figure, pd.DataFrame, pd.DataFrame]:
     """Density of each set's slip angle [deg], its percentiles, and the drawn values."""
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
@@ -54,13 +55,15 @@ def distribution(
                 drawn[label], edges, color=colour, linestyle=dash, linewidth=1.2, label=label
             )
         for side in (-1.0, 1.0):
-            known = "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
+            label_of_limit = (
+                "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
+            )
             axes.axvline(
                 side * paper.SLIP_99,
                 color="#767676",
                 linewidth=0.8,
                 linestyle="dotted",
-                label=known,
+                label=label_of_limit,
             )
         axes.set_yscale("log")
         axes.set_xlim(-LIMIT, LIMIT)
@@ -68,8 +71,8 @@ def distribution(
         axes.set_ylabel("density [1/deg]")
         legend_above(figure, axes)
     caption = (
-        f"Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. Data: {data}. Samples with v_x of "
-        f"{LEAST_SPEED:g} m/s and more. {note}"
+        "Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. "
+        f"Data: {data}. Samples with v_x of {MIN_SPEED:g} m/s and more. {note}"
     )
     rows = [
         {
@@ -79,13 +82,4 @@ def distribution(
         }
         for label, values in slips.items()
     ]
-    columns = {"set": Column("set"), "samples": Column("samples")} | {
-        f"p{p}": Column(f"{p} % below [deg]", decimals=1) for p in PERCENTILES
-    }
-    table = Table(
-        f"slip_percentiles_{name}",
-        "Size of the slip angle of the rear axle.",
-        pd.DataFrame(rows),
-        columns,
-    )
-    return Figure(f"figure_3_{name}", caption, figure), table, drawn
+    return Figure(f"figure_3_{name}", caption, figure), pd.DataFrame(rows), drawn

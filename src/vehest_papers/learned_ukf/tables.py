@@ -20,25 +20,21 @@ from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
 from vehest_papers.learned_ukf.paper import Published
 
-METRICS = {
-    "mse": ("mse_weighted", "MSE (weighted)"),
-    "mae": ("mae_weighted", "MAE"),
-    "ae99": ("ae99_weighted", "99%-AE"),
-}
-"""Attribute of `Published` -> metric, and its header."""
+METRICS = {"mse": "mse_weighted", "mae": "mae_weighted", "ae99": "ae99_weighted"}
+"""Attribute of `Published` -> metric."""
 
-STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
+STATES = ("vx", "vy", "yaw_rate")
 
 
-def accuracy(
-    blocks: Mapping[Key, BlockErrors], part: str, test: str, name: str, caption: str
-) -> Table:
-    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds."""
+def accuracy(blocks: Mapping[Key, BlockErrors], part: str, test: str) -> pd.DataFrame:
+    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over
+    sequences and seeds.
+    """
     published = paper.TABLES[test]
     rows = []
     for candidate in candidates_in(blocks, part, test):
         row: dict[str, object] = {"candidate": candidate}
-        for short, (metric, _) in METRICS.items():
+        for short, metric in METRICS.items():
             errors = blocks[Key(part, candidate, test, metric)]
             figure = value_of(errors, metric)[1]
             row[f"paper_{short}"] = _figure(published.get(candidate), short)
@@ -46,12 +42,7 @@ def accuracy(
             row[f"ours_{short}"] = figure_in_words(figure)
             row["n_seeds"] = len(errors.seeds)
         rows.append(row)
-    columns = {"candidate": Column("method")}
-    for short, (_, header) in METRICS.items():
-        columns[f"paper_{short}"] = Column(f"{header}, paper", decimals=4)
-        columns[f"ours_{short}"] = Column(f"{header}, ours")
-    columns["n_seeds"] = Column("seeds", decimals=0)
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def candidates_in(blocks: Mapping[Key, BlockErrors], part: str, test: str) -> list[str]:
@@ -70,7 +61,9 @@ def mse_text(blocks: Mapping[Key, BlockErrors], part: str, candidate: str, test:
 
 
 def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
-    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, and the paper's."""
+    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, and
+    the paper's.
+    """
     rows = []
     for candidate in candidates_in(blocks, part, next(iter(SETS))):
         row: dict[str, object] = {"candidate": candidate}
@@ -95,35 +88,29 @@ def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
         columns[f"words_{test}"] = Column(f"ours, {SETS[test]}")
     columns["n_seeds"] = Column("seeds", decimals=0)
     caption = (
-        f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over sequences and seeds. Baselines take vx "
-        "from the rims and the yaw rate from the gyroscope."
+        f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over "
+        "sequences and seeds. Baselines take vx from the rims and the yaw rate from the "
+        "gyroscope."
     )
     return Table("overview", caption, pd.DataFrame(rows), columns)
 
 
-def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
+def by_state(runs: pd.DataFrame, tests: Sequence[str]) -> pd.DataFrame:
     """Root mean square error of each velocity on each test set."""
     rows = []
     for candidate in dict.fromkeys(runs["candidate"]):
         row: dict[str, object] = {"candidate": candidate}
         for test in tests:
-            known = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
+            stated = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
             for state in STATES:
                 values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
                 row[f"ours_{state}_{test}"] = median_and_range(values, 3)
                 row |= {
                     f"median_{state}_{test}": np.median(values),
-                    f"paper_{state}_{test}": known.get(state, math.nan),
+                    f"paper_{state}_{test}": stated.get(state, math.nan),
                 }
-                row[f"shown_{state}_{test}"] = _beside(row, state, test)
         rows.append(row)
-    columns = {"candidate": Column("method")}
-    for test in tests:
-        columns |= {
-            f"shown_{state}_{test}": Column(f"{state.replace('_', ' ')}, {SETS[test]} [{unit}]")
-            for state, unit in STATES.items()
-        }
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def consistency(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
@@ -177,7 +164,7 @@ _HEADERS = {
 _DECIMALS = {"nees": 2, "nis": 2, "coverage_1sigma": 3, "coverage_2sigma": 3}
 
 
-def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> Table:
+def budget(part: PartArtefacts, runs: pd.DataFrame) -> pd.DataFrame:
     """Seeds, epochs, parameters and skipped steps, by candidate."""
     rows = []
     for candidate, models in models_by_candidate(part).items():
@@ -191,30 +178,11 @@ def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> 
         row["n_parameters"] = int(of_candidate(runs, candidate, "n_parameters")[0])
         row["skipped_steps"] = sum(fit.get("skipped_steps", 0.0) for fit in fits)
         rows.append(row)
-    columns = {
-        "candidate": Column("method"),
-        "n_seeds": Column("seeds", decimals=0),
-        "one_step": Column("epochs, one-step", decimals=0),
-        "after": Column("epochs, through the filter or on sequences", decimals=0),
-        "best_epoch": Column("best of them", decimals=0),
-        "n_parameters": Column("parameters", decimals=0),
-        "skipped_steps": Column("skipped steps, all seeds", decimals=0),
-    }
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return pd.DataFrame(rows)
 
 
 def _figure(published: Published | None, short: str) -> float:
     return getattr(published, short) if published else math.nan
-
-
-def _beside(row: Mapping[str, object], state: str, test: str) -> str:
-    value = row[f"paper_{state}_{test}"]
-    own = str(row[f"ours_{state}_{test}"])
-    return (
-        f"{own} (paper {fixed(value, 3)})"
-        if isinstance(value, float) and math.isfinite(value)
-        else own
-    )
 
 
 def _epochs_by_phase(history: pd.DataFrame) -> list[int]:

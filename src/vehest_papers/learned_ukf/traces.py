@@ -1,4 +1,6 @@
-"""Figure 4: a hard sequence on the unseen tyre, as estimated by some candidates, with what the filters know of their friction."""
+"""Figure 4: a hard sequence on the unseen tyre, as estimated by some candidates, with what the
+filters know of their friction.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +39,13 @@ AXES = {"vx": "$v_x$ [m/s]", "vy": "$v_y$ [m/s]", "yaw_rate": "yaw rate [rad/s]"
 
 
 def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
-    """The sequence on which the models together err most; ``errors``: of each model its losses, sequence by sequence."""
+    """The sequence on which the models together err most; ``errors``: of each model its losses,
+    sequence by sequence.
+    """
     return int(
         np.argmax(
             [
-                sum(float(own[position].mean()) for own in errors)
+                sum(float(of_candidate[position].mean()) for of_candidate in errors)
                 for position in range(len(errors[0]))
             ]
         )
@@ -53,7 +57,10 @@ def hard_sequence(
 ) -> tuple[Figure, pd.DataFrame]:
     """Reference and estimates over the sequence on which the shown models together err most."""
     losses = [
-        [weighted_errors(own, np.square) for own in part.scored(model, test)]
+        [
+            weighted_errors(losses_of_candidate, np.square)
+            for losses_of_candidate in part.scored(model, test)
+        ]
         for model in models.values()
     ]
     position = hardest(losses)
@@ -70,17 +77,18 @@ def hard_sequence(
     time = np.arange(len(reference)) / reference.rate_hz
     drawn = _values(reference, estimates, time)
     mse = {
-        candidate: float(own[position].mean())
-        for candidate, own in zip(models, losses, strict=True)
+        candidate: float(losses_of_candidate[position].mean())
+        for candidate, losses_of_candidate in zip(models, losses, strict=True)
     }
-    shown = "; ".join(
+    listed_errors = "; ".join(
         f"{candidate}, seed {model.seed}: {fixed(mse[candidate], 4)}"
         for candidate, model in models.items()
     )
     caption = (
-        f"Estimates over a hard sequence of {_where(piece)}, Figure 4 of the paper. Of {len(pieces)} sequences it is the one on which the "
-        f"candidates shown err most together. MSE (weighted) here: {shown}. Grey: not scored. "
-        f"Bands: one standard deviation of the friction by the filter itself; dotted: the paper's nominal friction of that tyre, "
+        f"Estimates over a hard sequence of {_place_of(piece)}, Figure 4 of the paper. Of "
+        f"{len(pieces)} sequences it is the one on which the candidates shown err most together. "
+        f"MSE (weighted) here: {listed_errors}. Grey: not scored. Bands: one standard deviation "
+        "of the friction by the filter itself; dotted: the paper's nominal friction of that tyre, "
         f"{paper.NOMINAL_FRICTION[test]:g}. Data: {data}."
     )
     return Figure(
@@ -154,5 +162,5 @@ def _drawn(
     return figure
 
 
-def _where(piece: Span) -> str:
+def _place_of(piece: Span) -> str:
     return f"{as_code(piece.recording)}, {piece.start:.2f} to {piece.stop:.2f} s"

@@ -1,4 +1,6 @@
-"""Step sizes and batches that were tried, and their validation errors: as many trials for the filter as for either recurrent network."""
+"""Step sizes and batches that were tried, and their validation errors: as many trials for the
+filter as for either recurrent network.
+"""
 
 from __future__ import annotations
 
@@ -46,5 +48,8 @@ def trials_table(trials: Sequence[Trial]) -> Table:
         "validation": Column("MSE (weighted), validation", decimals=4),
         "chosen": Column("chosen"),
     }
-    caption = "Step sizes and batches that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
+    caption = (
+        "Step sizes and batches that were tried, on one seed that is not in the tables. "
+        "Validation: tyre A, run 0."
+    )
     return Table("trials", caption, frame, columns)

@@ -1,9 +1,10 @@
-"""The study of the simulated cars: their drives, beside published figures of real ones and beside a real recording.
+"""Simulated cars compared with published figures of real ones and with a real recording.
 
-Used by the pipeline ``proving_ground``. `documents` makes an index and a page a vehicle.
+Used by the pipeline ``proving_ground``, which takes data sets alone. Tables ``statistics`` and
+``gates`` hold the statistics of every set of drives and every gate on the race cars.
 """
 
-from vehest_papers.proving_ground.pages import documents
+from vehest_papers.proving_ground.document import documents
 
 TAKES = "datasets"
 

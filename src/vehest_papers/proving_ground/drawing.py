@@ -1,16 +1,15 @@
-"""Figures of the pages: traces, handling diagram, distributions and spectra."""
+"""Figures of each vehicle: traces, handling diagram and distributions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.recording import Recording
 from vehest.report.figures import decimated
 from vehest.report.style import (
     DOUBLE_COLUMN,
@@ -20,21 +19,21 @@ from vehest.report.style import (
     MatplotlibFigure,
     new_figure,
 )
-from vehest_papers.proving_ground import noise
 from vehest_papers.proving_ground.handling import ANGLE_EDGES, AY_EDGES
-from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile
-from vehest_papers.proving_ground.vehicles import (
-    SHORTEST_TRACE,
-    TRACE_SECONDS,
-    Stretch,
-    VehiclePage,
-)
+from vehest_papers.proving_ground.vehicles import TRACE_SECONDS, Segment, VehicleData
 
 POINTS = 1200
 GREYS = 12
-FARTHEST_ANGLE = 6.0  # deg, to which a characteristic is shown beyond the samples
-GAP_SHARE = 0.012  # of the time axis, between two stretches
+MAX_ANGLE = 6.0  # deg, to which a characteristic is drawn beyond the samples
+GAP_SHARE = 0.012  # of the time axis, between two segments
+MAX_SEGMENTS = 8
+MIN_TRACE_SECONDS = 8.0
+MAX_SIDESLIP = 20.0
+"""Sideslip angle to which distributions are drawn [deg], so that cars that spin do not compress the
+others.
+"""
+
 SOURCES = {"simulated": (LINEAR_BLUES[1], "solid"), "real": (NONLINEAR_ORANGES[1], "dashed")}
 _CURVES = (
     (LINEAR_BLUES[1], "solid"),
@@ -42,7 +41,6 @@ _CURVES = (
     (OTHER_COLOURS[0], "dashdot"),
     (OTHER_COLOURS[2], "dotted"),
 )
-MOST_STRETCHES = 8
 QUANTITIES = {
     "vx": ("vx [m/s]", 1.0),
     "steer": ("steer [deg]", 180.0 / np.pi),
@@ -61,24 +59,24 @@ class Distribution:
     counts: NDArray[np.int64]  # (B,)
 
 
-def shown_stretches(stretches: Mapping[str, Stretch]) -> list[Stretch]:
-    """At most `MOST_STRETCHES`, shortened to their busiest parts so that all together last about `TRACE_SECONDS`."""
-    kept = list(stretches.values())[:MOST_STRETCHES]
-    seconds = max(TRACE_SECONDS / len(kept), SHORTEST_TRACE)
-    return [_busiest_part(stretch, seconds) for stretch in kept]
+def shortened(segments: Mapping[str, Segment]) -> list[Segment]:
+    """At most `MAX_SEGMENTS`, cut to their busiest parts, together about `TRACE_SECONDS` long."""
+    drawn = list(segments.values())[:MAX_SEGMENTS]
+    seconds = max(TRACE_SECONDS / len(drawn), MIN_TRACE_SECONDS)
+    return [segment.busiest_part(seconds) for segment in drawn]
 
 
-def traces(stretches: Sequence[Stretch]) -> MatplotlibFigure:
-    """Speed, steering, yaw rate, lateral acceleration and sideslip, stretches side by side on one time axis with gaps between them."""
-    shown = {name: QUANTITIES[name] for name in QUANTITIES if name in stretches[0].channels}
-    total = sum(float(trace.time[-1] - trace.time[0]) for trace in stretches)
-    with new_figure(DOUBLE_COLUMN, 0.6 + 0.85 * len(shown)) as figure:
-        rows = figure.subplots(len(shown), 1, sharex=True)
+def traces(segments: Sequence[Segment]) -> MatplotlibFigure:
+    """Speed, steering, yaw rate, lateral acceleration and sideslip of segments on one time axis."""
+    quantities = {name: QUANTITIES[name] for name in QUANTITIES if name in segments[0].channels}
+    total = sum(float(trace.time[-1] - trace.time[0]) for trace in segments)
+    with new_figure(DOUBLE_COLUMN, 0.6 + 0.85 * len(quantities)) as figure:
+        rows = figure.subplots(len(quantities), 1, sharex=True)
         offset = 0.0
-        for trace in stretches:
+        for trace in segments:
             at = offset + trace.time - trace.time[0]
             points = max(round(POINTS * (at[-1] - at[0]) / total), 60)
-            for axes, (name, (_, factor)) in zip(rows, shown.items(), strict=True):
+            for axes, (name, (_, factor)) in zip(rows, quantities.items(), strict=True):
                 axes.plot(
                     *decimated(at, factor * trace.channels[name], points),
                     color=SOURCES["simulated"][0],
@@ -88,44 +86,47 @@ def traces(stretches: Sequence[Stretch]) -> MatplotlibFigure:
                 trace.manoeuvre.replace("_", " "),
                 (at[0], 1.0),
                 xycoords=("data", "axes fraction"),
-                xytext=(1, 3 + 8 * (stretches.index(trace) % 2 if len(stretches) > 4 else 0)),
+                xytext=(1, 3 + 8 * (segments.index(trace) % 2 if len(segments) > 4 else 0)),
                 textcoords="offset points",
                 fontsize=6.5,
             )
             offset = float(at[-1]) + GAP_SHARE * total
-            if trace is not stretches[-1]:
+            if trace is not segments[-1]:
                 for axes in rows:
                     axes.axvline(offset - 0.5 * GAP_SHARE * total, color="#b5b9be", linewidth=0.8)
-        for axes, (label, _) in zip(rows, shown.values(), strict=True):
+        for axes, (label, _) in zip(rows, quantities.values(), strict=True):
             axes.set_ylabel(label)
             axes.set_xlim(-0.005 * total, offset)
             axes.margins(y=0.08)
             if axes.get_ylim()[0] < 0 < axes.get_ylim()[1]:
                 axes.axhline(0.0, color="#888888", linewidth=0.5)
-        rows[-1].set_xlabel("time [s]" if len(stretches) == 1 else "time, stretches end to end [s]")
+        rows[-1].set_xlabel("time [s]" if len(segments) == 1 else "time, segments end to end [s]")
         figure.align_ylabels()
     return figure
 
 
-def handling(page: VehiclePage) -> MatplotlibFigure:
-    """Understeer angle over centripetal acceleration: all samples in grey, medians of steady turns, the plant's own characteristics."""
+def handling(vehicle: VehicleData) -> MatplotlibFigure:
+    """Understeer angle over centripetal acceleration.
+
+    All samples in grey, medians of steady turns, and the characteristics of the plant.
+    """
     from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
-    assert page.handling is not None
+    assert vehicle.handling is not None
     edges = (AY_EDGES, ANGLE_EDGES)
-    counts = page.handling.everything
-    curves = page.characteristics
+    counts = vehicle.handling.moving
+    curves = vehicle.characteristics
     sources = {
-        "simulated": page.handling,
-        **({"real": page.real_handling} if page.real_handling is not None else {}),
+        "simulated": vehicle.handling,
+        **({"real": vehicle.real_handling} if vehicle.real_handling is not None else {}),
     }
     with new_figure(DOUBLE_COLUMN, 3.6) as figure:
         axes = figure.add_subplot()
         greys = LinearSegmentedColormap.from_list("greys", ["#ececec", "#7d7d7d"], N=GREYS)
-        shown = np.ma.masked_equal(counts.T, 0)
+        occupied = np.ma.masked_equal(counts.T, 0)
         mesh = axes.pcolormesh(
             *edges,
-            shown,
+            occupied,
             cmap=greys,
             norm=LogNorm(1, max(int(counts.max()), 10)),
             rasterized=True,
@@ -142,11 +143,10 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
                 zorder=4,
             )
         for (colour, _), curve in zip(_CURVES, curves, strict=False):
-            if curve.gradient not in [other.gradient for other in curves[: curves.index(curve)]]:
+            if curve.gradient not in [drawn.gradient for drawn in curves[: curves.index(curve)]]:
                 ends = np.array([-6.0, 6.0])
-                label = f"linear single track, {curve.label.split(',')[0]}: {curve.gradient:.3f}°/(m/s²)".replace(
-                    "-", "\N{MINUS SIGN}"
-                )
+                gradient = f"{curve.gradient:.3f}°/(m/s²)".replace("-", "\N{MINUS SIGN}")
+                label = f"linear single track, {curve.label.split(',')[0]}: {gradient}"
                 axes.plot(
                     ends,
                     curve.gradient * ends,
@@ -170,8 +170,8 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
                 *points.medians(), linestyle="none", marker=marker, label=label, zorder=5, **looks
             )
         axes.set_xlim(*_reach(edges[0], counts.sum(axis=1), [curve.ay for curve in curves]))
-        shown_curves = [np.clip(curve.angle, -FARTHEST_ANGLE, FARTHEST_ANGLE) for curve in curves]
-        axes.set_ylim(*_reach(edges[1], counts.sum(axis=0), shown_curves, share=0.001))
+        clipped = [np.clip(curve.angle, -MAX_ANGLE, MAX_ANGLE) for curve in curves]
+        axes.set_ylim(*_reach(edges[1], counts.sum(axis=0), clipped, share=0.001))
         axes.set_xlabel("speed × yaw rate [m/s²], positive in a left turn")
         axes.set_ylabel("steer \N{MINUS SIGN} arctan(L·yaw rate/speed) [deg]")
         bar = figure.colorbar(mesh, ax=axes, pad=0.01, aspect=30)
@@ -187,26 +187,26 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
     return figure
 
 
-MOST_SIDESLIP = 20.0  # beyond it a distribution of the sideslip angle is not drawn [deg]: cars that spin would press all others into a line
-
-
-def beyond(distributions: Sequence[Distribution], limit: float) -> float:
+def share_beyond(distributions: Sequence[Distribution], limit: float) -> float:
     """Share of all samples in bins beyond ±limit [%]."""
-    total = sum(int(own.counts.sum()) for own in distributions)
-    outside = sum(
-        int(own.counts[(own.edges[1:] <= -limit) | (own.edges[:-1] >= limit)].sum())
-        for own in distributions
-    )
+    total = sum(int(of_kind.counts.sum()) for of_kind in distributions)
+    outside = 0
+    for of_kind in distributions:
+        is_outside = (of_kind.edges[1:] <= -limit) | (of_kind.edges[:-1] >= limit)
+        outside += int(of_kind.counts[is_outside].sum())
     return 100.0 * outside / max(total, 1)
 
 
-def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
-    """Shares of samples in bins of 1° of sideslip and of 1 m/s² of lateral acceleration, logarithmic, with the profile's limits."""
+def distributions(vehicle: VehicleData, profile: Profile) -> MatplotlibFigure:
+    """Shares of samples in bins of 1° of sideslip and of 1 m/s² of lateral acceleration.
+
+    Logarithmic, with the limits of the profile.
+    """
     from matplotlib.ticker import FuncFormatter
 
-    kinds = [*(["simulated"] if page.simulated else []), *(["real"] if page.real else [])]
+    kinds = [*(["simulated"] if vehicle.simulated else []), *(["real"] if vehicle.real else [])]
     sideslip, ay = (
-        [Distribution(kind, *page.merged(kind).histogram(name, 1.0)) for kind in kinds]
+        [Distribution(kind, *vehicle.merged(kind).histogram(name, 1.0)) for kind in kinds]
         for name in ("sideslip", "ay")
     )
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
@@ -217,25 +217,30 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
             (right, ay, profile.ay_limit),
         ):
             reach = 1.0
-            for own in counted:
-                shares = 100.0 * own.counts / max(int(own.counts.sum()), 1)
-                (colour, dash) = SOURCES[own.kind]
-                filled = own.kind == "simulated"
+            for of_kind in counted:
+                shares = 100.0 * of_kind.counts / max(int(of_kind.counts.sum()), 1)
+                (colour, dash) = SOURCES[of_kind.kind]
+                filled = of_kind.kind == "simulated"
                 axes.stairs(
                     shares,
-                    own.edges,
+                    of_kind.edges,
                     color=colour,
                     fill=filled,
                     alpha=0.25 if filled else 1.0,
                     linewidth=0,
                 )
                 axes.stairs(
-                    shares, own.edges, color=colour, linestyle=dash, linewidth=1.2, label=own.kind
+                    shares,
+                    of_kind.edges,
+                    color=colour,
+                    linestyle=dash,
+                    linewidth=1.2,
+                    label=of_kind.kind,
                 )
-                occupied = np.flatnonzero(own.counts)
+                occupied = np.flatnonzero(of_kind.counts)
                 if len(occupied):
                     reach = max(
-                        reach, abs(own.edges[occupied[0]]), abs(own.edges[occupied[-1] + 1])
+                        reach, abs(of_kind.edges[occupied[0]]), abs(of_kind.edges[occupied[-1] + 1])
                     )
                     lowest = min(lowest, float(shares[shares > 0].min()))
             if limit is not None:
@@ -245,11 +250,12 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
                         side * limit, color="black", linestyle="dotted", linewidth=1.0, label=label
                     )
             axes.set_yscale("log")
-            shown = min(reach, MOST_SIDESLIP) if counted is sideslip else reach
-            axes.set_xlim(-1.03 * shown, 1.03 * shown)
-            if shown < reach:
+            limit_drawn = min(reach, MAX_SIDESLIP) if counted is sideslip else reach
+            axes.set_xlim(-1.03 * limit_drawn, 1.03 * limit_drawn)
+            if limit_drawn < reach:
                 axes.set_title(
-                    f"not shown: {beyond(counted, shown):.2g} % of samples beyond ±{shown:g}°",
+                    f"not drawn: {share_beyond(counted, limit_drawn):.2g} % of samples beyond "
+                    f"±{limit_drawn:g}°",
                     fontsize="small",
                 )
         left.set_ylim(bottom=0.6 * lowest, top=100.0)
@@ -264,38 +270,12 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
     return figure
 
 
-def noise_spectra(samples: Mapping[str, Recording]) -> MatplotlibFigure:
-    """Amplitude densities, one panel a channel."""
-    spectra = noise.spectra(samples)
-    columns = 3
-    with new_figure(DOUBLE_COLUMN, 0.4 + 1.75 * -(-len(spectra) // columns)) as figure:
-        grid = figure.subplots(-(-len(spectra) // columns), columns, sharex=True, squeeze=False)
-        for axes, (quantity, own) in zip(grid.flat, spectra.items(), strict=False):
-            for spectrum in own:
-                colour, dash = SOURCES[spectrum.kind]
-                style: Any = "solid" if dash == "solid" else (0, (3, 1))
-                axes.loglog(
-                    spectrum.frequency,
-                    spectrum.density,
-                    color=colour,
-                    linestyle=style,
-                    linewidth=0.9,
-                    label=spectrum.kind,
-                )
-            axes.axvline(NOISE_ABOVE, color="black", linestyle="dotted", linewidth=0.8)
-            axes.set_title(quantity, loc="left", fontsize=7.5, pad=2.5)
-        for axes in grid.flat[len(spectra) :]:
-            axes.set_visible(False)
-        for axes in grid[-1]:
-            axes.set_xlabel("frequency [Hz]")
-        figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
-    return figure
-
-
 def _reach(
     edges: FloatArray, counts: NDArray[np.int64], curves: Sequence[FloatArray], share: float = 0.0
 ) -> tuple[float, float]:
-    """Limits of an axis that show the curves and all but a share of the samples at either end, the same to both sides of zero."""
+    """Limits of an axis that show the curves and all but a share of the samples at either end, the
+    same to both sides of zero.
+    """
     total = int(counts.sum())
     reach = 1.0
     if total:
@@ -305,12 +285,3 @@ def _reach(
         reach = max(abs(float(edges[inside[0]])), abs(float(edges[inside[-1] + 1])))
     reach = max([reach, *(float(np.abs(curve).max()) for curve in curves)])
     return -1.04 * reach, 1.04 * reach
-
-
-def _busiest_part(stretch: Stretch, seconds: float) -> Stretch:
-    rate_hz = (len(stretch.time) - 1) / float(stretch.time[-1] - stretch.time[0])
-    n = min(round(seconds * rate_hz), len(stretch.time))
-    power = np.convolve(np.square(stretch.channels["ay"]), np.full(n, 1.0 / n), mode="valid")
-    kept = slice(int(power.argmax()), int(power.argmax()) + n)
-    channels = {name: own[kept] for name, own in stretch.channels.items()}
-    return replace(stretch, time=stretch.time[kept], channels=channels, power=float(power.max()))

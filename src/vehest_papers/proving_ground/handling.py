@@ -1,4 +1,6 @@
-"""The handling diagram: how much more a car is steered than the curvature needs without slip, over its lateral acceleration."""
+"""The handling diagram: how much more a car is steered than the curvature needs without slip, over
+its lateral acceleration.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,18 @@ ANGLE_EDGES: FloatArray = np.linspace(
     -ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1
 )
 
-SLOWEST = 5.0  # speed from which on samples count [m/s]
+MIN_SPEED = 5.0  # speed from which on samples count [m/s]
 STEADY_ACCELERATION = 1.0
 STEADY_YAW = 0.1
-SMOOTHED_SECONDS = 0.3
-"""Steady is a turn with |ax|, |ay - vx·yaw rate| [m/s²] and the change of the yaw rate [rad/s²] below, averaged over so long [s]."""
-LEAST_SAMPLES = 50
+SMOOTHING_SECONDS = 0.3
+"""Steady is a turn with |ax|, |ay - vx·yaw rate| [m/s²] and the change of the yaw rate [rad/s²]
+below, averaged over so long [s].
+"""
+MIN_SAMPLES = 50
 RAMP_SPEED = 25.0
-"""Of the slow ramp [m/s], or half the top speed if that is less: that at which the driver's knowledge of the car was measured."""
+"""Of the slow ramp [m/s], or half the top speed if that is less: that at which the driver's
+knowledge of the car was measured.
+"""
 
 
 def _no_samples() -> Counts:
@@ -43,20 +49,21 @@ def _no_samples() -> Counts:
 
 @dataclass
 class HandlingPoints:
-    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins of angle); does not grow with them.
+    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins
+    of angle); does not grow with them.
 
     ``wheelbase`` [m] is the car's.
     """
 
     wheelbase: float  # [m]
-    everything: Counts = field(default_factory=_no_samples)  # all samples above `SLOWEST`
+    moving: Counts = field(default_factory=_no_samples)  # all samples above `MIN_SPEED`
     steady: Counts = field(default_factory=_no_samples)  # those of quasi-steady turns
 
     def add(self, recording: Recording) -> None:
         """Count a recording in; it is to be about as free of noise as one at 20 Hz."""
         vx = recording["vx"]
         yaw_rate = recording["yaw_rate"]
-        moving = vx > SLOWEST
+        moving = vx > MIN_SPEED
         ay = vx * yaw_rate
         angle = np.degrees(
             recording["steer"] - np.arctan(self.wheelbase * yaw_rate / np.where(moving, vx, np.inf))
@@ -72,17 +79,21 @@ class HandlingPoints:
             (turning, STEADY_YAW),
         )
         steady = np.logical_and.reduce(
-            [moving, *(np.abs(_smooth(own, recording.rate_hz)) < limit for own, limit in limited)]
+            [
+                moving,
+                *(np.abs(_smooth(signal, recording.rate_hz)) < limit for signal, limit in limited),
+            ]
         )
-        for counts, chosen in ((self.everything, moving), (self.steady, steady)):
-            counts += np.histogram2d(ay[chosen], angle[chosen], bins=(AY_EDGES, ANGLE_EDGES))[
-                0
-            ].astype(np.int64)
+        for counts, mask in ((self.moving, moving), (self.steady, steady)):
+            drawn, _, _ = np.histogram2d(ay[mask], angle[mask], bins=(AY_EDGES, ANGLE_EDGES))
+            counts += drawn.astype(np.int64)
 
     def medians(self) -> tuple[FloatArray, FloatArray]:
-        """Lateral acceleration and median understeer angle of quasi-steady turns, a point a bin of enough samples."""
+        """Lateral acceleration and median understeer angle of quasi-steady turns, a point a bin of
+        enough samples.
+        """
         totals = self.steady.sum(axis=1)
-        enough = totals >= LEAST_SAMPLES
+        enough = totals >= MIN_SAMPLES
         above = np.cumsum(self.steady, axis=1) >= 0.5 * totals[:, None]
         centres = ANGLE_EDGES[:-1] + ANGLE_WIDTH / 2
         return (AY_EDGES[:-1] + AY_WIDTH / 2)[enough], centres[np.argmax(above, axis=1)][enough]
@@ -90,13 +101,16 @@ class HandlingPoints:
 
 @dataclass(frozen=True, eq=False)
 class Characteristic:
-    """What the plant does in a slow ramp of the steering at constant speed, and what a linear single track would do."""
+    """What the plant does in a slow ramp of the steering at constant speed, and what a linear
+    single track would do.
+    """
 
     label: str  # which car on which road
     speed: float  # of the ramp [m/s]
     ay: FloatArray  # centripetal acceleration, from the right to the left limit (M,) [m/s²]
     angle: FloatArray  # understeer angle there (M,) [deg]
-    gradient: float  # of the linear single track with the tyres' cornering stiffness at static load [deg/(m/s²)]
+    # of the linear single track with the tyres' cornering stiffness at static load [deg/(m/s²)]
+    gradient: float
 
 
 def vehicle_of(provenance: Mapping[str, Any], name: str) -> Vehicle:
@@ -127,14 +141,17 @@ def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteris
 
 
 def understeer_angle(motion: Motion, wheelbase: float) -> FloatArray:
-    """Steering angle beyond that of the path's curvature without slip, positive in understeer to the left (T,) [rad]."""
+    """Steering angle beyond that of the path's curvature without slip, positive in understeer to
+    the left (T,) [rad].
+    """
     return motion.steer - np.arctan(wheelbase * motion.yaw_rate / motion.vx)
 
 
 def single_track_gradient(vehicle: Vehicle) -> float:
     """Understeer gradient of the linear single track [deg/(m/s²)].
 
-    m (b/C_f - a/C_r)/L with axle stiffnesses C = -p_ky1 times the static load is (1/|p_ky1 front| - 1/|p_ky1 rear|)/g.
+    m (b/C_f - a/C_r)/L with axle stiffnesses C = -p_ky1 times the static load is (1/|p_ky1 front| -
+    1/|p_ky1 rear|)/g.
     """
     parameters = compiled_parameters(vehicle)
     return float(
@@ -146,7 +163,7 @@ def single_track_gradient(vehicle: Vehicle) -> float:
 
 def _smooth(samples: FloatArray, rate_hz: float) -> FloatArray:
     """Moving average; the ends are averaged over what there is."""
-    length = max(round(SMOOTHED_SECONDS * rate_hz), 1)
+    length = max(round(SMOOTHING_SECONDS * rate_hz), 1)
     if len(samples) < length:
         return np.full_like(samples, samples.mean())
     weights = np.ones(length)

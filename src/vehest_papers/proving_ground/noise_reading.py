@@ -1,7 +1,7 @@
 """Sensor noise read off a real recording: the way the levels of ``race`` were found.
 
-What shakes the body above 10 Hz is counted as noise: engine, road and sensors cannot be told apart in a recording.
-Read the Ferrari recording again with::
+What shakes the body above 10 Hz is counted as noise: engine, road and sensors cannot be told apart
+in a recording. Read the Ferrari recording again with::
 
     from vehest_papers.proving_ground.noise_reading import read_off
     print(read_off(recording.channels, recording.rate_hz))
@@ -39,13 +39,14 @@ class SlowError:
 def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, float]:
     """Levels by their name, such as ``ay.noise``; units as in SensorLevel.
 
-    The reference's velocities are taken to be true and on time. Then d(vx)/dt - vy·r - ax and d(vy)/dt + vx·r - ay are errors of ax and ay,
-    the delay of r aside. Their slopes over ax and ay are the gravity that pitch and roll let in; divided by g they are given as
-    ``pitch_gradient`` and ``roll_gradient`` [rad s²/m].
+    The reference's velocities are taken to be true and on time. Then d(vx)/dt - vy·r - ax and
+    d(vy)/dt + vx·r - ay are errors of ax and ay, the delay of r aside. Their slopes over ax and ay
+    are the gravity that pitch and roll let in; divided by g they are given as ``pitch_gradient``
+    and ``roll_gradient`` [rad s²/m].
 
     Args:
-        channels: vx, yaw_rate, ax, ay, steer, vx_ref and vy_ref, each (T,), in SI units, of some minutes without a stop.
-        rate_hz: sampling rate [Hz].
+        channels: vx, yaw_rate, ax, ay, steer, vx_ref and vy_ref, each (T,), in SI units, of some
+        minutes without a stop. rate_hz: sampling rate [Hz].
     """
     vx, vy, yaw_rate, ax, ay = (
         channels[name] for name in ("vx_ref", "vy_ref", "yaw_rate", "ax", "ay")
@@ -87,7 +88,8 @@ def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, fl
 def noise_density(samples: FloatArray, rate_hz: float) -> float:
     """Noise density [unit/√Hz] of samples (T,) between `NOISE_ABOVE` and the Nyquist frequency.
 
-    Medians over time and over frequency: neither a jolt nor a resonance of the body counts for much.
+    Medians over time and over frequency: neither a jolt nor a resonance of the body counts for
+    much.
     """
     frequency, power = signal.welch(
         samples, rate_hz, nperseg=round(WELCH_SECONDS * rate_hz), average="median"
@@ -98,28 +100,34 @@ def noise_density(samples: FloatArray, rate_hz: float) -> float:
 
 
 def quantum(samples: FloatArray) -> float:
-    """The step that samples (T,) change by in ones, twos and threes; zero where they change by anything."""
+    """The step that samples (T,) change by in ones, twos and threes; zero where they change by
+    anything.
+    """
     steps = np.abs(np.diff(samples))
     if not steps.any():
         return 0.0
     smallest = float(np.percentile(steps[steps > 0.0], 10))
-    few = steps[steps < 3.5 * smallest] / smallest
-    return smallest if np.percentile(np.abs(few - np.round(few)), 95) < 0.15 else 0.0
+    multiples = steps[steps < 3.5 * smallest] / smallest
+    return smallest if np.percentile(np.abs(multiples - np.round(multiples)), 95) < 0.15 else 0.0
 
 
 def slow_error(
     residual: FloatArray, explaining: list[FloatArray], noise: float, rate_hz: float
 ) -> SlowError:
-    """Split a residual (T,) below ``SLOW_BELOW`` into its mean, what other signals (T,) explain, white noise of a density, and the rest."""
+    """Split a residual (T,) below ``SLOW_BELOW`` into its mean, what other signals (T,) explain,
+    white noise of a density, and the rest.
+    """
     low_pass = signal.butter(2, SLOW_BELOW, fs=rate_hz, output="sos")
     slow, *signals = (signal.sosfiltfilt(low_pass, values) for values in (residual, *explaining))
     regressors = np.stack([np.ones_like(slow), *signals], axis=1)
     coefficients = np.linalg.lstsq(regressors, slow, rcond=None)[0]
-    rest = slow - regressors @ coefficients
-    frequency = np.fft.rfftfreq(2 * len(rest), 1.0 / rate_hz)
-    power = np.abs(np.fft.rfft(rest, 2 * len(rest))) ** 2 / len(rest)
+    remainder = slow - regressors @ coefficients
+    frequency = np.fft.rfftfreq(2 * len(remainder), 1.0 / rate_hz)
+    power = np.abs(np.fft.rfft(remainder, 2 * len(remainder))) ** 2 / len(remainder)
     _, response = signal.sosfreqz(low_pass, frequency, fs=rate_hz)
-    covariance = np.fft.irfft(power - noise**2 * rate_hz / 2.0 * np.abs(response) ** 4)[: len(rest)]
+    covariance = np.fft.irfft(power - noise**2 * rate_hz / 2.0 * np.abs(response) ** 4)[
+        : len(remainder)
+    ]
     variance = max(float(covariance[0]), 0.0)
     fallen = np.flatnonzero(covariance < variance / np.e)
     time = float(fallen[0]) / rate_hz if len(fallen) else np.inf
@@ -131,9 +139,12 @@ def slow_error(
 def lags(target: FloatArray, regressors: list[FloatArray], rate_hz: float) -> tuple[float, ...]:
     """Coefficients of a target (T,) over regressors (T,) within ``DELAY_BAND``.
 
-    A signal that is late by d is, to first order, the true one less d times its derivative: the coefficient of the derivative is d.
+    A signal that is late by d is, to first order, the true one less d times its derivative: the
+    coefficient of the derivative is d.
     """
     band = signal.butter(2, DELAY_BAND, btype="bandpass", fs=rate_hz, output="sos")
     inside = slice(round(5.0 * rate_hz), -round(5.0 * rate_hz))
-    wanted, *parts = (signal.sosfiltfilt(band, values)[inside] for values in (target, *regressors))
-    return tuple(np.linalg.lstsq(np.stack(parts, axis=1), wanted, rcond=None)[0].tolist())
+    filtered_target, *parts = (
+        signal.sosfiltfilt(band, values)[inside] for values in (target, *regressors)
+    )
+    return tuple(np.linalg.lstsq(np.stack(parts, axis=1), filtered_target, rcond=None)[0].tolist())

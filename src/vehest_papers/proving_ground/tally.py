@@ -1,4 +1,6 @@
-"""Statistics of recordings that are seen one at a time: their size does not grow with the number of recordings."""
+"""Statistics of recordings that are seen one at a time: their size does not grow with the number of
+recordings.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from vehest.data.recording import Recording
 
 Counts = NDArray[np.int64]
 
-MOVING = 5.0  # speed above which samples count in distributions and quantiles [m/s], as in Bertipaglia et al. 2024
+MIN_SPEED = 5.0
+"""Speed above which samples count in quantiles [m/s] (Bertipaglia et al. 2024)."""
+
 FLAGS = ("spun", "left_road", "stood")
 
 
@@ -36,7 +40,9 @@ class Grid:
         return self.width * (np.arange(self.size + 1, dtype=np.float64) - self.size // 2)
 
     def count(self, values: FloatArray) -> Counts:
-        """How many of the values (T,) lie in each bin, shape (size,); a value on an edge counts above it."""
+        """How many of the values (T,) lie in each bin, shape (size,); a value on an edge counts
+        above it.
+        """
         index = np.floor(values / self.width).astype(np.int64) + self.size // 2
         return np.bincount(np.clip(index, 0, self.size - 1), minlength=self.size)
 
@@ -52,7 +58,9 @@ FINE: Mapping[str, Grid] = {
 
 @dataclass
 class Tally:
-    """Statistics of a set of drives; quantiles are those above `MOVING`, exact to half a bin of `FINE`."""
+    """Statistics of a set of drives; quantiles are those above `MIN_SPEED`, exact to half a bin of
+    `FINE`.
+    """
 
     drives: int = 0
     seconds: float = 0.0
@@ -66,7 +74,9 @@ class Tally:
     flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FLAGS, 0))
 
     def add(self, recording: Recording) -> None:
-        """Count a recording in; its channels are vx, vy_ref, sideslip_ref, ay, ax, yaw_rate and, if it has it, steer."""
+        """Count a recording in; its channels are vx, vy_ref, sideslip_ref, ay, ax, yaw_rate and, if
+        it has it, steer.
+        """
         speed = np.hypot(recording["vx"], recording["vy_ref"])
         self.drives += 1
         self.seconds += recording.duration
@@ -86,25 +96,25 @@ class Tally:
         if "steer" in recording:
             samples["steer"] = np.degrees(recording["steer"])
         for name, values in samples.items():
-            self.counts[name] += FINE[name].count(values[speed > MOVING])
+            self.counts[name] += FINE[name].count(values[speed > MIN_SPEED])
         for name in FLAGS:
             self.flags[name] += bool(flags_of(recording).get(name))
 
-    def merge(self, other: Tally) -> None:
+    def merge(self, added: Tally) -> None:
         """Count another set's drives in."""
-        self.drives += other.drives
-        self.seconds += other.seconds
-        self.distance += other.distance
-        self._widen(other.ranges)
-        for name, counts in other.counts.items():
+        self.drives += added.drives
+        self.seconds += added.seconds
+        self.distance += added.distance
+        self._widen(added.ranges)
+        for name, counts in added.counts.items():
             self.counts[name] = self.counts[name] + counts
-        for name, number in other.flags.items():
+        for name, number in added.flags.items():
             self.flags[name] += number
 
     def _widen(self, ranges: Mapping[str, tuple[float, float]]) -> None:
         for name, (low, high) in ranges.items():
-            own = self.ranges.get(name, (math.inf, -math.inf))
-            self.ranges[name] = (min(low, own[0]), max(high, own[1]))
+            lowest, highest = self.ranges.get(name, (math.inf, -math.inf))
+            self.ranges[name] = (min(low, lowest), max(high, highest))
 
     def quantile(self, name: str, share: float, *, absolute: bool = False) -> float:
         """The value below which a share of the samples lies; NaN where there are none."""
@@ -127,12 +137,14 @@ class Tally:
         return float(self.counts[name][inside].sum()) / total if total else math.nan
 
     def histogram(self, name: str, width: float) -> tuple[FloatArray, Counts]:
-        """Edges (B + 1,) and counts (B,) of wider bins, a whole number of fine ones each, one edge at zero."""
+        """Edges (B + 1,) and counts (B,) of wider bins, a whole number of fine ones each, one edge
+        at zero.
+        """
         grid = FINE[name]
-        together = round(width / FINE[name].width)
-        if abs(together * grid.width - width) > 1e-9 or (grid.size // 2) % together:
+        n_fine = round(width / FINE[name].width)
+        if abs(n_fine * grid.width - width) > 1e-9 or (grid.size // 2) % n_fine:
             raise ValueError(f"bins of {width} do not fit those of {grid.width} up to {grid.limit}")
-        return grid.edges[::together], self.counts[name].reshape(-1, together).sum(axis=1)
+        return grid.edges[::n_fine], self.counts[name].reshape(-1, n_fine).sum(axis=1)
 
     def values(self) -> dict[str, tuple[float, str]]:
         """Quantity -> value and unit."""
@@ -164,5 +176,5 @@ class Tally:
 
 def flags_of(recording: Recording) -> Mapping[str, object]:
     """How a drive went, as the simulation wrote it down; nothing for a real one."""
-    found = recording.provenance.get("flags")
-    return found if isinstance(found, Mapping) else {}
+    flags = recording.provenance.get("flags")
+    return flags if isinstance(flags, Mapping) else {}

@@ -1,4 +1,4 @@
-"""Data sets, read one recording at a time, to what each vehicle's page shows."""
+"""Data sets, read one recording at a time, to what the report has of each vehicle."""
 
 from __future__ import annotations
 
@@ -19,49 +19,67 @@ from vehest_papers.proving_ground.handling import (
     vehicle_of,
     wheelbase_of,
 )
-from vehest_papers.proving_ground.papers import counterpart_page, page_of, profile_of
+from vehest_papers.proving_ground.papers import counterpart_of, profile_name, profile_of
 from vehest_papers.proving_ground.tally import Tally, flags_of
 
-NEEDED = ("vx", "yaw_rate", "ax", "ay", "vy_ref")
-CHANNELS = (*NEEDED, "steer", "vx_ref", "sideslip_ref")
+REQUIRED = ("vx", "yaw_rate", "ax", "ay", "vy_ref")
+CHANNELS = (*REQUIRED, "steer", "vx_ref", "sideslip_ref")
 TRACED = ("vx", "steer", "yaw_rate", "ay", "sideslip_ref")
 TRACE_SECONDS = 60.0
-SHORTEST_TRACE = 8.0
-MOST_CHARACTERISTICS = 4
+MAX_CHARACTERISTICS = 4
 ROLES = ("train", "validation", "test")
 ALL = "all"
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """A stretch of one drive."""
+class Segment:
+    """A segment of one drive."""
 
     recording: str  # its name
-    manoeuvre: str  # what is driven
-    time: FloatArray  # on the recording's own clock (K,) [s]
+    manoeuvre: str
+    time: FloatArray  # on the recording's clock (K,) [s]
     channels: Mapping[str, FloatArray]  # those of `TRACED` that it has (K,), SI units
     power: float  # mean square of the lateral acceleration [m²/s⁴]
+
+    def busiest_part(self, seconds: float) -> Segment:
+        """The part of a length with the largest mean square of the lateral acceleration.
+
+        Parameters
+        ----------
+        seconds
+            Length [s]; a shorter segment is returned whole.
+        """
+        rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
+        n = min(round(seconds * rate_hz), len(self.time))
+        power = np.convolve(np.square(self.channels["ay"]), np.full(n, 1.0 / n), mode="valid")
+        first = int(power.argmax())
+        part = slice(first, first + n)
+        channels = {name: samples[part].copy() for name, samples in self.channels.items()}
+        time = self.time[part]
+        return replace(self, time=time, channels=channels, power=float(power[first]))
 
 
 @dataclass(frozen=True)
 class FlaggedDrive:
     """A drive that went wrong by accident."""
 
-    dataset: str  # its data set
-    recording: str  # its name
-    vehicle: str  # its car
-    manoeuvre: str  # what was to be driven
+    dataset: str
+    recording: str
+    vehicle: str
+    manoeuvre: str  # that was planned
     stability_control: bool  # whether it was switched on
     flags: Mapping[str, Any]  # how it went
 
 
 @dataclass
 class DatasetTally:
-    """One data set's recordings of one page."""
+    """The recordings of one vehicle in one data set.
 
-    dataset: StoredDataset  # whose
-    # set -> its statistics: `ALL`, drives by their names without a counter, ``manoeuvre:NAME``, and the `ROLES` that drives have by the
-    # beginning of their names
+    `tallies` maps a set to its statistics: `ALL`, drives by their names without a counter,
+    ``manoeuvre:NAME``, and the `ROLES` that the names of drives begin with.
+    """
+
+    dataset: StoredDataset
     tallies: dict[str, Tally] = field(default_factory=dict)
 
     def add(self, recording: Recording) -> None:
@@ -76,123 +94,115 @@ class DatasetTally:
 
 
 @dataclass
-class VehiclePage:
-    """What a vehicle's page is drawn from."""
+class VehicleData:
+    """What tables and figures of a vehicle are made from."""
 
-    name: str  # of the page
+    name: str  # of its profile
     simulated: dict[str, DatasetTally] = field(default_factory=dict)  # by data set
-    real: dict[str, DatasetTally] = field(
-        default_factory=dict
-    )  # the same of the real recordings that stand beside
-    handling: HandlingPoints | None = None  # points of the simulated recordings
-    real_handling: HandlingPoints | None = None  # of the real ones
-    characteristics: list[Characteristic] = field(
-        default_factory=list
-    )  # of the plant, one a variant and surface
+    real: dict[str, DatasetTally] = field(default_factory=dict)  # of real recordings of the car
+    handling: HandlingPoints | None = None  # of the simulated recordings
+    real_handling: HandlingPoints | None = None
+    # of the plant, one for each variant and surface
+    characteristics: list[Characteristic] = field(default_factory=list)
     # manoeuvre -> of all drives that went as planned, that with the most lateral acceleration
-    stretches: dict[str, Stretch] = field(default_factory=dict)
-    flagged: list[FlaggedDrive] = field(default_factory=list)  # drives that spun or left the road
-    # one simulated and one real recording as they were recorded, to read noise from
-    samples: dict[str, Recording] = field(default_factory=dict)
+    segments: dict[str, Segment] = field(default_factory=dict)
+    flagged: list[FlaggedDrive] = field(default_factory=list)
 
     def merged(self, kind: str) -> Tally:
-        """All recordings of a kind together."""
+        """All recordings of a kind, ``simulated`` or ``real``, together."""
         total = Tally()
-        for own in (self.simulated if kind == "simulated" else self.real).values():
-            total.merge(own.all)
+        for of_dataset in (self.simulated if kind == "simulated" else self.real).values():
+            total.merge(of_dataset.all)
         return total
 
 
-def survey(datasets: Sequence[StoredDataset]) -> dict[str, VehiclePage]:
-    """Name of the page -> what it shows, in the order in which vehicles are met.
+def survey(datasets: Sequence[StoredDataset]) -> dict[str, VehicleData]:
+    """Name of a profile -> data of its vehicle, in the order of the recordings.
 
-    Memory does not grow with the number of recordings: one is held at a time, and one a page for its noise.
+    Memory does not grow with the number of recordings.
     """
-    pages: dict[str, VehiclePage] = {}
-    for dataset in sorted(datasets, key=lambda own: own.kind == "real"):
+    vehicles: dict[str, VehicleData] = {}
+    for dataset in sorted(datasets, key=lambda dataset: dataset.kind == "real"):
         for recording in dataset.recordings():
-            _add(pages, dataset, recording)
-    return pages
+            _add(vehicles, dataset, _completed(recording))
+    return vehicles
 
 
-def _add(pages: dict[str, VehiclePage], dataset: StoredDataset, recording: Recording) -> None:
-    recording = _completed(recording)
-    real = recording.kind == "real"
-    beside = counterpart_page(dataset.name) if real else None
-    name = beside or page_of(recording.vehicle)
-    page = pages.setdefault(name, VehiclePage(name))
-    if real or not _accident(recording):
-        page.samples.setdefault(recording.kind, recording)
+def _add(vehicles: dict[str, VehicleData], dataset: StoredDataset, recording: Recording) -> None:
+    is_real = recording.kind == "real"
+    counterpart = counterpart_of(dataset.name) if is_real else None
+    name = counterpart or profile_name(recording.vehicle)
+    vehicle = vehicles.setdefault(name, VehicleData(name))
     prepared = profile_of(name).prepared(recording)
-    own = page.real if real else page.simulated
-    own.setdefault(dataset.name, DatasetTally(dataset)).add(prepared)
-    if real:
-        _add_real(page, prepared)
+    by_dataset = vehicle.real if is_real else vehicle.simulated
+    by_dataset.setdefault(dataset.name, DatasetTally(dataset)).add(prepared)
+    if is_real:
+        _add_real(vehicle, prepared)
     else:
-        _add_simulated(page, dataset, prepared)
+        _add_simulated(vehicle, dataset, prepared)
 
 
 def _completed(recording: Recording) -> Recording:
-    """The channels that are shown; sideslip from the velocities where it is not recorded."""
+    """The channels that are needed; sideslip from the velocities where it is not recorded."""
     vx_ref = recording.channels.get("vx_ref", recording["vx"])
-    known = {
+    channels = {
         "vx_ref": vx_ref,
         "sideslip_ref": np.arctan2(recording["vy_ref"], vx_ref),
         **recording.channels,
     }
-    return replace(recording, channels=known).select(
-        [*NEEDED, *(name for name in CHANNELS if name in known and name not in NEEDED)]
-    )
+    optional = [name for name in CHANNELS if name in channels and name not in REQUIRED]
+    return replace(recording, channels=channels).select([*REQUIRED, *optional])
 
 
-def _add_real(page: VehiclePage, recording: Recording) -> None:
-    if (
-        page.handling is None or "steer" not in recording
-    ):  # no simulated car whose wheelbase it shares
+def _add_real(vehicle: VehicleData, recording: Recording) -> None:
+    """Count a real recording's steering where a simulated car gives the wheelbase."""
+    if vehicle.handling is None or "steer" not in recording:
         return
-    if page.real_handling is None:
-        page.real_handling = HandlingPoints(page.handling.wheelbase)
-    page.real_handling.add(recording)
+    if vehicle.real_handling is None:
+        vehicle.real_handling = HandlingPoints(vehicle.handling.wheelbase)
+    vehicle.real_handling.add(recording)
 
 
-def _add_simulated(page: VehiclePage, dataset: StoredDataset, recording: Recording) -> None:
-    about = recording.provenance
+def _add_simulated(vehicle: VehicleData, dataset: StoredDataset, recording: Recording) -> None:
     manoeuvre = manoeuvre_of(recording)
-    if "parameter_set" in about and "steer" in recording:  # by vehest's own plant
-        label = _variant(page.name, recording)
-        if len(page.characteristics) < MOST_CHARACTERISTICS and label not in {
-            known.label for known in page.characteristics
-        }:
-            vehicle = vehicle_of(about, recording.vehicle)
-            page.handling = page.handling or HandlingPoints(wheelbase_of(vehicle))
-            page.characteristics.append(
-                characteristic(vehicle, float(about["surface"]["friction"]), label)
-            )
-        assert page.handling is not None
-        page.handling.add(recording)
-    if _accident(recording):
-        on = bool(about.get("stability_control"))
-        page.flagged.append(
+    if "parameter_set" in recording.provenance and "steer" in recording:  # by vehest's plant
+        _add_handling(vehicle, recording)
+    if is_accident(recording):
+        is_controlled = bool(recording.provenance.get("stability_control"))
+        vehicle.flagged.append(
             FlaggedDrive(
-                dataset.name, recording.id, recording.vehicle, manoeuvre, on, flags_of(recording)
+                dataset.name,
+                recording.id,
+                recording.vehicle,
+                manoeuvre,
+                is_controlled,
+                flags_of(recording),
             )
         )
         return
-    stretch = busiest_stretch(recording, TRACE_SECONDS)
-    if manoeuvre not in page.stretches or stretch.power > page.stretches[manoeuvre].power:
-        page.stretches[manoeuvre] = stretch
+    segment = busiest_segment(recording, TRACE_SECONDS)
+    if manoeuvre not in vehicle.segments or segment.power > vehicle.segments[manoeuvre].power:
+        vehicle.segments[manoeuvre] = segment
 
 
-def busiest_stretch(recording: Recording, seconds: float) -> Stretch:
-    """The stretch of a length with the largest mean square of the lateral acceleration; all of a shorter recording."""
-    n = min(round(seconds * recording.rate_hz), len(recording))
-    power = np.convolve(np.square(recording["ay"]), np.full(n, 1.0 / n), mode="valid")
-    first = int(power.argmax())
-    kept = slice(first, first + n)
-    channels = {name: recording[name][kept].copy() for name in TRACED if name in recording}
-    return Stretch(
-        recording.id, manoeuvre_of(recording), recording.time[kept], channels, float(power[first])
-    )
+def _add_handling(vehicle: VehicleData, recording: Recording) -> None:
+    surface = recording.provenance["surface"]
+    variant = recording.vehicle.removeprefix(vehicle.name).strip("_") or "nominal"
+    label = f"{variant}, {surface['name']} road"
+    labels = {curve.label for curve in vehicle.characteristics}
+    if len(labels) < MAX_CHARACTERISTICS and label not in labels:
+        car = vehicle_of(recording.provenance, recording.vehicle)
+        vehicle.handling = vehicle.handling or HandlingPoints(wheelbase_of(car))
+        vehicle.characteristics.append(characteristic(car, float(surface["friction"]), label))
+    assert vehicle.handling is not None
+    vehicle.handling.add(recording)
+
+
+def busiest_segment(recording: Recording, seconds: float) -> Segment:
+    """The segment of a length [s] with the largest mean square of ay, or a shorter recording."""
+    channels = {name: recording[name] for name in TRACED if name in recording}
+    drive = Segment(recording.id, manoeuvre_of(recording), recording.time, channels, 0.0)
+    return drive.busiest_part(seconds)
 
 
 def manoeuvre_of(recording: Recording) -> str:
@@ -207,18 +217,13 @@ def set_of(recording_id: str) -> str:
 
 
 def _sets_of(recording: Recording) -> list[str]:
-    own = set_of(recording.id)
-    sets = [ALL, own, f"manoeuvre:{manoeuvre_of(recording)}"]
-    role = own.split("_")[0]
-    return [*sets, role] if role in ROLES and role != own else sets
+    name = set_of(recording.id)
+    sets = [ALL, name, f"manoeuvre:{manoeuvre_of(recording)}"]
+    role = name.split("_")[0]
+    return [*sets, role] if role in ROLES and role != name else sets
 
 
-def _accident(recording: Recording) -> bool:
+def is_accident(recording: Recording) -> bool:
+    """Whether a simulated drive spun or left the road."""
     flags = flags_of(recording)
     return bool(flags.get("spun") or flags.get("left_road"))
-
-
-def _variant(page: str, recording: Recording) -> str:
-    """What tells a car and its road from others on the same page."""
-    variant = recording.vehicle.removeprefix(page).strip("_") or "nominal"
-    return f"{variant}, {recording.provenance['surface']['name']} road"

@@ -1,4 +1,4 @@
-"""The study of the real recordings: what each holds, what is wrong with it, and whether it can rank estimators at all.
+"""Study of the real recordings: contents, errors, and whether they can rank estimators.
 
 Used by the pipeline ``real_cars``. Nothing is trained.
 """
@@ -6,5 +6,6 @@ Used by the pipeline ``real_cars``. Nothing is trained.
 from vehest_papers.real_cars.document import documents
 
 TAKES = "datasets"
+VERSION = "2"  # recordings, findings and injected errors as CSV, summaries in the report
 
-__all__ = ["TAKES", "documents"]
+__all__ = ["TAKES", "VERSION", "documents"]

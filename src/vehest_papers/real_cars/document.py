@@ -1,211 +1,207 @@
-"""The report: which recordings can rank estimators, what is in each, what the checks find, and how well they find planted faults."""
+"""The report on the real recordings, its tables and its values.
+
+recordings -> statistics, findings of the checks, injected errors -> `report.md.j2`
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
-from vehest.report.style import MISSING, fixed, listed
+from vehest.report.document import REPORT, Column, Document, Figure, Table, as_code
+from vehest.report.style import MISSING, fixed
+from vehest.report.template import fill_template
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
 from vehest_papers.real_cars.figure import distributions
 from vehest_papers.real_cars.planted import detections
 from vehest_papers.real_cars.statistics import (
-    DRIVEN,
-    LEAST_OVER_NOISE,
-    LEAST_SECONDS,
-    LEAST_SIDESLIP,
-    RATE,
+    DRIVEN_SHARE_OF_SPEED,
+    MIN_DRIVEN_SECONDS,
+    MIN_ERROR_OVER_NOISE,
+    MIN_RMS_SIDESLIP,
+    RATE_HZ,
     Statistics,
     statistics_of,
 )
 
-PLANTED_IN = "ferrari_250lm"
+TEMPLATE = Path(__file__).with_name("report.md.j2")
+INJECTED_INTO = "ferrari_250lm"
 RANGES = {
     "150 to 450 s": (150.0, 450.0),
     "450 to 550 s": (450.0, 550.0),
     "550 to 700 s": (550.0, 700.0),
-}  # of the Ferrari's drive
-
-
-def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of all data sets, real ones and those that their publishers simulated.
-
-    Raises:
-        DataError: a recording's file is damaged.
-    """
-    own: dict[str, dict[str, Statistics]] = {}
-    together: dict[str, Statistics] = {}
-    findings = []
-    planted: list[pd.DataFrame] = []
-    for dataset in artefacts.datasets:
-        recordings = list(dataset.recordings())
-        own[dataset.name] = {recording.id: statistics_of([recording]) for recording in recordings}
-        together[dataset.name] = statistics_of(recordings)
-        findings += [row for recording in recordings for row in _findings(dataset, recording)]
-        if dataset.name == PLANTED_IN:
-            planted = [
-                detections(recordings[0].cut(*bounds)).assign(range=name)
-                for name, bounds in RANGES.items()
-            ]
-    blocks: list[Block] = [
-        *_headline(artefacts, together),
-        _overview(artefacts.datasets, together),
-        _rules(),
-        Figure(
-            "distributions",
-            "Sizes of the reference's sideslip angle and of the lateral acceleration while driving: 50, 90 and 99 % of the samples lie "
-            "below the three marks of a row. Open markers: simulated by its publishers.",
-            distributions(
-                [
-                    (dataset.name, dataset.kind, together[dataset.name])
-                    for dataset in artefacts.datasets
-                ]
-            ),
-        ),
-        "## Every recording",
-        _recordings(own),
-        "## What the checks find",
-        _findings_table(findings),
-    ]
-    if planted:
-        blocks += [
-            "## Faults planted into real data",
-            *_planted(pd.concat(planted, ignore_index=True)),
-        ]
-    blocks += ["## Licences and citations", _licences(artefacts.datasets), _how(artefacts)]
-    return {REPORT: Document(artefacts.title, blocks)}
-
-
-def _headline(artefacts: StudyArtefacts, together: Mapping[str, Statistics]) -> list[Block]:
-    kinds = {dataset.name: dataset.kind for dataset in artefacts.datasets}
-    able = [name for name, found in together.items() if not found.reasons]
-    unable = [
-        f"{as_code(name)} ({'; '.join(found.reasons)})"
-        for name, found in together.items()
-        if found.reasons
-    ]
-    hidden = [
-        name
-        for name, found in together.items()
-        if not found.reasons and ("not known" in found.point or found.point == "not said")
-    ]
-    text = (
-        f"**Of {len(together)} data sets {len(able)} can rank estimators** by the rules below: "
-        f"{listed([f'{as_code(name)} ({kinds[name]})' for name in able])}."
-    )
-    if unable:
-        text += f"\n\nNot: {listed(unable)}."
-    if hidden:
-        text += (
-            f"\n\nWhere the reference of {listed([as_code(name) for name in hidden])} was measured is not known: a comparison there "
-            f"ranks lever arms too, and errors are to be read with the best lever arm."
-        )
-    absent = [f"{as_code(missing.name)}" for missing in artefacts.absent_datasets]
-    if absent:
-        text += f"\n\nMissing when this was made: {listed(absent)}."
-    return [block for block in (artefacts.about, text) if block.strip()]
-
-
-def _overview(datasets: Sequence[StoredDataset], together: Mapping[str, Statistics]) -> Table:
-    rows = [
-        {
-            "dataset": dataset.name,
-            "kind": dataset.kind,
-            "recordings": len(dataset.files),
-            "minutes": together[dataset.name].driven / 60.0,
-            **_figures_of(together[dataset.name]),
-            "point": together[dataset.name].point,
-            "ranks": "yes" if not together[dataset.name].reasons else "no",
-        }
-        for dataset in datasets
-    ]
-    return Table(
-        "overview",
-        f"Data sets, all recordings together, while driving (faster than {100 * DRIVEN:.0f} % of the recording's highest speed), at "
-        f"{RATE:g} Hz. β 99 %: of the samples lie below. v = 0 and static map: RMSE(β) of knowing nothing, and of v = r·(b − k·u²) fitted "
-        f"on these very samples. Noise: white noise of the reference, a lower bound. Bound: posterior Cramér-Rao bound from all "
-        f"inputs, axles known but for 23 % of the tyres' stiffness; its levels of noise are those of all recordings together, too high for "
-        f"the quiet ones. All in deg. Correlation: of v with the yaw rate.",
-        pd.DataFrame(rows),
-        {
-            "dataset": Column("data set"),
-            "kind": Column("kind"),
-            "recordings": Column("recordings"),
-            "minutes": Column("driven [min]", decimals=1),
-            **_COLUMNS,
-            "point": Column("reference point"),
-            "ranks": Column("can rank"),
-        },
-    )
-
-
-_COLUMNS = {
+}
+"""Ranges of the Ferrari's drive into which errors are injected [s]."""
+UNDOCUMENTED_POINTS = ("at a point that is not known", "not said")
+ERROR_COLUMNS = {
     "sideslip_99": Column("β 99 %", decimals=2),
-    "rms": Column("v = 0", decimals=2),
+    "rms": Column("zero", decimals=2),
     "static_map": Column("static map", decimals=2),
     "noise": Column("noise", decimals=3),
     "bound": Column("bound", decimals=2),
     "correlation": Column("correlation", decimals=2),
 }
+OVERVIEW_CAPTION = (
+    "Data sets while driving; angles in deg. β 99 %: 99th percentile of |β|. zero: RMSE(β) of the "
+    "zero-sideslip baseline. Static map: RMSE(β) of v = r·(b − k·u²), fitted to the same samples. "
+    "Noise: white noise of the reference. Bound: posterior Cramér-Rao bound of all inputs, with "
+    "known axles and 23 % uncertainty of the tyre stiffness. Correlation: of v and yaw rate."
+)
+DISTRIBUTIONS_CAPTION = (
+    "Sideslip angle of the reference and lateral acceleration while driving: the marks are the "
+    "50th, 90th and 99th percentiles. Open markers: simulated by the publishers."
+)
 
 
-def _figures_of(found: Statistics) -> dict[str, float]:
-    names = ("rms", "static_map", "noise", "bound", "correlation")
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
+    """Report of all data sets, real ones and those that their publishers simulated.
+
+    Raises
+    ------
+    DataError
+        The file of a recording is damaged.
+    """
+    by_recording: dict[str, dict[str, Statistics]] = {}
+    by_dataset: dict[str, Statistics] = {}
+    findings: list[dict[str, str]] = []
+    injected = pd.DataFrame()
+    for dataset in artefacts.datasets:
+        recordings = list(dataset.recordings())
+        by_recording[dataset.name] = {
+            recording.id: statistics_of([recording]) for recording in recordings
+        }
+        by_dataset[dataset.name] = statistics_of(recordings)
+        for recording in recordings:
+            findings += _findings(dataset, recording)
+        if dataset.name == INJECTED_INTO:
+            injected = _injected(recordings[0])
+    recordings_table = _recordings(by_recording)
+    findings_table = pd.DataFrame(
+        findings, columns=["dataset", "recording", "level", "check", "channel", "message"]
+    )
+    kinds = [
+        (dataset.name, dataset.kind, by_dataset[dataset.name]) for dataset in artefacts.datasets
+    ]
+    blocks: list[Table | Figure] = [
+        _overview(artefacts.datasets, by_dataset),
+        Figure("distributions", DISTRIBUTIONS_CAPTION, distributions(kinds)),
+        _findings_by_check(findings_table),
+    ]
+    data = {
+        "recordings": recordings_table,
+        "findings": findings_table,
+        "licences": _licences(artefacts.datasets),
+    }
+    if len(injected):
+        blocks.append(_injected_by_error(injected))
+        data["injected"] = injected
+    values = _values(artefacts, by_dataset, recordings_table, injected)
+    return {REPORT: Document(artefacts.title, fill_template(TEMPLATE, values, blocks), data)}
+
+
+def _values(
+    artefacts: StudyArtefacts,
+    by_dataset: Mapping[str, Statistics],
+    recordings: pd.DataFrame,
+    injected: pd.DataFrame,
+) -> dict[str, object]:
+    """Numbers and names that the template has places for."""
+    kinds = {dataset.name: dataset.kind for dataset in artefacts.datasets}
+    able = [name for name, statistics in by_dataset.items() if not statistics.reasons]
+    detectable = injected[injected["detectable"]] if len(injected) else injected
     return {
-        "sideslip_99": found.sideslip[-1],
-        **{name: float(getattr(found, name)) for name in names},
+        "able": [f"{as_code(name)} ({kinds[name]})" for name in able],
+        "unable": [
+            {"name": as_code(name), "reasons": "; ".join(statistics.reasons)}
+            for name, statistics in by_dataset.items()
+            if statistics.reasons
+        ],
+        "unknown_points": [
+            as_code(name) for name in able if by_dataset[name].point in UNDOCUMENTED_POINTS
+        ],
+        "absent": [as_code(dataset.name) for dataset in artefacts.absent_datasets],
+        "injected": {
+            "n_cases": len(injected),
+            "n_detectable": len(detectable),
+            "n_detected": int(detectable["detected"].sum()),
+            "n_false_alarms": int((injected["false_alarms"] != "").sum()),
+        }
+        if len(injected)
+        else None,
+        "n_datasets": len(by_dataset),
+        "n_recordings": len(recordings),
+        "n_able_recordings": int((recordings["reasons"] == "").sum()),
+        "minutes": fixed(float(recordings["seconds"].sum()) / 60.0, 0),
+        "rate": f"{RATE_HZ:g}",
+        "driven_percent": f"{100 * DRIVEN_SHARE_OF_SPEED:.0f}",
+        "min_seconds": f"{MIN_DRIVEN_SECONDS:g}",
+        "min_sideslip": f"{MIN_RMS_SIDESLIP:g}",
+        "min_over_noise": f"{MIN_ERROR_OVER_NOISE:g}",
+        "command": as_code(artefacts.command),
     }
 
 
-def _rules() -> str:
-    return (
-        f"**Rules**, set before this table was first drawn. A recording can rank estimators if it has a reference of v, "
-        f"{LEAST_SECONDS:g} s of driving, a sideslip of {LEAST_SIDESLIP:g}° (rms) or more, and if a static map fitted on it leaves more "
-        f"than {LEAST_OVER_NOISE:g} times the reference's noise: else there is nothing to be told apart, or no way to tell. The noise is a "
-        f"lower bound: what is slow or smoothed in a reference is not seen, so 'yes' means that nothing speaks against it."
-    )
-
-
-def _recordings(own: Mapping[str, Mapping[str, Statistics]]) -> Table:
-    rows = [
-        {
-            "dataset": dataset,
-            "recording": name,
-            "seconds": found.driven,
-            "rate": found.native_rate,
-            "speed": f"{fixed(found.speed[0], 1)} … {fixed(found.speed[1], 1)}"
-            if math.isfinite(found.speed[0])
-            else MISSING,
-            "ay_99": found.ay[-1],
-            **_figures_of(found),
-            "kinematic_bound": found.kinematic_bound,
-            "why": "; ".join(found.reasons) or "yes",
+def _overview(datasets: Sequence[StoredDataset], by_dataset: Mapping[str, Statistics]) -> Table:
+    rows = []
+    for dataset in datasets:
+        statistics = by_dataset[dataset.name]
+        row = {
+            "dataset": dataset.name,
+            "kind": dataset.kind,
+            "recordings": len(dataset.files),
+            "minutes": statistics.driven / 60.0,
+            **_errors_of(statistics),
+            "point": statistics.point,
+            "ranks": "no" if statistics.reasons else "yes",
         }
-        for dataset, recordings in own.items()
-        for name, found in recordings.items()
-    ]
-    return Table(
-        "recordings",
-        "The same for each recording; speed at 1 and 99 % of the time. Kinematic bound: from u, ω, a_y and a_x alone, nothing known of the "
-        "car.",
-        pd.DataFrame(rows),
-        {
-            "dataset": Column("data set"),
-            "recording": Column("recording"),
-            "seconds": Column("driven [s]", decimals=0),
-            "rate": Column("rate [Hz]", decimals=0),
-            "speed": Column("u [m/s]"),
-            "ay_99": Column("|a_y| 99 % [m/s²]", decimals=1),
-            **_COLUMNS,
-            "kinematic_bound": Column("kinematic bound", decimals=2),
-            "why": Column("can rank, or why not"),
-        },
+        rows.append(row)
+    columns = {
+        "dataset": Column("data set"),
+        "kind": Column("kind"),
+        "recordings": Column("recordings"),
+        "minutes": Column("driven [min]", decimals=1),
+        **ERROR_COLUMNS,
+        "point": Column("reference point"),
+        "ranks": Column("can rank"),
+    }
+    return Table("overview", OVERVIEW_CAPTION, pd.DataFrame(rows), columns)
+
+
+def _errors_of(statistics: Statistics) -> dict[str, float]:
+    """Columns of `ERROR_COLUMNS`."""
+    return {
+        "sideslip_99": statistics.sideslip[-1],
+        "rms": statistics.rms,
+        "static_map": statistics.static_map,
+        "noise": statistics.noise,
+        "bound": statistics.bound,
+        "correlation": statistics.correlation,
+    }
+
+
+def _recordings(by_recording: Mapping[str, Mapping[str, Statistics]]) -> pd.DataFrame:
+    """A row a recording; ``reasons`` is empty where it can rank estimators."""
+    return pd.DataFrame(
+        [
+            {
+                "dataset": dataset,
+                "recording": name,
+                "seconds": statistics.driven,
+                "rate_hz": statistics.native_rate,
+                "speed_1": statistics.speed[0],
+                "speed_99": statistics.speed[1],
+                "ay_99": statistics.ay[-1],
+                **_errors_of(statistics),
+                "kinematic_bound": statistics.kinematic_bound,
+                "reasons": "; ".join(statistics.reasons),
+            }
+            for dataset, recordings in by_recording.items()
+            for name, statistics in recordings.items()
+        ]
     )
 
 
@@ -214,86 +210,89 @@ def _findings(dataset: StoredDataset, recording: Recording) -> list[dict[str, st
         {
             "dataset": dataset.name,
             "recording": recording.id,
-            "level": found.level,
-            "check": found.check,
-            "channel": found.channel or MISSING,
-            "message": found.message,
+            "level": finding.level,
+            "check": finding.check,
+            "channel": finding.channel or MISSING,
+            "message": finding.message,
         }
-        for found in checks_of_recording(recording)
+        for finding in checks_of_recording(recording)
     ]
 
 
-def _findings_table(findings: Sequence[Mapping[str, str]]) -> Table:
-    frame = pd.DataFrame(
-        findings, columns=["dataset", "recording", "level", "check", "channel", "message"]
-    )
-    columns = {name: Column(name) for name in frame.columns} | {
-        "dataset": Column("data set"),
-        "message": Column("finding"),
-    }
-    return Table(
-        "findings",
-        "Everything that `vehest data check` says of these recordings: delays, held and slow channels among it.",
-        frame,
-        columns,
-    )
-
-
-def _planted(found: pd.DataFrame) -> list[Block]:
-    """Detections and false alarms, in sentences and as a table, a row a fault and range."""
-    decidable = found[found["decidable"]]
-    alarms = found[found["false_alarms"] != ""]
-    missed = decidable[~decidable["found"]]
-    text = (
-        f"Into three ranges of the real Ferrari drive {len(found)} faults were planted. Of {len(decidable)} that the channels can "
-        f"show **{int(decidable['found'].sum())} were found**, and in **{len(alarms)}** of all {len(found)} cases an untouched "
-        f"channel was accused. Thresholds come from the first range, but the method was revised after all three had been seen: none of "
-        f"them is an untouched test."
-    )
-    if len(missed):
-        text += f" Missed: {listed([_case(row) for row in missed.to_dict('records')])}."
-    shown = found.assign(
-        found=np.where(
-            found["decidable"], np.where(found["found"], "yes", "**no**"), "cannot be told"
-        ),
-        false_alarms=found["false_alarms"].replace("", MISSING),
-        reported=found["reported"].replace("", MISSING),
-    )
-    caption = "Faults planted into real data, what the checks find, and false alarms: findings on untouched channels."
-    columns = {
-        "range": Column("range"),
-        "fault": Column("fault"),
-        "channel": Column("channel"),
-        "size": Column("size"),
-        "found": Column("found"),
-        "reported": Column("named"),
-        "false_alarms": Column("false alarms"),
-    }
-    return [text, Table("planted", caption, shown, columns)]
-
-
-def _case(row: Mapping[object, object]) -> str:
-    return f"{row['channel']} {row['fault']} ({row['size']}) in {row['range']}"
-
-
-def _licences(datasets: Sequence[StoredDataset]) -> Table:
+def _findings_by_check(findings: pd.DataFrame) -> Table:
+    """How many findings each check has, in how many recordings and in which data sets."""
     rows = [
-        {"dataset": own.name, "title": own.title, "licence": own.licence, "citation": own.citation}
-        for own in datasets
+        {
+            "check": check,
+            "level": level,
+            "findings": len(group),
+            "recordings": len(group[["dataset", "recording"]].drop_duplicates()),
+            "datasets": ", ".join(dict.fromkeys(group["dataset"])),
+        }
+        for (level, check), group in findings.groupby(["level", "check"])
     ]
     columns = {
-        "dataset": Column("data set"),
-        "title": Column("what"),
-        "licence": Column("licence"),
-        "citation": Column("cite"),
+        "check": Column("check"),
+        "level": Column("level"),
+        "findings": Column("findings", decimals=0),
+        "recordings": Column("recordings", decimals=0),
+        "datasets": Column("data sets"),
     }
-    return Table(
-        "licences",
-        "Whose recordings they are. None of them comes with vehest.",
-        pd.DataFrame(rows),
-        columns,
+    frame = pd.DataFrame(rows, columns=list(columns))
+    return Table("findings_by_check", "Findings of `vehest data check`.", frame, columns)
+
+
+def _injected(recording: Recording) -> pd.DataFrame:
+    """Detections in each range of the Ferrari's drive."""
+    return pd.concat(
+        [detections(recording.cut(*bounds)).assign(range=name) for name, bounds in RANGES.items()],
+        ignore_index=True,
     )
 
 
-def _how(artefacts: StudyArtefacts) -> str:
-    return f"## Appendix: how it was made\n\n- Command: {as_code(artefacts.command)}\n- No estimator is trained, no figure depends on a seed."
+def _injected_by_error(injected: pd.DataFrame) -> Table:
+    """Cases, detections and false alarms of each kind of error, and the cases that were missed."""
+    rows = []
+    for name, group in injected.groupby("fault", sort=False):
+        detectable = group[group["detectable"]]
+        missed = detectable[~detectable["detected"]]
+        row = {
+            "fault": name,
+            "cases": len(group),
+            "detectable": len(detectable),
+            "detected": int(detectable["detected"].sum()),
+            "false_alarms": int((group["false_alarms"] != "").sum()),
+            "missed": "; ".join(
+                f"{case['channel']} ({case['size']}), {case['range']}"
+                for case in missed.to_dict("records")
+            )
+            or MISSING,
+        }
+        rows.append(row)
+    columns = {
+        "fault": Column("error"),
+        "cases": Column("cases", decimals=0),
+        "detectable": Column("detectable", decimals=0),
+        "detected": Column("detected", decimals=0),
+        "false_alarms": Column("false alarms", decimals=0),
+        "missed": Column("not detected"),
+    }
+    caption = (
+        "Errors injected into the real Ferrari drive. Detectable: the other channels contain the "
+        "information. False alarms: cases in which an unchanged channel is named."
+    )
+    return Table("injected_by_error", caption, pd.DataFrame(rows), columns)
+
+
+def _licences(datasets: Sequence[StoredDataset]) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "dataset": dataset.name,
+                "title": dataset.title,
+                "licence": dataset.licence,
+                "citation": dataset.citation,
+            }
+            for dataset in datasets
+        ]
+    )

@@ -1,4 +1,4 @@
-"""How large sideslip and lateral acceleration get in each data set."""
+"""Sizes of sideslip angle and lateral acceleration in each data set."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ COLOURS = {"sideslip": "#b8480b", "ay": "#0b4f9c"}
 
 
 def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigure:
-    """A row a data set: 50, 90 and 99 % quantiles of |β| and |ay| while driving, on logarithmic axes."""
+    """Quantiles of |β| and |ay| while driving, a row a data set, on logarithmic axes."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     with new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2)) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, name, label in ((left, "sideslip", "|β| [deg]"), (right, "ay", "|a_y| [m/s²]")):
             colour = COLOURS[name]
-            for height, (_, kind, found) in enumerate(rows):
-                values = np.array(getattr(found, name))
+            for height, (_, kind, statistics) in enumerate(rows):
+                values = np.array(getattr(statistics, name))
                 if not np.isfinite(values).all():
                     axes.annotate(
                         "not measured",

@@ -1,4 +1,6 @@
-"""Faults that are planted into a recording, to see which the checks find and whether they accuse an untouched channel."""
+"""Errors that are injected into a recording: which of them the checks detect, and whether a check
+names an unchanged channel.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from vehest.data.recording import Recording
 
 DELAYS = (0.02, 0.04, 0.1)  # s
 TIME_CONSTANT = 0.4  # s
-HELD_RATE = 10.0  # Hz
+SENSOR_RATE_HZ = 10.0  # Hz
 REFERENCE = ("vy_ref", "sideslip_ref")
 COUNTED_NOTES = frozenset({"offset", "held"})
 Change = Callable[[FloatArray, float], FloatArray]
@@ -24,14 +26,13 @@ Change = Callable[[FloatArray, float], FloatArray]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault."""
+    """An error of one or several channels."""
 
-    name: str  # what is done
-    channels: tuple[
-        str, ...
-    ]  # to which channels; those that a recording does not have are left out, at least one must be there
-    size: str  # how much, with its unit
-    checks: frozenset[str]  # names of checks of which one must find it; empty where none can
+    name: str  # kind of error
+    # that it changes; those that a recording does not have are left out, at least one must be there
+    channels: tuple[str, ...]
+    size: str  # with its unit
+    checks: frozenset[str]  # names of checks of which one must detect it; empty where none can
     change: Change  # samples (T,) and sampling rate [Hz] to samples
 
     def __call__(self, recording: Recording) -> Recording:
@@ -45,7 +46,7 @@ class Fault:
 
 
 def planted_faults() -> list[Fault]:
-    """All faults: delays, signs, units, offsets, a slow sensor that is held, low-passes."""
+    """Delays, signs, units, offsets, held samples of a slow sensor, low-pass filters."""
     delayed = [("yaw_rate",), ("ay",), ("ax",), REFERENCE, ("steer",)]
     faults = [
         Fault(
@@ -77,9 +78,9 @@ def planted_faults() -> list[Fault]:
         ("vx", "km/h", 3.6),
         ("ay", "g", 1.0 / GRAVITY),
     ]
-    found_by = frozenset({"unit", "impossible"})
+    checks_of_units = frozenset({"unit", "impossible"})
     faults += [
-        Fault("in another unit", (name,), unit, found_by, partial(_scaled, factor))
+        Fault("in another unit", (name,), unit, checks_of_units, partial(_scaled, factor))
         for name, unit, factor in units
     ]
     faults += [
@@ -94,7 +95,13 @@ def planted_faults() -> list[Fault]:
         ),
     ]
     faults += [
-        Fault("held", (name,), f"{HELD_RATE:g} Hz", frozenset({"held"}), partial(_held, HELD_RATE))
+        Fault(
+            "held",
+            (name,),
+            f"{SENSOR_RATE_HZ:g} Hz",
+            frozenset({"held"}),
+            partial(_repeated, SENSOR_RATE_HZ),
+        )
         for name in ("yaw_rate", "ay")
     ]
     slow = partial(_low_passed, TIME_CONSTANT)
@@ -106,46 +113,56 @@ def planted_faults() -> list[Fault]:
 
 
 def detections(recording: Recording) -> pd.DataFrame:
-    """Which of `planted_faults` the checks find; those whose channels are missing are left out.
+    """Which of `planted_faults` the checks detect; those whose channels are missing are left out.
 
-    Findings on the untouched recording do not count. A fault is found where one of its checks names one of its channels, or, where
-    the channels contradict each other undecidedly, tells of it among the alternatives.
+    Findings on the unchanged recording do not count. An error is detected where one of its checks
+    names one of its channels or, where the channels contradict each other without a decision, has
+    it among the alternatives.
 
-    Returns:
-        A row a fault: ``fault``, ``channel``, ``size``, ``decidable``, ``found``, ``reported`` (channels that its checks name),
-        ``message``, ``false_alarms`` (checks and untouched channels, separated by "; ").
+    Returns
+    -------
+    DataFrame
+        A row an error: ``fault``, ``channel``, ``size``, ``detectable``, ``detected``,
+        ``reported`` (channels that its checks name), ``message``, ``false_alarms`` (checks and
+        unchanged channels, separated by "; ").
     """
-    own = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
+    before = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
     rows = []
     for fault in planted_faults():
-        touched = [name for name in fault.channels if name in recording]
-        if not touched:
+        changed = [name for name in fault.channels if name in recording]
+        if not changed:
             continue
         new = [
             finding
             for finding in _counted(fault(recording))
-            if (finding.level, finding.check, finding.channel) not in own
+            if (finding.level, finding.check, finding.channel) not in before
         ]
-        right = [one for one in new if one.check in fault.checks and _names(one, touched)]
-        wrong = [one for one in new if one.channel and not _names(one, touched)]
+        right = [
+            finding for finding in new if finding.check in fault.checks and _names(finding, changed)
+        ]
+        wrong = [finding for finding in new if finding.channel and not _names(finding, changed)]
         rows.append(
             {
                 "fault": fault.name,
-                "channel": " and ".join(touched),
+                "channel": " and ".join(changed),
                 "size": fault.size,
-                "decidable": bool(fault.checks),
-                "found": bool(right),
-                "reported": ", ".join(dict.fromkeys(one.channel or "undecided" for one in right)),
+                "detectable": bool(fault.checks),
+                "detected": bool(right),
+                "reported": ", ".join(
+                    dict.fromkeys(finding.channel or "undecided" for finding in right)
+                ),
                 "message": right[0].message if right else "",
-                "false_alarms": "; ".join(f"{one.check}: {one.channel}" for one in wrong),
+                "false_alarms": "; ".join(
+                    f"{finding.check}: {finding.channel}" for finding in wrong
+                ),
             }
         )
     columns = [
         "fault",
         "channel",
         "size",
-        "decidable",
-        "found",
+        "detectable",
+        "detected",
         "reported",
         "message",
         "false_alarms",
@@ -161,11 +178,14 @@ def _counted(recording: Recording) -> list[Finding]:
     ]
 
 
-def _names(finding: Finding, touched: Sequence[str]) -> bool:
-    """Whether a finding is about one of the channels; ``kinematics`` is about all those that it compares."""
+def _names(finding: Finding, channels: Sequence[str]) -> bool:
+    """Whether a finding is about one of the channels.
+
+    ``kinematics`` is about all those that it compares.
+    """
     if finding.check == "kinematics":
-        return bool({"ay", "yaw_rate", "vx", "vx_ref", "vy_ref"} & set(touched))
-    return bool({finding.channel, *finding.suspects} & set(touched))
+        return bool({"ay", "yaw_rate", "vx", "vx_ref", "vy_ref"} & set(channels))
+    return bool({finding.channel, *finding.suspects} & set(channels))
 
 
 def _late(seconds: float, samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -181,8 +201,8 @@ def _shifted(offset: float, samples: FloatArray, rate_hz: float) -> FloatArray:
     return samples + offset
 
 
-def _held(held_rate: float, samples: FloatArray, rate_hz: float) -> FloatArray:
-    step = max(round(rate_hz / held_rate), 1)
+def _repeated(sensor_rate_hz: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    step = max(round(rate_hz / sensor_rate_hz), 1)
     return np.repeat(samples[::step], step)[: len(samples)]
 
 

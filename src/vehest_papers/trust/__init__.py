@@ -1,1 +1,2 @@
-"""The study of what guards an estimate: contract, band and health under faults, on real and simulated cars."""
+"""Study of trust: coverage of bands, and sensor faults that health flags, on real and simulated
+cars."""

@@ -1,4 +1,6 @@
-"""Faults on the test ranges of a study's part: what a likelihood-ratio test that knows them sees, and when health flags them."""
+"""Faults injected into the test ranges of a part: whether a likelihood-ratio test that is given the
+fault detects it, and when health flags it.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +19,21 @@ from vehest.data.splits import Span
 from vehest.evaluation.under_fault import detection_delay
 from vehest.studies.artefacts import PartArtefacts
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
-from vehest.trust.guard import Guard, learn_limits
+from vehest.trust.guard import Guard, GuardLimits, learn_limits
 from vehest.trust.health import HealthModel, health_rows, learn_health
 from vehest_papers.kit.reading import recordings_of
 from vehest_papers.trust.oracle import HORIZON_SECONDS, Oracle, learn_oracle, motion_of
 
-WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current")
-"""Channels that faults are tried in, of those that a car has."""
-
-DRAWN = ("noise", "spikes")
-LASTS = 10.0  # s
-TIMES = 2.0
-PLUS = 0.5  # of the oracle's delay, and s beyond it, within which a flag is in time
-LEAST_SECONDS = 25.0  # of a range that faults are tried on
-MOST_RANGES = 6  # of a part, so that a set of many manoeuvres takes minutes
+CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current")
+"""Channels that faults are injected into, of those that a car has."""
+RANDOM_KINDS = ("noise", "spikes")
+FAULT_SECONDS = 10.0
+DELAY_FACTOR = 2.0
+DELAY_MARGIN_SECONDS = 0.5
+"""A flag is in time up to `DELAY_FACTOR` times the delay of the likelihood-ratio test plus this."""
+MIN_RANGE_SECONDS = 25.0
+MAX_RANGES = 6
+"""Ranges of a part with faults, so that a set of many manoeuvres takes minutes."""
 
 
 @dataclass(frozen=True)
@@ -40,141 +43,160 @@ class FaultTrials:
     part: str  # its name
     data: str  # data sets of the tests, and whether they are real
     rate_hz: float  # of the samples [Hz]
-    # a row a case: fault, channel, severity, onset [s], whether and when [s] the oracle sees it, whether and when health flags it
+    # a row a case: ``fault``, ``channel``, ``severity``, ``onset`` [s], ``detectable`` with
+    # ``test_delay`` [s] by the likelihood-ratio test, ``flagged`` with ``delay`` [s] by health
     table: pd.DataFrame
     nominal: list[NDArray[np.bool_]]  # flags without faults on every test range, (T,) each
 
 
 def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
-    """Try every kind of fault in every channel at three severities, each once a test range, at a third of it.
+    """Inject every kind of fault into every channel at three severities, at a third of each range.
 
-    Health and oracle learn on the part's training and validation ranges.
+    Health and the likelihood-ratio test are fitted to the part's training and validation ranges.
+
+    Raises
+    ------
+    DataError
+        The ranges are too short, or have no channel in common.
     """
-    train, validation, tests = (
-        recordings_of(part, spans)
-        for spans in (part.split.train, part.split.validation, _tested(part))
-    )
+    tested = _tested(part)
+    train = recordings_of(part, part.split.train)
+    validation = recordings_of(part, part.split.validation)
+    tests = recordings_of(part, tested)
     channels = _channels([*train, *validation, *tests])
     rate = part.protocol.rate_hz
-    model = learn_health(train, validation, channels, rate)
-    oracle = learn_oracle(train, validation, channels, rate)
-    limits = learn_limits(train, channels, rate)
-    nominal = [
-        _flags(model, Guard(channels, (), limits, rate), recording.stack(channels))
-        for recording in tests
-    ]
-    long = [
+    detectors = Detectors(
+        learn_health(train, validation, channels, rate),
+        learn_oracle(train, validation, channels, rate),
+        learn_limits(train, channels, rate),
+    )
+    nominal = [detectors.flags(recording.stack(channels)) for recording in tests]
+    long_enough = [
         (recording, flags)
         for recording, flags in zip(tests, nominal, strict=True)
-        if recording.duration >= LEAST_SECONDS
+        if recording.duration >= MIN_RANGE_SECONDS
     ]
+    step = max(math.ceil(len(long_enough) / MAX_RANGES), 1)
     rows = []
-    for recording, flags in long[:: max(math.ceil(len(long) / MOST_RANGES), 1)]:
+    for recording, flags in long_enough[::step]:
         onset = round(recording.duration / 3.0, 2)
-        clean = {channel: recording[channel] for channel in channels}
-        motion = motion_of(clean, rate)
-        for kind in KINDS:
-            for channel in channels:
-                if applies(kind, channel):
-                    for severity in SEVERITIES:
-                        fault = Fault(kind, channel, severity, onset, LASTS)
-                        found = _case(
-                            model,
-                            oracle,
-                            Guard(channels, (), limits, rate),
-                            clean,
-                            motion,
-                            fault,
-                            flags,
-                        )
-                        case = {
-                            "recording": recording.id,
-                            "fault": kind,
-                            "channel": channel,
-                            "severity": severity,
-                            "onset": onset,
-                        }
-                        rows.append(case | found)
-    data = " and ".join(
-        sorted(
-            {
-                f"{part.data_titles[span.dataset]} ({part.kinds[span.dataset]})"
-                for span in _tested(part)
+        samples = {channel: recording[channel] for channel in channels}
+        motion = motion_of(samples, rate)
+        faults = [
+            Fault(kind, channel, severity, onset, FAULT_SECONDS)
+            for kind in KINDS
+            for channel in channels
+            if applies(kind, channel)
+            for severity in SEVERITIES
+        ]
+        for fault in faults:
+            case = {
+                "recording": recording.id,
+                "fault": fault.kind,
+                "channel": fault.channel,
+                "severity": fault.severity,
+                "onset": onset,
             }
-        )
-    )
-    return FaultTrials(name, data, rate, pd.DataFrame(rows), nominal)
+            rows.append(case | detectors.outcome(samples, motion, fault, flags))
+    data = {f"{part.data_titles[span.dataset]} ({part.kinds[span.dataset]})" for span in tested}
+    return FaultTrials(name, " and ".join(sorted(data)), rate, pd.DataFrame(rows), nominal)
+
+
+@dataclass(frozen=True)
+class Detectors:
+    """What is to detect a fault: health, and the likelihood-ratio test that it is compared with."""
+
+    health: HealthModel
+    oracle: Oracle
+    limits: GuardLimits  # of the guard before health
+
+    def flags(self, rows: FloatArray) -> NDArray[np.bool_]:
+        """Whether health flags each sample, (T,), of rows (T, C)."""
+        received = np.ascontiguousarray(rows)
+        model = self.health
+        guard = Guard(model.channels, (), self.limits, model.rate_hz)
+        measured = guard(received).measured
+        status = health_rows(model.packed(), received, measured, model.start()).status
+        return np.asarray(status > 0)
+
+    def outcome(
+        self,
+        samples: Mapping[str, FloatArray],
+        motion: Mapping[str, FloatArray],
+        fault: Fault,
+        nominal: NDArray[np.bool_],
+    ) -> dict[str, Any]:
+        """Outcome of a fault on a recording, the columns of `FaultTrials.table` after ``onset``.
+
+        Parameters
+        ----------
+        samples
+            Channel -> (T,), without the fault.
+        motion
+            The same without noise (`motion_of`).
+        fault
+            To inject.
+        nominal
+            Flags without the fault, (T,).
+        """
+        rate = self.health.rate_hz
+        steps = len(nominal)
+        faulty = inject(samples, rate, fault)
+        first = window(fault, steps, rate)[0]
+        if fault.kind in RANDOM_KINDS:
+            detection = self.oracle.detects(samples, faulty, first, is_random=True)
+        else:
+            detection = self.oracle.detects(
+                motion, inject(motion, rate, fault), first, drive=samples
+            )
+        rows = np.stack([faulty[name] for name in self.health.channels], axis=1)
+        last = min(first + round(HORIZON_SECONDS * rate), steps)
+        delay = detection_delay(self.flags(rows) & ~nominal, first, last, rate)
+        max_delay = DELAY_FACTOR * detection.delay + DELAY_MARGIN_SECONDS
+        return {
+            "detectable": detection.is_detectable,
+            "test_delay": detection.delay,
+            "flagged": math.isfinite(delay),
+            "delay": delay,
+            "in_time": detection.is_detectable and delay <= max_delay,
+        }
 
 
 def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
-    """(test set, number of the range) -> status without faults, (T,), of the channels that the car has."""
-    train, validation = (
-        recordings_of(part, spans) for spans in (part.split.train, part.split.validation)
-    )
-    found = {}
+    """Status without faults, (T,), of each test set and position of a range."""
+    train = recordings_of(part, part.split.train)
+    validation = recordings_of(part, part.split.validation)
+    status = {}
     for test_set, spans in part.split.tests.items():
         tests = recordings_of(part, spans)
         channels = _channels([*train, *validation, *tests])
         model = learn_health(train, validation, channels, part.protocol.rate_hz)
         for position, recording in enumerate(tests):
             rows = np.ascontiguousarray(recording.stack(channels))
-            found[test_set, position] = health_rows(
-                model.packed(), rows, np.isfinite(rows), model.start()
-            ).status
-    return found
+            health = health_rows(model.packed(), rows, np.isfinite(rows), model.start())
+            status[test_set, position] = health.status
+    return status
 
 
-def _case(
-    model: HealthModel,
-    oracle: Oracle,
-    guard: Guard,
-    clean: Mapping[str, FloatArray],
-    motion: Mapping[str, FloatArray],
-    fault: Fault,
-    nominal: NDArray[np.bool_],
-) -> dict[str, Any]:
-    rate = model.rate_hz
-    steps = len(nominal)
-    faulty = inject(clean, rate, fault)
-    first = window(fault, steps, rate)[0]
-    if fault.kind in DRAWN:
-        seen = oracle.sees(clean, faulty, first, drawn=True)
-    else:
-        seen = oracle.sees(motion, inject(motion, rate, fault), first, drive=clean)
-    flags = (
-        _flags(model, guard, np.stack([faulty[name] for name in model.channels], axis=1)) & ~nominal
-    )
-    delay = detection_delay(flags, first, min(first + round(HORIZON_SECONDS * rate), steps), rate)
-    return {
-        "visible": seen.visible,
-        "oracle_delay": seen.delay,
-        "flagged": math.isfinite(delay),
-        "delay": delay,
-        "in_time": seen.visible and delay <= TIMES * seen.delay + PLUS,
-    }
-
-
-def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.bool_]:
-    received = np.ascontiguousarray(rows)
-    return np.asarray(
-        health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0
-    )
-
-
-def other_vehicle(part: PartArtefacts, test_set: str) -> bool:
+def is_other_vehicle(part: PartArtefacts, test_set: str) -> bool:
     """Whether a test set is of another car, or other tyres, than training and validation."""
-    learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
+    trained = {span.dataset for span in (*part.split.train, *part.split.validation)}
     return (
         test_set in part.protocol.sets_elsewhere
-        or not {span.dataset for span in part.split.tests[test_set]} <= learnt
+        or not {span.dataset for span in part.split.tests[test_set]} <= trained
     )
+
+
+def tests_trained_car(part: PartArtefacts) -> bool:
+    """Whether a test is of the car of the training, to which health is fitted."""
+    return any(not is_other_vehicle(part, test_set) for test_set in part.split.tests)
 
 
 def _tested(part: PartArtefacts) -> list[Span]:
     return [
         span
         for name, spans in part.split.tests.items()
-        if not other_vehicle(part, name)
+        if not is_other_vehicle(part, name)
         for span in spans
     ]
 
@@ -182,6 +204,9 @@ def _tested(part: PartArtefacts) -> list[Span]:
 def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(
         channel
-        for channel in WATCHED
-        if all(channel in own and np.isfinite(own[channel]).all() for own in recordings)
+        for channel in CHANNELS
+        if all(
+            channel in recording and np.isfinite(recording[channel]).all()
+            for recording in recordings
+        )
     )

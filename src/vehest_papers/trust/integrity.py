@@ -1,9 +1,10 @@
-"""Integrity of an estimate that states how wrong it may be: protection levels, misleading information, false alarms.
+"""Integrity of an estimate with bands: protection levels, misleading information, false alarms.
 
-The terms are those of satellite navigation: the **protection level** is the error that is exceeded with a stated risk only, here the
-calibrated band; the **alert limit** the error beyond which the estimate must not be used. Information is **misleading** when the error
-exceeds the protection level and nothing was flagged, **hazardously** so when it exceeds the alert limit as well. Where the level is beyond
-the limit, or the estimate was flagged as invalid, it is **unavailable**.
+The terms are those of satellite navigation: the **protection level** is the error that is exceeded
+with a stated risk only, here the calibrated band; the **alert limit** the error beyond which the
+estimate must not be used. Information is **misleading** when the error exceeds the protection level
+and nothing was flagged, **hazardously** so when it exceeds the alert limit as well. Where the level
+is beyond the limit, or the estimate was flagged as invalid, it is **unavailable**.
 
 Source: RTCA DO-229; Tossaint et al., The Stanford-ESA integrity diagram, Navigation 54, 2007.
 """
@@ -32,7 +33,7 @@ UNAVAILABLE = "unavailable"
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,)."""
+    """Errors and protection levels of K samples, and their regions in the Stanford diagram."""
 
     error: FloatArray  # size of the error [deg, or the unit of the levels]
     level: FloatArray  # protection level
@@ -65,25 +66,39 @@ def integrity_of(
     flagged: NDArray[np.bool_],
     alert_limit: float = ALERT_LIMIT,
 ) -> Integrity:
-    """Of signed errors; samples without error or level (a window that is not full yet) are left out.
+    """Integrity from signed errors; samples without error or level are omitted.
 
-    Args:
-        error: estimate less reference, (T,).
-        level: protection level in the same unit, (T,).
-        flagged: whether the estimate was flagged as invalid, (T,).
-        alert_limit: in the same unit.
+    Parameters
+    ----------
+    error
+        Estimate less reference, (T,); NaN while a window is not full.
+    level
+        Protection level in the same unit, (T,).
+    flagged
+        Whether the estimate was flagged as invalid, (T,).
+    alert_limit
+        In the same unit.
     """
-    known = ~np.isnan(error) & ~np.isnan(level)
+    has_both = ~np.isnan(error) & ~np.isnan(level)
+    is_flagged = np.asarray(flagged, bool)[has_both]
+    return Integrity(np.abs(error[has_both]), level[has_both], is_flagged, alert_limit)
+
+
+def joined(parts: Sequence[Integrity]) -> Integrity:
+    """Integrity of several drives with the same alert limit together."""
     return Integrity(
-        np.abs(error[known]), level[known], np.asarray(flagged, bool)[known], alert_limit
+        np.concatenate([part.error for part in parts]),
+        np.concatenate([part.level for part in parts]),
+        np.concatenate([part.flagged for part in parts]),
+        parts[0].alert_limit,
     )
 
 
 @dataclass(frozen=True)
 class AlarmRate:
-    """False alarms in so many hours."""
+    """False alarms and their rate."""
 
-    alarms: int  # how many there were
+    alarms: int  # number of false alarms
     hours: float  # of healthy driving
     per_hour: float  # alarms an hour; NaN without any time
     low: float  # of the 95 % interval of the rate, exact for a Poisson process
@@ -93,11 +108,15 @@ class AlarmRate:
 def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) -> AlarmRate:
     """Alarms on healthy drives; flagged samples in a row are one.
 
-    Args:
-        flagged: of each drive, (T,).
-        rate_hz: [Hz].
+    Parameters
+    ----------
+    flagged
+        Whether each sample of each drive is flagged, (T,).
+    rate_hz
+        Rate of the samples [Hz].
 
-    Source of the interval: Garwood, Fiducial limits for the Poisson distribution, Biometrika 28 (3/4), 1936.
+    Source of the interval: Garwood, Fiducial limits for the Poisson distribution, Biometrika 28
+    (3/4), 1936.
     """
     alarms = sum(len(true_runs(drive)) for drive in flagged)
     hours = sum(len(drive) for drive in flagged) / rate_hz / 3600.0

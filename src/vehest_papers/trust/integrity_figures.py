@@ -1,4 +1,4 @@
-"""The Stanford diagram: error against protection level, with the share of samples in each region."""
+"""The Stanford diagram, error over protection level, and the share of samples in each region."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from vehest.data.store import read_recording
+from vehest.report.document import Column, Figure, Table, as_text
 from vehest.report.style import (
     DOUBLE_COLUMN,
     LINEAR_BLUES,
@@ -15,26 +18,92 @@ from vehest.report.style import (
     MatplotlibFigure,
     new_figure,
 )
-from vehest_papers.trust.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, Integrity
+from vehest.studies.artefacts import PartArtefacts
+from vehest.studies.kit.runs import by_name
+from vehest_papers.kit.reading import sideslip_error
+from vehest_papers.trust.faults import health_of, tests_trained_car
+from vehest_papers.trust.integrity import (
+    ALERT_LIMIT,
+    HAZARDOUS,
+    MISLEADING,
+    NOMINAL,
+    UNAVAILABLE,
+    Integrity,
+    integrity_of,
+    joined,
+)
 
 BINS = 60
 COLUMNS = 3
-REACH = 2.0  # alert limits that the axes span
-_BEHIND = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+AXIS_OVER_LIMIT = 2.0
+"""End of both axes over the alert limit."""
+_TEXT_BOX = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
 LABELS = {
     NOMINAL: (0.25, 0.75),
     MISLEADING: (0.72, 0.42),
     HAZARDOUS: (1.5, 0.5),
     UNAVAILABLE: (1.0, 1.8),
 }
-"""Region -> where its share is written, in alert limits."""
+"""Region -> place of its share, in alert limits."""
+FAMILIES = ("ksnn", "rational_ekf", "static_map")
+INVALID = 2
+"""Status of health."""
+INTEGRITY_CAPTION = (
+    "Share of samples in each region [%], real cars of the training, without faults, all test "
+    "ranges."
+)
+STANFORD_CAPTION = (
+    "Stanford diagrams of β, real cars of the training, without faults: size of the error over the "
+    f"protection level, which is the 90 % band; alert limit {ALERT_LIMIT:g}°."
+)
+
+
+def integrity_by_estimator(parts: Mapping[str, PartArtefacts]) -> dict[str, Integrity]:
+    """Title -> errors and levels on real cars of the training, of estimators of `FAMILIES`."""
+    drives: dict[str, list[Integrity]] = {}
+    for part in parts.values():
+        recording = read_recording(next(iter(part.references.values())))
+        is_real = "real" in set(part.kinds.values())
+        if not is_real or not tests_trained_car(part) or "vx" not in recording.channels:
+            continue
+        status = health_of(part)
+        for (estimator, _), models in by_name(part.models).items():
+            if estimator not in FAMILIES:
+                continue
+            of_estimator = drives.setdefault(as_text(models[0].title), [])
+            for test_set in part.split.tests:
+                for position, scored in enumerate(part.scored(models[0], test_set)):
+                    estimate = models[0].estimate(test_set, position)
+                    band = np.degrees(estimate.held_at(scored.time, "band_sideslip"))
+                    is_invalid = status[test_set, position][-len(scored.time) :] == INVALID
+                    of_estimator.append(integrity_of(sideslip_error(scored), band, is_invalid))
+    return {title: joined(of_estimator) for title, of_estimator in drives.items()}
+
+
+def integrity_table(families: Mapping[str, Integrity]) -> Table:
+    """Share of samples in each region [%], a row an estimator."""
+    rows = [
+        {"estimator": title, **{region: 100 * share for region, share in family.shares().items()}}
+        for title, family in families.items()
+    ]
+    columns = {"estimator": Column("estimator")}
+    columns |= {
+        region: Column(region, digits=2, each=True)
+        for region in (NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE)
+    }
+    return Table("integrity", INTEGRITY_CAPTION, pd.DataFrame(rows), columns)
+
+
+def stanford(families: Mapping[str, Integrity]) -> Figure:
+    """The Stanford diagrams with their caption."""
+    return Figure("stanford", STANFORD_CAPTION, stanford_figure(families))
 
 
 def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
-    """A panel an estimate: how many samples have which error and protection level, on a logarithmic scale of grey.
+    """A panel an estimator: samples by error and protection level, on a logarithmic grey scale.
 
-    Samples beyond the axes are drawn at their ends. Where an estimate was flagged as invalid its level counts as beyond the axes.
-
+    Samples beyond the axes are drawn at their ends. Where an estimate was flagged as invalid its
+    level counts as beyond the axes.
     """
     from matplotlib.colors import LogNorm
 
@@ -44,22 +113,24 @@ def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
         panels = np.atleast_1d(
             figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         ).ravel()
-        for axes, (title, own) in zip(panels, families.items(), strict=False):
-            end = REACH * own.alert_limit
-            level = np.where(own.flagged | ~np.isfinite(own.level), np.inf, own.level)
+        for axes, (title, family) in zip(panels, families.items(), strict=False):
+            end = AXIS_OVER_LIMIT * family.alert_limit
+            level = np.where(family.flagged | ~np.isfinite(family.level), np.inf, family.level)
             edges = np.linspace(0.0, end, BINS + 1)
-            across, up = (np.clip(values, 0.0, end * (1.0 - 1e-9)) for values in (own.error, level))
+            across, up = (
+                np.clip(values, 0.0, end * (1.0 - 1e-9)) for values in (family.error, level)
+            )
             counts = np.histogram2d(across, up, bins=[edges, edges])[0]
-            shown = np.ma.masked_equal(counts.T, 0)
+            filled_bins = np.ma.masked_equal(counts.T, 0)
             axes.pcolormesh(
                 edges,
                 edges,
-                shown,
+                filled_bins,
                 cmap="Greys",
                 norm=LogNorm(1, max(counts.max(), 2.0)),
                 rasterized=True,
             )
-            _draw_regions(axes, own)
+            _draw_regions(axes, family)
             axes.set_title(title)
             axes.set_aspect("equal")
         for axes in panels[len(families) :]:
@@ -71,10 +142,10 @@ def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
     return figure
 
 
-def _draw_regions(axes: Any, own: Integrity) -> None:
+def _draw_regions(axes: Any, family: Integrity) -> None:
     """Limits between regions, and the share of the samples in each."""
-    limit = own.alert_limit
-    end = REACH * own.alert_limit
+    limit = family.alert_limit
+    end = AXIS_OVER_LIMIT * limit
     axes.fill(
         [0.0, limit, limit], [0.0, 0.0, limit], color=NONLINEAR_ORANGES[0], alpha=0.15, linewidth=0
     )
@@ -97,11 +168,17 @@ def _draw_regions(axes: Any, own: Integrity) -> None:
     axes.plot(
         [limit, limit], [0.0, limit], color=REFERENCE.colour, linewidth=0.7, linestyle="dashed"
     )
-    shares = own.shares()
+    shares = family.shares()
     for region, (across, up) in LABELS.items():
         words = f"{region.replace(' ', chr(10))}\n{100.0 * shares[region]:.3g} %"
         axes.text(
-            across * limit, up * limit, words, ha="center", va="center", fontsize=5.5, bbox=_BEHIND
+            across * limit,
+            up * limit,
+            words,
+            ha="center",
+            va="center",
+            fontsize=5.5,
+            bbox=_TEXT_BOX,
         )
     axes.set_xlim(0.0, end)
     axes.set_ylim(0.0, end)

@@ -1,16 +1,19 @@
-"""Which faults can be seen at all from a set of channels, and how soon: a likelihood-ratio test that knows the fault.
+"""Which faults are detectable from a set of channels, and how soon: a likelihood-ratio test that is
+given the fault.
 
-The oracle knows what a fault does to the channels, when it begins and how large it is; all that it does not know is whether it is there.
-Channels less their instantaneous relations are predicted by an autoregression with innovations ε ~ N(0, S). Whatever adds a known
-signature to the channels adds s_k to the innovations, the signature through the same filter, and the logarithm of the likelihood ratio of
+The test (oracle) is given the effect of a fault on the channels, its start and its size, and
+decides whether it is present. Channels less their instantaneous relations are predicted by an
+autoregression with innovations ε ~ N(0, S). A signature that is added to the channels adds s_k to
+the innovations, the signature through the same filter, and the logarithm of the likelihood ratio of
 "fault" over "no fault" grows at each sample by
 
-    s_kᵀS⁻¹ε_k + ½ s_kᵀS⁻¹s_k       where the fault is there,       s_kᵀS⁻¹ε_k - ½ s_kᵀS⁻¹s_k       where it is not,
+    s_kᵀS⁻¹ε_k + ½ s_kᵀS⁻¹s_k    with the fault,      s_kᵀS⁻¹ε_k - ½ s_kᵀS⁻¹s_k    without it,
 
-ε being the innovations of the healthy drive. It detects where the sum first exceeds log A; A bounds the chance of a false alarm by 1/A
-(Wald, Sequential Analysis, 1947; Basseville & Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have
-heavier tails than a normal distribution, so A is raised to what the same test reaches anywhere on healthy drives, with the reserve that
-limits of the detector have (`vehest.trust.health.margin`).
+ε being the innovations of the healthy drive. The fault is detected where the sum first exceeds
+log A; A bounds the probability of a false alarm by 1/A (Wald, Sequential Analysis, 1947; Basseville
+& Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have
+heavier tails than a normal distribution, so that A is raised to the largest value of the same test
+on healthy drives, with the margin of the limits of health (`vehest.trust.health.margin`).
 """
 
 from __future__ import annotations
@@ -35,26 +38,32 @@ from vehest.trust.relations import (
     without_glitches,
 )
 
-N_LEVELS = 5  # speeds at which the noise is looked at
-HORIZON_SECONDS = 10.0  # after the onset, within which a fault has to be seen
-STARTS_SECONDS = 1.0  # between the places of healthy drives at which the test is tried
-MOTION_HZ = 4.0  # below which a car moves
-FALSE_ALARMS_PER_HOUR = 1.0  # that the test may have, as the detector that it is compared with
-MOST_DEVIATIONS = 1e3  # of an innovation, beyond which a signature is certain
+N_LEVELS = 5
+"""Speeds at which the level of the noise is fitted."""
+HORIZON_SECONDS = 10.0
+"""After the onset, within which a fault has to be detected."""
+START_INTERVAL_SECONDS = 1.0
+"""Between the starts at which the test is evaluated on healthy drives."""
+MOTION_HZ = 4.0
+"""Frequency below which a signal is motion of the car."""
+MAX_FALSE_ALARMS_PER_HOUR = 1.0
+"""Of the test, as of health, with which it is compared."""
+MAX_DEVIATIONS = 1e3
+"""Standard deviations of an innovation to which a signature is limited."""
 
 
 @dataclass(frozen=True)
-class Visibility:
-    """What the oracle makes of a fault."""
+class Detection:
+    """Outcome of the likelihood-ratio test for a fault."""
 
-    visible: bool  # whether it is seen within the horizon
-    delay: float  # from the onset to the alarm [s]; NaN if it is not seen
+    is_detectable: bool  # whether it is detected within the horizon
+    delay: float  # from the onset to the alarm [s]; NaN if it is not detected
     threshold: float  # log A
 
 
 @dataclass(frozen=True, eq=False)
 class Oracle:
-    """What the test knows of healthy drives."""
+    """The likelihood-ratio test, fitted to healthy drives."""
 
     channels: tuple[str, ...]  # that are measured
     rate_hz: float  # [Hz]
@@ -63,30 +72,37 @@ class Oracle:
     model: Autoregression  # of what they leave
     speed: str | None  # channel that the noise goes by
     levels: tuple[FloatArray, FloatArray]  # speeds, and the noise at each
-    healthy: tuple[
-        FloatArray, ...
-    ]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
-    reserve: float  # how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector
+    # innovations over their levels, of healthy drives on which the threshold is set, (T, C) each
+    healthy: tuple[FloatArray, ...]
+    # factor by which the innovations of healthy drives may grow without an alarm, as with health
+    reserve: float
 
-    def sees(
+    def detects(
         self,
         healthy: Mapping[str, FloatArray],
         faulty: Mapping[str, FloatArray],
         onset: int,
         *,
         drive: Mapping[str, FloatArray] | None = None,
-        drawn: bool = False,
-    ) -> Visibility:
-        """Whether a fault can be seen, and how soon.
+        is_random: bool = False,
+    ) -> Detection:
+        """Whether a fault is detectable, and how soon.
 
-        Args:
-            healthy: channel -> (T,), as it would have been.
-            faulty: channel -> (T,), as it is received; a value that is not finite is seen at once.
-            onset: index of the first sample of the fault.
-            drive: channel -> (T,), where ``healthy`` is only the motion of a drive (`motion_of`) and not what was measured: the signature
-                is then what the fault makes of the motion, and the noise is unknown to the oracle as it is to any detector. A delay or a
-                frozen value would else be seen by the noise that it moves or removes.
-            drawn: whether the fault is random; the oracle then knows the covariance of its signature and not the signature.
+        Parameters
+        ----------
+        healthy
+            Channel -> (T,), without the fault.
+        faulty
+            Channel -> (T,), as received; a value that is not finite is detected at once.
+        onset
+            Index of the first sample of the fault.
+        drive
+            Channel -> (T,), the measured drive where ``healthy`` is its motion alone (`motion_of`).
+            The signature is then the effect of the fault on the motion, and the noise is not given
+            to the test, as to no detector. A delay or a frozen value would otherwise be detected by
+            the noise that it moves or removes.
+        is_random
+            Whether the fault is random; the test is then given the covariance of its signature.
         """
         length = round(HORIZON_SECONDS * self.rate_hz)
         begin = max(onset - self.model.order, 0)
@@ -98,7 +114,7 @@ class Oracle:
             for part in (healthy, faulty, drive or healthy)
         ]
         broken = np.any([~np.isfinite(values) for values in parts[1].values()], axis=0)[first:]
-        seen = int(np.argmax(broken)) if broken.any() else length
+        first_broken = int(np.argmax(broken)) if broken.any() else length
         parts[1] = {
             name: np.where(np.isfinite(values), values, parts[0][name])
             for name, values in parts[1].items()
@@ -108,7 +124,7 @@ class Oracle:
                 residuals_of(part, self.channels, self.relations, self.least_speed)
                 for part in parts
             )
-            bound = MOST_DEVIATIONS * np.sqrt(np.diag(self.model.covariance))
+            bound = MAX_DEVIATIONS * np.sqrt(np.diag(self.model.covariance))
             signature = filtered(
                 self.model, np.clip(np.nan_to_num(after - before), -1e3 * bound, 1e3 * bound)
             )
@@ -123,20 +139,21 @@ class Oracle:
         innovations = innovations / levels
         test = (
             _random_test(signature, self.model.covariance)
-            if drawn
-            else known_test(signature, self.model.covariance)
+            if is_random
+            else signature_test(signature, self.model.covariance)
         )
         threshold = self._threshold(test, within)
         ratio = np.cumsum(test(innovations + signature))
         above = np.flatnonzero(ratio > threshold)
-        at = min(seen, int(above[0]) if len(above) else length)
-        visible = at < within
-        return Visibility(visible, (at + 1) / self.rate_hz if visible else math.nan, threshold)
+        at = min(first_broken, int(above[0]) if len(above) else length)
+        is_detectable = at < within
+        delay = (at + 1) / self.rate_hz if is_detectable else math.nan
+        return Detection(is_detectable, delay, threshold)
 
     def _threshold(self, test: Test, within: int) -> float:
-        """log A: of the false alarms that it may have in a horizon, and not below what healthy drives reach."""
-        highest = -math.log(FALSE_ALARMS_PER_HOUR * HORIZON_SECONDS / 3600.0)
-        step = max(round(STARTS_SECONDS * self.rate_hz), 1)
+        """log A, by the rate of false alarms and not below the largest value on healthy drives."""
+        highest = -math.log(MAX_FALSE_ALARMS_PER_HOUR * HORIZON_SECONDS / 3600.0)
+        step = max(round(START_INTERVAL_SECONDS * self.rate_hz), 1)
         for innovations in self.healthy:
             for begin in range(self.model.order, len(innovations) - within + 1, step):
                 highest = max(
@@ -150,12 +167,11 @@ class Oracle:
         return highest
 
 
-Test = Callable[
-    [FloatArray], FloatArray
-]  # innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)
+Test = Callable[[FloatArray], FloatArray]
+"""Innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)."""
 
 
-def known_test(signature: FloatArray, covariance: FloatArray) -> Test:
+def signature_test(signature: FloatArray, covariance: FloatArray) -> Test:
     """N(s_k, S) against N(0, S): s_kᵀS⁻¹(ε_k + s_k) - ½ s_kᵀS⁻¹s_k."""
     weighted = np.linalg.solve(covariance, signature.T).T
     half = 0.5 * np.einsum("ti,ti->t", weighted, signature)
@@ -171,7 +187,7 @@ def _random_test(signature: FloatArray, covariance: FloatArray) -> Test:
 
 
 def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, FloatArray]:
-    """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time."""
+    """Motion of the car in the channels: all below `MOTION_HZ`, without a shift in time."""
     if rate_hz <= 2.5 * MOTION_HZ:
         return {name: np.array(values) for name, values in samples.items()}
     band = signal.butter(2, MOTION_HZ, fs=rate_hz, output="sos")
@@ -184,46 +200,53 @@ def learn_oracle(
     channels: Sequence[str],
     rate_hz: float,
 ) -> Oracle:
-    """Fit relations and autoregression to training drives at ``rate_hz`` [Hz]; these and validation's are healthy; raises `DataError`."""
+    """Fit relations and autoregression to training drives at ``rate_hz`` [Hz].
+
+    Raises
+    ------
+    DataError
+        The drives are too short, or have no channel in common.
+    """
     names = tuple(channels)
     train, validation = (
         [without_glitches(recording, names) for recording in part] for part in (train, validation)
     )
     least_speed = least_speed_of(train, names)
     relations = tuple(learn_relations(train, names, rate_hz, least_speed))
-    pieces = [
+    residuals = [
         residuals_of({name: recording[name] for name in names}, names, relations, least_speed)
         for recording in (*train, *validation)
     ]
-    model = fit_autoregression(pieces[: len(train)])
+    model = fit_autoregression(residuals[: len(train)])
     speed = speed_channel(names)
-    innovations = [model.innovations(piece) for piece in pieces]
+    innovations = [model.innovations(residual) for residual in residuals]
     speeds = [
         recording[speed] if speed else np.zeros(len(recording))
         for recording in (*train, *validation)
     ]
-    seen = len(train)
+    n_train = len(train)
     levels = learn_noise_levels(
-        np.concatenate(innovations[:seen]),
+        np.concatenate(innovations[:n_train]),
         model.covariance,
-        np.concatenate(speeds[:seen]),
+        np.concatenate(speeds[:n_train]),
         N_LEVELS,
     )
     reserve = margin(
-        STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz
+        START_INTERVAL_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz
     )
     healthy = tuple(
-        own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True)
+        of_drive / levels_at(levels, speed_of_drive)
+        for of_drive, speed_of_drive in zip(innovations, speeds, strict=True)
     )
     return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, reserve)
 
 
 def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:
-    """A signature in the innovations, (T, C), of one that is added to the samples (zero before its first row)."""
-    found = np.array(signature, dtype=np.float64)
+    """Signature in the innovations, (T, C), of one added to samples, zero before its first row."""
+    innovations = np.array(signature, dtype=np.float64)
     for lag, coefficient in enumerate(model.coefficients, start=1):
-        found[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T
-    return found
+        innovations[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T
+    return innovations
 
 
 def levels_at(levels: tuple[FloatArray, FloatArray], speed: FloatArray) -> FloatArray:

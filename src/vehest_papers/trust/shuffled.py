@@ -1,8 +1,9 @@
-"""What a count of intervals that hold 90 % could come to at best, with as many manoeuvres as there are.
+"""How often the interval of a coverage contains 0.90 if calibration and test are exchangeable.
 
-A band of few manoeuvres holds 90 % on average, but seldom just that: mostly more, at times much less. How often an interval over the test's
-few manoeuvres then has 0.90 in it is a matter of their number, even if test and calibration are alike in everything. Manoeuvres of both
-are shuffled here, many times, with the numbers kept: that makes them alike, and what is missing then is not the bands' fault.
+A band of few manoeuvres covers 90 % on average, but seldom on a single test: mostly more, at times
+much less. How often an interval over the few manoeuvres of the test then contains 0.90 depends on
+their number. Manoeuvres of calibration and test are shuffled here, many times, with the numbers
+unchanged, which makes both exchangeable.
 """
 
 from __future__ import annotations
@@ -18,91 +19,106 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.store import read_recording
 from vehest.evaluation.bands import proportion_interval
-from vehest.report.document import Block, Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import by_name
-from vehest.trust.bands import SHOWN_LEVEL, block_labels, pooled_quantile
+from vehest.trust.bands import CHANNEL_LEVEL, block_labels, pooled_quantile
+from vehest_papers.trust.band_tables import TRAINED, contains_level
 
-LEARNT = "learnt on"  # in the board's column "car"
 DRAWS = 100
-LEAST_MANOEUVRES = 3  # of a test, for an interval
+MIN_MANOEUVRES = 3
+"""Of calibration and test, for an interval."""
+TOGETHER_COLUMNS = [
+    "drive",
+    "estimator_title",
+    "tests",
+    "manoeuvres",
+    "coverage",
+    "low",
+    "high",
+    "contained",
+]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of β over the half width of the 90 % band, of all samples of some ranges."""
+    """Errors of β over the half width of the 90 % band, of all samples of several ranges."""
 
-    values: FloatArray  # (N,), 1 where an error ends on the band
-    manoeuvres: NDArray[np.int64]  # which each sample belongs to, (N,), counted from 0
+    values: FloatArray  # (N,), 1 where an error equals the half width
+    manoeuvres: NDArray[np.int64]  # manoeuvre of each sample, (N,), counted from 0
 
     @property
-    def number(self) -> int:
-        """Of manoeuvres."""
+    def n_manoeuvres(self) -> int:
+        """Number of manoeuvres."""
         return int(self.manoeuvres.max(initial=-1)) + 1
 
 
 def scores_of(part: PartArtefacts, model: EvaluatedModel, test_set: str) -> Scores | None:
-    """Scores of a model on a test set, or on ``validation``, by the manoeuvres that bands are calibrated by; none without bands."""
+    """Scores of a model on a test set, or on ``validation``; none without bands.
+
+    Manoeuvres are those that bands are calibrated by.
+    """
     spans = part.split.validation if test_set == "validation" else part.split.tests[test_set]
     parts = part.scored(model, test_set)
-    turns: list[FloatArray | None] = [None] * len(parts)
+    yaw_rates: list[FloatArray | None] = [None] * len(parts)
     values = []
     for position, scored in enumerate(parts):
         if "sideslip" not in scored.bands:
             return None
-        turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-        values.append(np.abs(turned) / scored.bands["sideslip"])
+        error = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+        values.append(np.abs(error) / scored.bands["sideslip"])
         if len(parts) == len(spans):  # else each sequence of a range is a manoeuvre
             reference = read_recording(
                 part.references[spans[position].dataset, spans[position].recording]
             )
-            turns[position] = (
+            yaw_rates[position] = (
                 np.interp(scored.time, reference.time, reference["yaw_rate"])
                 if "yaw_rate" in reference
                 else None
             )
-    labels, _ = block_labels(turns, [len(own) for own in values], part.protocol.rate_hz)
-    together = np.concatenate(values)
-    known = np.concatenate(labels)
-    finite = np.isfinite(together)
-    return (
-        Scores(together[finite], np.unique(known[finite], return_inverse=True)[1])
-        if finite.any()
-        else None
-    )
+    rate_hz = part.protocol.rate_hz
+    labels, _ = block_labels(yaw_rates, [len(part) for part in values], rate_hz)
+    joined = np.concatenate(values)
+    is_finite = np.isfinite(joined)
+    if not is_finite.any():
+        return None
+    manoeuvres = np.unique(np.concatenate(labels)[is_finite], return_inverse=True)[1]
+    return Scores(joined[is_finite], manoeuvres)
 
 
-def holds_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> bool:
+def covers_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> bool:
     """Whether 0.90 lies in the 95 % interval of a share, by manoeuvres counted from 0, (N,)."""
     low, high = _interval(inside, manoeuvres)
-    return low <= SHOWN_LEVEL <= high
+    return low <= CHANNEL_LEVEL <= high
 
 
 def share_if_shuffled(
     calibration: Scores, test: Scores, draws: int = DRAWS, seed: int = 0
 ) -> float:
-    """In which share of draws 0.90 lies in the test's interval, if manoeuvres are shuffled between calibration and test; NaN if too few."""
-    if min(calibration.number, test.number) < LEAST_MANOEUVRES:
+    """Share of draws in which the interval of the test contains 0.90, with shuffled manoeuvres.
+
+    NaN with fewer than `MIN_MANOEUVRES`.
+    """
+    if min(calibration.n_manoeuvres, test.n_manoeuvres) < MIN_MANOEUVRES:
         return float("nan")
     generator = np.random.default_rng(seed)
     values = np.concatenate([calibration.values, test.values])
-    labels = np.concatenate([calibration.manoeuvres, test.manoeuvres + calibration.number])
-    held = 0
+    labels = np.concatenate([calibration.manoeuvres, test.manoeuvres + calibration.n_manoeuvres])
+    n_contained = 0
     for _ in range(draws):
-        order = generator.permutation(calibration.number + test.number)
-        learnt = (order < calibration.number)[labels]
-        factor, _ = pooled_quantile(values[learnt], labels[learnt], SHOWN_LEVEL)
-        manoeuvres = np.unique(labels[~learnt], return_inverse=True)[1]
-        held += holds_level(values[~learnt] <= factor, manoeuvres)
-    return held / draws
+        order = generator.permutation(calibration.n_manoeuvres + test.n_manoeuvres)
+        calibrates = (order < calibration.n_manoeuvres)[labels]
+        factor, _ = pooled_quantile(values[calibrates], labels[calibrates], CHANNEL_LEVEL)
+        manoeuvres = np.unique(labels[~calibrates], return_inverse=True)[1]
+        n_contained += covers_level(values[~calibrates] <= factor, manoeuvres)
+    return n_contained / draws
 
 
 def together(tests: Sequence[Scores]) -> tuple[float, float, float]:
-    """Share of errors inside their bands over several test sets, each by a model and a band of its own, and its 95 % interval."""
-    inside = np.concatenate([own.values <= 1.0 for own in tests])
-    starts = np.cumsum([0, *(own.number for own in tests)])
+    """Coverage over several test sets, each with its model and band, and its 95 % interval."""
+    inside = np.concatenate([scores.values <= 1.0 for scores in tests])
+    starts = np.cumsum([0, *(scores.n_manoeuvres for scores in tests)])
     manoeuvres = np.concatenate(
-        [own.manoeuvres + start for own, start in zip(tests, starts[:-1], strict=True)]
+        [scores.manoeuvres + start for scores, start in zip(tests, starts[:-1], strict=True)]
     )
     low, high = _interval(inside, manoeuvres)
     return float(inside.mean()), low, high
@@ -114,27 +130,11 @@ def _interval(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> tuple
     return proportion_interval(hits, sizes)
 
 
-# In the report
-
-
-def in_words(low: float, high: float) -> str:
-    """Whether 0.90 lies in an interval."""
-    return (
-        "no interval"
-        if math.isnan(low)
-        else "yes"
-        if low <= 0.9 <= high
-        else "too wide"
-        if low > 0.9
-        else "too narrow"
-    )
-
-
-def scores_learnt(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) -> list[Scores | None]:
-    """Of each row of the board, the errors over the band; none off the cars that were learnt on."""
+def scores_of_rows(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) -> list[Scores | None]:
+    """Scores of each row of the board; none on cars that bands were not calibrated on."""
     return [
         scores_of(parts[row["part"]], _model_of(parts[row["part"]], row), row["test_set"])
-        if row["car"] == LEARNT
+        if row["car"] == TRAINED
         else None
         for _, row in board.iterrows()
     ]
@@ -144,78 +144,36 @@ def _model_of(part: PartArtefacts, row: pd.Series) -> EvaluatedModel:
     return by_name(part.models)[row["estimator"], row["variant"]][0]
 
 
-def if_shuffled(
+def shares_if_shuffled(
     parts: Mapping[str, PartArtefacts], board: pd.DataFrame, scores: Sequence[Scores | None]
 ) -> list[float]:
-    """`share_if_shuffled` of each row of the board [%]; NaN off the cars that were learnt on."""
-    found = []
+    """`share_if_shuffled` of each row of the board [%]; NaN on other cars."""
+    shares = []
     for (_, row), test in zip(board.iterrows(), scores, strict=True):
-        part = parts[row["part"]]
-        calibration = None if test is None else scores_of(part, _model_of(part, row), "validation")
-        found.append(
-            math.nan
-            if calibration is None or test is None
-            else 100 * share_if_shuffled(calibration, test)
-        )
-    return found
+        share = math.nan
+        if test is not None:
+            part = parts[row["part"]]
+            calibration = scores_of(part, _model_of(part, row), "validation")
+            if calibration is not None:
+                share = 100 * share_if_shuffled(calibration, test)
+        shares.append(share)
+    return shares
 
 
-def shuffled_in_words(board: pd.DataFrame) -> str:
-    """How many of the intervals could hold 0.90 if test and calibration were alike."""
-    own = board[(board["inside"] != "no interval") & board["if_shuffled"].notna()]
-    if own.empty:
-        return ""
-    by_title = "; ".join(
-        f"{title} {shares.mean():.0f} %"
-        for title, shares in own.groupby("title", sort=False)["if_shuffled"]
-    )
-    held = 100 * float((own["inside"] == "yes").mean())
-    chance = float(own["if_shuffled"].mean())
-    return (
-        f"Of these {len(own)}, {held:.0f} % hold it. **With manoeuvres shuffled {DRAWS} times between calibration and test, which "
-        f"makes the two alike, {chance:.0f} % do** ({by_title}): a band of so few manoeuvres seldom holds just 90 %. "
-        "Added after the tests had been seen; nothing was chosen by it."
-    )
+def coverage_over_parts(board: pd.DataFrame, scores: Sequence[Scores | None]) -> pd.DataFrame:
+    """Coverage over all parts that test on the same drive, each with its model and band.
 
-
-def over_parts(board: pd.DataFrame, scores: Sequence[Scores | None]) -> list[Block]:
-    """Coverage over all parts that test on the same data, each by its own model and band."""
+    Parts of a drive have titles such as ``Real Ferrari, lap 1``.
+    """
     rows = []
     drives = [title.rpartition(", ")[0] or title for title in board["title"]]
-    for (drive, title), own in board.reset_index(drop=True).groupby(
-        [drives, "estimator_title"], sort=False
-    ):
-        tests = [test for test in (scores[position] for position in own.index) if test is not None]
-        if len(tests) > 1 and own["part"].nunique() == len(own):
-            share, low, high = together(tests)
-            row = {
-                "where": drive,
-                "estimator_title": title,
-                "tests": len(tests),
-                "manoeuvres": sum(test.number for test in tests),
-            }
-            rows.append(
-                {
-                    **row,
-                    "share": 100 * share,
-                    "interval": f"{100 * low:.0f} … {100 * high:.0f}",
-                    "inside": in_words(low, high),
-                }
-            )
-    if not rows:
-        return []
-    frame = pd.DataFrame(rows)
-    caption = (
-        "The same over all parts of a drive together, each test by the model and the band that had not seen it: 0.90 lies in "
-        f"{int((frame['inside'] == 'yes').sum())} of {len(frame)} intervals, over manoeuvres. Added after the tests had been seen."
-    )
-    columns = {
-        "where": Column("drive"),
-        "estimator_title": Column("estimator"),
-        "tests": Column("tests", decimals=0),
-        "manoeuvres": Column("manoeuvres", decimals=0),
-        "share": Column("inside [%]", decimals=1),
-        "interval": Column("95 % interval [%]"),
-        "inside": Column("0.90 in it"),
-    }
-    return [Table("bands_together", caption, frame, columns)]
+    board = board.reset_index(drop=True)
+    for (drive, title), group in board.groupby([drives, "estimator_title"], sort=False):
+        tests = [test for test in (scores[row] for row in group.index) if test is not None]
+        if len(tests) < 2 or group["part"].nunique() < len(group):
+            continue
+        coverage, low, high = together(tests)
+        n_manoeuvres = sum(test.n_manoeuvres for test in tests)
+        contained = contains_level(low, high)
+        rows.append((drive, title, len(tests), n_manoeuvres, coverage, low, high, contained))
+    return pd.DataFrame(rows, columns=TOGETHER_COLUMNS)

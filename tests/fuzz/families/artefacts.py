@@ -32,11 +32,11 @@ def _mend(folder):
     file.write_text(json.dumps(content))
 
 
-def _put(file, how):
+def _replace_by_special_file(file, kind):
     """Something else in the place of a file: nothing, a folder, a pipe, a link."""
     file.unlink()
     makers = [lambda: None, file.mkdir, lambda: os.mkfifo(file), file.touch]
-    [*makers, lambda: file.symlink_to("/dev/zero"), lambda: file.symlink_to(file.name)][how % 6]()
+    [*makers, lambda: file.symlink_to("/dev/zero"), lambda: file.symlink_to(file.name)][kind % 6]()
 
 
 def _rename(content, case):
@@ -63,7 +63,10 @@ def _with_header(content, change, rng):
 
 @generator("study", weight=8)
 def manifest(case):
-    """Manifests and files of every stage; a file is spoilt while the manifest still agrees with its size."""
+    """Manifests and files of every stage.
+
+    A file is spoilt while the manifest still agrees with its size.
+    """
     case.copy("study")
     folder = case.rng.choice(
         [
@@ -73,12 +76,12 @@ def manifest(case):
         ]
     )
     file = folder / "manifest.json"
-    how = case.idea(4)
-    if how == 0:
+    kind = case.idea(4)
+    if kind == 0:
         case.spoil(file, lambda content, rng: _rename(content, case))
-    elif how == 1:
+    elif kind == 1:
         file = case.rng.choice(
-            [one for one in sorted(folder.rglob("*")) if one.is_file() and one != file]
+            [path for path in sorted(folder.rglob("*")) if path.is_file() and path != file]
         )
         text = file.suffix in (".csv", ".json", ".yaml", ".md")
         case.spoil(
@@ -88,8 +91,8 @@ def manifest(case):
             ),
         )
         _mend(folder)
-    elif how == 2:
-        _put(file, case.visit // 4)
+    elif kind == 2:
+        _replace_by_special_file(file, case.visit // 4)
     else:
         case.spoil(file, spoil_json)
     likely = [
@@ -104,25 +107,28 @@ def manifest(case):
 
 @generator("study", weight=10)
 def model(case):
-    """model.yaml, model.safetensors with its header, manifest.json; names of models and folders that are none."""
+    """model.yaml, model.safetensors with its header, manifest.json.
+
+    Names of models and folders that are none.
+    """
     case.copy("study")
     folder = case.rng.choice(sorted((case.place / "outputs" / "train").iterdir()))
     rng = case.rng
-    how = case.idea(5)
+    kind = case.idea(5)
     name = rng.choice([str(folder.relative_to(case.place)), folder.name])
-    if how == 0:
+    if kind == 0:
         case.spoil(
             folder / "model.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng)
         )
-    elif how == 1:
+    elif kind == 1:
         case.spoil(folder / "model.safetensors", spoil_bytes)
-    elif how == 2:
+    elif kind == 2:
         case.spoil(
             folder / "model.safetensors",
             lambda content, rng: _with_header(content, lambda head: spoil_json(head, rng), rng),
         )
-    elif how == 3:
-        _put(
+    elif kind == 3:
+        _replace_by_special_file(
             folder / rng.choice(["model.yaml", "model.safetensors", "manifest.json"]),
             case.visit // 5,
         )
@@ -130,13 +136,13 @@ def model(case):
         name = rng.choice(
             ["", ".", "..", "/", "*", "[", "k", "../train", "outputs", "raw", "**", *WRITABLE_NAMES]
         )
-    if how < 3 and not case.honest:
+    if kind < 3 and not case.honest:
         _mend(folder)
-    used = [
+    entries = [
         ("estimate", name, "lap.csv", "-o", "out.csv"),
         ("eval", "--model", name, "split=mine", "tracking=none", "--force"),
     ]
-    return Command(rng.choice(used))
+    return Command(rng.choice(entries))
 
 
 @template
@@ -178,13 +184,15 @@ def tracked(folder):
 
 @generator("tracked", weight=2)
 def tracking_store(case):
-    """The store is damaged, or something else stands in its place: work goes on without it and says so."""
+    """The store is damaged, or something else stands in its place: work goes on without it and says
+    so.
+    """
     case.copy("tracked")
     store = case.place / "outputs" / "mlflow.db"
-    how = case.idea(4)
-    if how == 0:
-        _put(store, case.visit // 4)
-    elif how == 1:
+    kind = case.idea(4)
+    if kind == 0:
+        _replace_by_special_file(store, case.visit // 4)
+    elif kind == 1:
         connection = sqlite3.connect(store)
         connection.executescript(case.rng.choice(STATEMENTS))
         connection.close()

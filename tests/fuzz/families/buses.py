@@ -8,7 +8,7 @@ from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes
 
-TOLD = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
+BUS_CHANNELS = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
 SUFFIXES = (".asc", ".blf", ".log")
 BUS = {
     "name": "logs",
@@ -21,18 +21,21 @@ BUS = {
 BUS |= {"path": "${root}", "files": "drive.*", "dbc": "${root}/car.dbc", "rate_hz": 100}
 BUS |= {"channels": {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}}
 LINES_OF_A_LOG = (
-    (b"d 8", b"d 99"), (b"Rx", b"CANFD"), (b"120", b"zzz"), (b"#", b"##9"), (b".", b".e"), (b"\n", b"\r"), (b"0", b"9" * 400),
+    (b"d 8", b"d 99"), (b"Rx", b"CANFD"), (b"120", b"zzz"), (b"#", b"##9"), (b".", b".e"),
+    (b"\n", b"\r"), (b"0", b"9" * 400),
 )  # fmt: skip
 LINES_OF_A_DBC = (
-    (b"BO_ 288 IMU: 8", b"BO_ 288 IMU: 4000000000"), (b"BO_ 288 IMU: 8", b"BO_ 288 IMU: 0"), (b"BO_ 288", b"BO_ 99999999999"),
-    (b"SG_ YawRate :", b"SG_ YawRate m0 :"), (b"SG_ YawRate :", b"SG_ YawRate M :"), (b"SG_ YawRate :", b"SG_ " + b"Y" * 500 + b" :"),
+    (b"BO_ 288 IMU: 8", b"BO_ 288 IMU: 4000000000"), (b"BO_ 288 IMU: 8", b"BO_ 288 IMU: 0"),
+    (b"BO_ 288", b"BO_ 99999999999"), (b"SG_ YawRate :", b"SG_ YawRate m0 :"),
+    (b"SG_ YawRate :", b"SG_ YawRate M :"), (b"SG_ YawRate :", b"SG_ " + b"Y" * 500 + b" :"),
     *((b"YawRate", name.encode("utf-8", "surrogatepass")) for name in NAMES),
 )  # fmt: skip
 LINES_OF_A_VBO = (
-    (b"[data]", b""), (b"[data]", b"[data][data]"), (b"[column names]", b"[column names]\r\n"), (b"[channel units]", b"[comments]"),
-    (b" time ", b" "), (b" time ", b" time time "), (b"YawRate", b"\xff\xfe"), (b"{", b"{" * 500), (b"+00.031", b"+" + b"9" * 400),
-    (b"+1.790", b"1e999"), (b"[header]", b"[" * 5000), (b"\r\n", b"\r"), (b"\r\n", b"\n\n"), (b" ", b"\t"),
-    (b"[comments]", b"[comments]\r\n\x1b[2J"),
+    (b"[data]", b""), (b"[data]", b"[data][data]"), (b"[column names]", b"[column names]\r\n"),
+    (b"[channel units]", b"[comments]"), (b" time ", b" "), (b" time ", b" time time "),
+    (b"YawRate", b"\xff\xfe"), (b"{", b"{" * 500), (b"+00.031", b"+" + b"9" * 400),
+    (b"+1.790", b"1e999"), (b"[header]", b"[" * 5000), (b"\r\n", b"\r"), (b"\r\n", b"\n\n"),
+    (b" ", b"\t"), (b"[comments]", b"[comments]\r\n\x1b[2J"),
 )  # fmt: skip
 CLOCKS = (0.0, 86_395.0, 86_399.99, 43_200.0)
 
@@ -89,7 +92,7 @@ def log_of_a_bus(case):
         "--dbc",
         "raw/car.dbc",
         "--signals",
-        TOLD,
+        BUS_CHANNELS,
         "--speed",
         "max",
         "--quiet",

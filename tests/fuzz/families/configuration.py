@@ -1,4 +1,7 @@
-"""./conf, which Hydra alone reads: files of every group, spoilt; tags, interpolations, other encodings. ./pipelines, bombs of aliases."""
+"""./conf, which Hydra alone reads: files of every group, spoilt.
+
+Tags, interpolations, other encodings. ./pipelines, bombs of aliases.
+"""
 
 import yaml
 
@@ -39,7 +42,8 @@ CARS = {
     "heavy_truck": "sim_heavy",
     "bmw_545i": "sim_bmw",
 }
-PACKAGED = {  # file of the packaged configuration -> commands that read it, of which the first succeeds
+# file of the packaged configuration -> commands that read it, of which the first succeeds
+PACKAGED = {
     "training/supervised": [("train", *KSNN, "--dry-run")],
     "training/nelder_mead": [("train", *LUENBERGER, "--dry-run")],
     "common": [("ingest", "mine")],
@@ -50,21 +54,22 @@ PACKAGED = {  # file of the packaged configuration -> commands that read it, of 
 }
 DRY = ("split=steered", "tracking=none", "--dry-run")
 PACKAGED |= {
-    f"estimator/{own}": [
-        ("config", "train", f"estimator={own}"),
-        ("train", f"estimator={own}", *DRY),
+    f"estimator/{entry_name}": [
+        ("config", "train", f"estimator={entry_name}"),
+        ("train", f"estimator={entry_name}", *DRY),
     ]
-    for own in ESTIMATORS
+    for entry_name in ESTIMATORS
 }
 PACKAGED |= {
-    f"dataset/{own}": [
-        ("config", "ingest", f"dataset={own}"),
-        ("ingest", own, "--dry-run", "--download"),
+    f"dataset/{entry_name}": [
+        ("config", "ingest", f"dataset={entry_name}"),
+        ("ingest", entry_name, "--dry-run", "--download"),
     ]
-    for own in DATASETS
+    for entry_name in DATASETS
 }
 PACKAGED |= {
-    f"vehicle/{own}": [("simulate", dataset, "--dry-run")] for own, dataset in CARS.items()
+    f"vehicle/{entry_name}": [("simulate", dataset, "--dry-run")]
+    for entry_name, dataset in CARS.items()
 }
 DERIVED = DATASET | {
     "transforms": [
@@ -151,7 +156,10 @@ PIPELINES = (
 
 
 def _write(case, name, tree, head=""):
-    """Write a configuration file, spoilt unless the case is honest; of one that builds on others, the rest."""
+    """Write a configuration file, spoilt unless the case is honest.
+
+    Of one that builds on others, the rest.
+    """
     if case.honest:
         case.write(name, head + yaml_of(tree))
     elif "defaults" in tree or case.rng.random() < 0.3:
@@ -164,7 +172,9 @@ def _write(case, name, tree, head=""):
 
 @generator("drives", weight=8)
 def dataset(case):
-    """A table's channels, transforms, points, poses, held channels, rows that are dropped, time that restarts."""
+    """A table's channels, transforms, points, poses, held channels, rows that are dropped, time
+    that restarts.
+    """
     case.copy("drives")
     _write(
         case,
@@ -218,7 +228,10 @@ def split(case):
 
 @generator("drives", "steered", weight=20)
 def packaged_file(case):
-    """A file that comes with vehest, of any group or at the root, stands spoilt in ./conf; or one that holds any value at all."""
+    """A file that comes with vehest, of any group or at the root, stands spoilt in ./conf.
+
+    Or one that holds any value at all.
+    """
     case.copy("drives")
     case.copy("steered")
     if not case.honest and case.rng.random() < 0.1:
@@ -238,10 +251,13 @@ def packaged_file(case):
 
 @generator("drives", "study", weight=8)
 def pipeline(case):
-    """Studies of one's own and packaged ones; titles and texts that end up in tables, figures and pages."""
-    how = case.idea(8)
-    case.copy("study" if how == 0 else "drives")
-    if how == 0:
+    """Studies of one's own and packaged ones.
+
+    Titles and texts that end up in tables, figures and pages.
+    """
+    kind = case.idea(8)
+    case.copy("study" if kind == 0 else "drives")
+    if kind == 0:
         word = case.rng.choice(
             [*WRITABLE_NAMES, "$x^{", "\\frac", "$", "_" * 50, "|a|b|", "&lt;", "</script>"]
         )
@@ -251,7 +267,7 @@ def pipeline(case):
         )
         return Command(("report", "small", "tracking=none"))
     name = "small"
-    if how in (1, 2):
+    if kind in (1, 2):
         file = case.rng.choice(sorted(packaged("pipelines").glob("*.yaml")))
         name = file.stem
         tree = yaml.safe_load(file.read_text(encoding="utf-8"))

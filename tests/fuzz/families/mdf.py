@@ -36,8 +36,9 @@ RATIONAL = {"P1": 0.0, "P2": 2.0, "P3": 1.0, "P4": 0.0, "P5": 0.0, "P6": 1.0}
 CONVERSIONS = (None, {"a": 0.5, "b": 1.0}, PAIRS, RATIONAL, {"formula": FORMULA})
 VERSIONS = {"v4": ("4.10", 0), "v4dz": ("4.10", 2), "v42": ("4.20", 1), "v3": ("3.30", 0)}
 PAYLOADS = (
-    CALL, f"open('{CANARY}','w')", "().__class__.__base__.__subclasses__()", "9**9**9**9", "X1+__import__('sly').x",
-    "[x for x in range(10**9)]", "factorial(10**6)", "(" * 30 + "X1" + ")" * 30, "'a'*10**9", "X1;import os", "\x1b[2J", "",
+    CALL, f"open('{CANARY}','w')", "().__class__.__base__.__subclasses__()", "9**9**9**9",
+    "X1+__import__('sly').x", "[x for x in range(10**9)]", "factorial(10**6)",
+    "(" * 30 + "X1" + ")" * 30, "'a'*10**9", "X1;import os", "\x1b[2J", "",
 )  # fmt: skip
 
 
@@ -75,13 +76,13 @@ def _overwrite_formula(content, rng):
 @generator("mdf", weight=12)
 def measurement(case):
     case.copy("mdf/conf", "conf")
-    how = case.idea(2)
-    name = f"{case.rng.choice(list(VERSIONS))}_{4 if how == 0 else case.rng.randrange(4)}"
+    kind = case.idea(2)
+    name = f"{case.rng.choice(list(VERSIONS))}_{4 if kind == 0 else case.rng.randrange(4)}"
     file = case.write(
         f"raw/drive.{'mdf' if name.startswith('v3') else 'mf4'}",
         (case.templates / "mdf" / "files" / name).read_bytes(),
     )
-    case.spoil(file, (_overwrite_formula, spoil_bytes)[how])
+    case.spoil(file, (_overwrite_formula, spoil_bytes)[kind])
     return Command(
         case.rng.choice(
             [("data", "check", "measured"), ("data", "show", "measured"), ("ingest", "measured")]

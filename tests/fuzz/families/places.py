@@ -5,10 +5,11 @@ import os
 from fuzz.case import Command, generator
 
 NAMES = (
-    b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv", b"--out.csv", b"a=b.csv", b"~a.csv",
-    b"a'b.csv", b'a"b.csv', b"[a].csv", b"*.csv", b"\xe2\x80\xaeevil.csv", b"x" * 200 + b".csv", b".csv", b".hidden.csv", b"LAP.CSV",
-    b"lap.csv.csv", b"lap.", b"lap", b"lap.csv ", b"$(touch EXECUTED).csv", b"a;touch EXECUTED.csv", b"<b>.csv", b"[red]a[blue].csv",
-    b"null.csv", b"${root}.csv",
+    b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv",
+    b"--out.csv", b"a=b.csv", b"~a.csv", b"a'b.csv", b'a"b.csv', b"[a].csv", b"*.csv",
+    b"\xe2\x80\xaeevil.csv", b"x" * 200 + b".csv", b".csv", b".hidden.csv", b"LAP.CSV",
+    b"lap.csv.csv", b"lap.", b"lap", b"lap.csv ", b"$(touch EXECUTED).csv", b"a;touch EXECUTED.csv",
+    b"<b>.csv", b"[red]a[blue].csv", b"null.csv", b"${root}.csv",
 )  # fmt: skip
 
 

@@ -1,4 +1,7 @@
-"""Commands that misbehave on purpose, one for each verdict: they show that the harness notices. No part of a normal run."""
+"""Commands that misbehave on purpose, one for each verdict: they show that the harness notices.
+
+No part of a normal run.
+"""
 
 import os
 import signal
@@ -33,8 +36,8 @@ def _finish():
     print("done")
 
 
-def _leave(code, said=""):
-    sys.stderr.write(said)
+def _leave(code, error_text=""):
+    sys.stderr.write(error_text)
     sys.exit(code)
 
 

@@ -1,4 +1,6 @@
-"""ROS 2 bags, plain and zipped: bytes, databases that hold something else, metadata.yaml, layouts of messages."""
+"""ROS 2 bags, plain and zipped: bytes, databases that hold something else, metadata.yaml, layouts
+of messages.
+"""
 
 import shutil
 import sqlite3
@@ -63,22 +65,22 @@ def _spoil_layout(content, case):
 
 @generator("bags", weight=8)
 def bag(case):
-    how = case.idea(5)
+    kind = case.idea(5)
     storage = case.rng.choice(["sqlite3", "mcap"])
-    storage = "sqlite3" if how == 0 else storage
+    storage = "sqlite3" if kind == 0 else storage
     case.copy("bags/conf", "conf")
     folder = case.copy(f"bags/{storage}/lap", "raw/lap")
-    if how == 0:
+    if kind == 0:
         _state(folder / "lap.db3", case)
-    elif how == 1:
+    elif kind == 1:
         case.spoil(
             case.place / "conf/dataset/mine.yaml", lambda content, rng: _spoil_layout(content, case)
         )
-    elif how == 2:
+    elif kind == 2:
         case.spoil(
             folder / "metadata.yaml", lambda content, rng: spoil_yaml(yaml.safe_load(content), rng)
         )
-    elif how == 3 or (case.honest and case.rng.random() < 0.5):
+    elif kind == 3 or (case.honest and case.rng.random() < 0.5):
         archive = Path(
             shutil.make_archive(str(case.place / "raw" / "lap"), "zip", case.place / "raw", "lap")
         )

@@ -12,8 +12,9 @@ from parquet_bomb import bomb
 from vehest.data.store import write_recording
 
 CELLS = (
-    "", "nan", "inf", "1e400", "-1e400", "1e308", "1e-400", "0x10", "1_000", "1;5", "१२", "1e", "--1", "None", "true", '"', '""', "\x00",
-    "\x1b[31m", "=1+1", "9" * 23, "1" * 5000, " ", "\t1", "1 2", "N/A", "😀", "\ufeff1",
+    "", "nan", "inf", "1e400", "-1e400", "1e308", "1e-400", "0x10", "1_000", "1;5", "१२", "1e",
+    "--1", "None", "true", '"', '""', "\x00", "\x1b[31m", "=1+1", "9" * 23, "1" * 5000, " ", "\t1",
+    "1 2", "N/A", "😀", "\ufeff1",
 )  # fmt: skip
 
 
@@ -30,13 +31,13 @@ def _reads(case, file):
 @generator(weight=8)
 def csv(case):
     file = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False))
-    how = case.idea(3)
-    if how == 2:
+    kind = case.idea(3)
+    if kind == 2:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         row = case.rng.choice([*rows[1:], rows[-1]])
         row[0] = repr(float(row[0]) + case.rng.choice([1e7, 1e9, 1e10, 1e18]))
         case.write("lap.csv", "\n".join(map(",".join, rows)) + "\n")
-    elif how == 0:
+    elif kind == 0:
         rows = [line.split(",") for line in file.read_text().splitlines()]
         for row in case.rng.sample(rows, case.rng.choice([1, 1, 3, 50])):
             row[case.rng.randrange(len(row))] = case.rng.choice(CELLS)
@@ -48,7 +49,10 @@ def csv(case):
 
 @generator(weight=8)
 def parquet(case):
-    """Bytes, most of all of the footer, which says how to read the rest; zeros that pack to next to nothing; pages larger than said."""
+    """Bytes, most of all of the footer, which says how to read the rest.
+
+    Zeros that pack to next to nothing; pages larger than said.
+    """
     file = case.place / "lap.parquet"
     idea = case.idea(4)
     if idea == 1:

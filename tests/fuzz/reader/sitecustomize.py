@@ -1,4 +1,6 @@
-"""Python imports this at its start: watches a reading process (vehest.sources.limited) that a watched command starts."""
+"""Python imports this at its start: watches a reading process (vehest.sources.limited) that a
+watched command starts.
+"""
 
 import os
 

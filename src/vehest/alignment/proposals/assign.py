@@ -354,6 +354,7 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
         has_sure_unit = bool(column.unit) and "ay" in turning.columns and is_close
         doubts = ["" if has_sure_unit else question]
         alternatives: tuple[str, ...] = ()
+        is_weak = False
         if channel == "ay" and not is_evident(column, turning.scale):
             doubts.append(
                 f"its gain to vx·yaw_rate is {turning.scale:.2g}, and it has no unit or clear "
@@ -362,11 +363,15 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
         if column.hint(channel) <= -STRONG:
             doubts.append("its values contradict its name")
         if column.unit not in ("", unit):
-            alternatives = (f"{channel} {column.unit}",)
+            ratio = si_factor(unit, channel) / si_factor(column.unit, channel)
+            factor = ratio * turning.scale ** (-1 if channel == "ay" else 1)
+            scaled = f"{channel} {column.unit} {turning.signs[channel]:+d} {factor:.3g}"
+            alternatives = (scaled, f"{channel} {column.unit}")
             doubts = [
                 f"its unit is {unit} according to the gain of ay to vx·yaw_rate, "
                 f"but {column.unit} according to the header"
             ]
+            is_weak = abs(math.log(turning.scale)) > CLOSE_MISMATCH
         yield Proposal(
             column.name,
             channel,
@@ -375,6 +380,7 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
             (evidence,),
             next(filter(None, doubts), ""),
             alternatives=alternatives,
+            is_weak=is_weak,
         )
 
 
@@ -670,7 +676,8 @@ def _left_right_clues(
     for column in columns:
         if is_vbo and column.name == "heading":
             yield (
-                "'heading', clockwise by its format, decreases when yaw_rate with sign {} is positive",
+                "'heading', clockwise by its format, decreases when yaw_rate with sign {} is "
+                "positive",
                 -turning_of(column, "deg", motion),
             )
     latitude = _first_named(columns, "latitude")
@@ -688,7 +695,8 @@ def _left_right_clues(
     is_sound = is_moving & (np.abs(turned) < MAX_COURSE_STEP) & (np.hypot(*steps) > 0.0)
     if is_sound.sum() > MIN_COURSE_SAMPLES:
         yield (
-            "the course over latitude and longitude turns left when yaw_rate with sign {} is positive",
+            "the course over latitude and longitude turns left when yaw_rate with sign {} is "
+            "positive",
             correlation(turned[is_sound], yaw_rate[is_sound]),
         )
 

@@ -53,7 +53,9 @@ class Candidate:
 
     @cached_property
     def size(self) -> float:
-        """99th percentile of the magnitude, of what is slow, in the file's unit; thousands of triples of columns ask for it."""
+        """99th percentile of the magnitude, of what is slow, in the file's unit; thousands of
+        triples of columns ask for it.
+        """
         return largest(self.slow)
 
     @cached_property
@@ -97,7 +99,9 @@ def si_factor(unit: str, channel: str) -> float:
 def candidates(
     columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float
 ) -> list[Candidate]:
-    """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
+    """Columns that change, are mostly there, and are neither clocks nor distances; see
+    `vehest.alignment.proposals.assign.propose`.
+    """
     usable = []
     for name, unit, values, device in columns:
         is_measured = np.isfinite(values) & (np.abs(values) < 1e15)

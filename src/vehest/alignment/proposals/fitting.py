@@ -1,4 +1,6 @@
-"""Columns that agree with a known motion: longitudinal acceleration, steering, lateral velocity and sideslip angle."""
+"""Columns that agree with a known motion: longitudinal acceleration, steering, lateral velocity and
+sideslip angle.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ CLEAR_CORRELATION = 0.6  # correlation that decides where nothing else comes nea
 CLEAR_LATERAL_CORRELATION = 0.45  # of relations with derivatives of noisy channels
 MIN_STRENGTH = 0.3
 RIVAL_MARGIN = 2.0  # score within which another column comes near
-# logarithm of the gain of an acceleration to d(vx)/dt, within which pitch, grade and slip explain it
+# logarithm of the gain of an acceleration to d(vx)/dt, within which pitch, grade and slip explain
+# it
 MAX_AX_MISMATCH = 1.1
 # of score, for a reference's column as a channel that the car measures itself; more where its bus
 # has a column of that name
@@ -153,7 +156,8 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
     del proposals["sideslip_ref"]
     expected = f"atan2({velocity.name}, {search.turning.columns['vx'].name})"
     return proposals, (
-        f"'{angle.name}' is left out: its correlation with {expected} is {correlation_with_atan:.2f}, so that it is not the sideslip angle",
+        f"'{angle.name}' is left out: its correlation with {expected} is "
+        f"{correlation_with_atan:.2f}, so that it is not the sideslip angle",
     )
 
 
@@ -211,7 +215,9 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
 
 
 def _as_steering(search: Search, column: Candidate) -> Offer | None:
-    """As an angle of the road wheels or of the steering wheel; where it can be neither, as a command of unknown scale."""
+    """As an angle of the road wheels or of the steering wheel; where it can be neither, as a
+    command of unknown scale.
+    """
     hint = max(column.hint("steer"), column.hint("handwheel"))
     if hint < 0.0 or not column.measures("steer"):
         return None
@@ -246,7 +252,10 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
             "rad",
         )
         offset = straight if abs(straight) > MAX_CENTRE_SHARE * spread else 0.0
-        question = "its range and the slow corners match neither a road-wheel nor a steering-wheel angle: if it is a command, state its scale"
+        question = (
+            "its range and the slow corners match neither a road-wheel nor a steering-wheel angle: "
+            "if it is a command, state its scale"
+        )
         return Offer(
             score,
             column,
@@ -264,12 +273,18 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
         USUAL_LENGTHS[channel][0] <= length <= USUAL_LENGTHS[channel][1]
         or float(np.quantile(search.motion.vx, 0.99)) < MAX_MODEL_SPEED
     ):
-        text += f", {'wheelbase' if channel == 'steer' else 'wheelbase × steering ratio'} {length:.3g} m from slow corners"
+        text += (
+            f", {'wheelbase' if channel == 'steer' else 'wheelbase × steering ratio'} {length:.3g} "
+            "m from slow corners"
+        )
     ay = search.motion.channels.get("ay", search.motion.turning)
     ay_correlation = abs(correlation(column.slow, slow_of(ay, search.motion.rate_hz)))
     is_weak = not (hint or column.unit) and ay_correlation >= best.strength
     if is_weak:
-        question = f"neither name nor unit says so, and its correlation with ay is as high ({ay_correlation:.2f})"
+        question = (
+            "neither name nor unit says so, and its correlation with ay is as high "
+            f"({ay_correlation:.2f})"
+        )
     if channel == "steer" and column.hints.get("handwheel") == STRONG:
         question = "its name suggests a steering wheel, its range and slow corners a road wheel"
         is_weak = True
@@ -374,7 +389,7 @@ def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
 
 
 def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -> Agreement:
-    """Agreement of a column with d(vx)/dt, in the unit (of ``units``, or all) with a gain near 1."""
+    """Agreement of a column with d(vx)/dt, in the unit with a gain near 1."""
     agreements = (
         agreement(motion, column, "ax", unit, "ax") for unit in units or column.units("ax")
     )

@@ -1,4 +1,6 @@
-"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x`` and ``_y``, ``other``."""
+"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x``
+and ``_y``, ``other``.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +11,62 @@ STRONG = 4.0
 WEAK = 2.0
 
 _STRONG = {  # over the name without blanks
-    "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
-    r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
-    r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
-    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|yawangular|gierbeschl|angularacc|"
-    r"crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$",
-    "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
-    r"angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|"
-    r"quera(?!bw)|accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right",
-    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
-    r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle|accel?forward",
-    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
+    "other": (
+        r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
+        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|"
+        r"ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|"
+        r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|"
+        r"zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"
+        r"yawangular|gierbeschl|angularacc|crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|"
+        r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$"
+    ),
+    "yaw_rate": (
+        r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
+        r"rateyaw|yawspeed|omegaz|angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
+        r"^rimu$|psistrich|vgier"
+    ),
+    "ay": (
+        r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
+        r"linearaccelerationy|yacc|glat|^gy$|quera(?!bw)|accquer|accel?lat|laterala|"
+        r"beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right"
+    ),
+    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
+    r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
+    r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
+    r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
+    "handwheel": (
+        r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
+        r"volant"
+    ),
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
-    "vy_ref": r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
-    r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
+    "vy_ref": (
+        r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|"
+        r"velocityy|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
+    ),
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
-    "heading": r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
+    "heading": (
+        r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
+        r"headimu"
+    ),
     "latitude": r"latitude|gpslat$|^lat$|breitengrad",
     "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
-    "vx": r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
-    r"velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
-    "roll_rate": r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
+    "vx": (
+        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
+        r"linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|"
+        r"vehv|groundspd|vehicles?pd|encoder"
+    ),
+    "roll_rate": (
+        r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$"
+    ),
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",
 }
 _WEAK = {
-    "yaw_rate": r"gyro|gier|^r$|^w$|^omega$|yaw|wimu",
+    "yaw_rate": r"gyro|gier|dpsi|^r$|^w$|^omega$|yaw|wimu",
     "ay": r"quer$|^quer|lateral|^lat",
     "ax": r"laengs|langs|^longitudinal",
     "steer": r"^cmd$|^str$|steering",
@@ -49,12 +76,14 @@ _WEAK = {
     "heading": r"yaw|^phi$|head|^theta$",
 }
 _REFERENCE = re.compile(
-    r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|optitrack|true|truth|\bgt\b|datron|s350|"
+    r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|"
+    r"optitrack|true|truth|\bgt\b|datron|s350|"
     r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys|"
     r"from (yaw|pose|positions?)\b"
 )
 _BUS = re.compile(
-    r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d"
+    r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|"
+    r"^algt\d"
 )
 _WORLD_FRAME = re.compile(r"\b(world|global|map|utm|earth)\b")
 # of a quantity along an axis of the world, which no channel is
@@ -63,7 +92,8 @@ _WORLD_AXIS = re.compile(
     r"\b(v|vel|velocity|speed|spd|acc|acceleration)( ?[en]| d| up)$"
 )
 _STEERING_RATE = re.compile(
-    r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta"
+    r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|"
+    r"deltadot|ddelta"
 )
 _FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
 _UNTELLING = re.compile(r"\b(body|frame|chassis)\b")
@@ -74,7 +104,8 @@ _CORNERS = {
     "rr": r"rr|hr|rear ?right|hinten ?rechts|right ?rear",
 }
 _NO_SPEED_OF_A_WHEEL = re.compile(
-    r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|winkel|disp|damp|tyre|tire"
+    r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|"
+    r"winkel|disp|damp|tyre|tire"
 )
 _AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
 _WHEEL_SPEED = re.compile(
@@ -135,7 +166,9 @@ def bare(name: str) -> str:
 
 @cache
 def hints(name: str, unit: str = "") -> dict[str, float]:
-    """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it, says of what quantity it is."""
+    """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it,
+    says of what quantity it is.
+    """
     words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
     without_unit = _WITHOUT_UNIT.sub("", words).replace(" ", "")
@@ -192,7 +225,8 @@ def _corner(words: str) -> str:
     if _NO_SPEED_OF_A_WHEEL.search(words):
         return ""
     for corner, pattern in _CORNERS.items():
-        joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$"
+        wheel = "wheel|whl|rad|spd|speed|vel|ws|drehzahl"
+        joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:{wheel})(?:{pattern})$"
         is_separate = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(
             words
         )

@@ -30,7 +30,9 @@ def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
 def find_pose(
     columns: Sequence[Candidate], motion: Motion | None
 ) -> tuple[tuple[str, str, str], ...]:
-    """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty where there is none, or no motion."""
+    """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty
+    where there is none, or no motion.
+    """
     pose = named_pose(columns)
     if (
         motion is None
@@ -62,7 +64,7 @@ def find_pose(
 
 
 def turning_of(yaw: Candidate, unit: str, motion: Motion) -> float:
-    """Correlation of a yaw angle's derivative with the yaw rate, where the angle was not wrapped."""
+    """Correlation of a yaw angle's derivative with the yaw rate, where it was not wrapped."""
     turned = np.gradient(np.unwrap(yaw.values * factor_to_si(unit, "rad"))) * motion.rate_hz
     is_sound = np.abs(turned) < MAX_YAW_RATE
     return correlation(turned[is_sound], motion["yaw_rate"][is_sound])

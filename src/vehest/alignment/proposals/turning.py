@@ -1,4 +1,6 @@
-"""Speed, yaw rate and lateral acceleration with their units, by ay ≈ vx·yaw_rate, and columns that repeat them."""
+"""Speed, yaw rate and lateral acceleration with their units, by ay ≈ vx·yaw_rate, and columns that
+repeat them.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ MAX_COLUMNS = 60
 MAX_TURNINGS = 8
 MIN_SCORE = 6.0
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
-"""Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a clear name decides."""
+"""Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a
+clear name decides.
+"""
 NO_RATE_OR_ACCELERATION = (
     *("vx", "heading", "roll", "pitch"),
     *("latitude", "longitude", "position_x", "position_y"),
@@ -238,7 +242,8 @@ def _scored(
     correlation_with_ay: float,
     file_gain: float,
 ) -> Turning:
-    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all evidence.
+    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
+    evidence.
 
     Units other than the header's are chosen only where these are far from the gain.
     """
@@ -290,9 +295,6 @@ def _scored(
     score -= (
         3.0 if any(column.is_of_bus and "ay" in column.hints for column in columns) else 0.5
     ) * named["ay"].is_reference + 5.0 * n_implausible
-    level = np.abs(named["vx"].slow)
-    if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
-        score -= 2.0
     score += (
         -5.0
         if n_contradicted or mismatch >= FAR_MISMATCH
@@ -368,7 +370,10 @@ def repeated(search: Search) -> Iterator[Proposal]:
             and column.hint("ay") >= 0.0
         ):
             search.free.remove(column)
-            text = f"'{column.name}': correlation {abs(correlation(column.slow, ay.slow)):.3f}, measured at another point or filtered"
+            text = (
+                f"'{column.name}': correlation {abs(correlation(column.slow, ay.slow)):.3f}, "
+                "measured at another point or filtered"
+            )
             unit = search.turning.units["ay"]
             sign = search.turning.signs["ay"]
             yield Proposal(ay.name, "ay", unit, sign, (text,), is_repeated=True)
@@ -427,8 +432,14 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
     name = first.column.name
     speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)
-    evidence = f"correlation with '{name}' {correlation(column.slow, first.column.slow):.2f}; no unit of speed explains the gain"
-    question = f"is it the car's own speed with factor {abs(factor):.5g} m/s, so that '{name}' is the reference's, or another quantity?"
+    evidence = (
+        f"correlation with '{name}' {correlation(column.slow, first.column.slow):.2f}; no unit of "
+        "speed explains the gain"
+    )
+    question = (
+        f"is it the car's own speed with factor {abs(factor):.5g} m/s, so that '{name}' is the "
+        "reference's, or another quantity?"
+    )
     sign = -1 if factor < 0.0 else 1
     yield Proposal(
         column.name, "vx", "m/s", sign, (evidence,), question, factor=float(f"{abs(factor):.5g}")
@@ -452,7 +463,9 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     references = [repeat for repeat in plain if repeat.column.is_reference] or [
         repeat for repeat in plain if repeat not in of_car
     ]
-    text = f"correlation with the other {channel} {min(abs(correlation(repeat.column.slow, family[0].column.slow)) for repeat in plain):.2f}"
+    slow = family[0].column.slow
+    lowest = min(abs(correlation(repeat.column.slow, slow)) for repeat in plain)
+    text = f"correlation with the other {channel} {lowest:.2f}"
 
     def proposal(
         repeat: Repeat,

@@ -1,4 +1,6 @@
-"""Wheel speeds: corner by name, unit and radius by the speed or, without one, by ay over the yaw rate."""
+"""Wheel speeds: corner by name, unit and radius by the speed or, without one, by ay over the yaw
+rate.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def find_wheels(columns: Sequence[Candidate]) -> Wheels:
 
 
 def turning_left(wheels: Wheels, motion: Motion) -> float:
-    """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is missing."""
+    """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is
+    missing.
+    """
     rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     axles = [
         (wheels[left].slow, wheels[right].slow)
@@ -58,7 +62,9 @@ def turning_left(wheels: Wheels, motion: Motion) -> float:
 def speed_of_wheels(
     columns: Sequence[Candidate], wheels: Wheels, rate_hz: float
 ) -> list[Candidate]:
-    """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that make ay = vx·yaw_rate."""
+    """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that
+    make ay = vx·yaw_rate.
+    """
     if not wheels or any("vx" in column.hints for column in columns):
         return []
     mean = _mean(wheels)
@@ -99,7 +105,9 @@ def speed_of_wheels(
 def wheel_proposals(
     wheels: Wheels, motion: Motion | None, *, has_speed: bool, is_wheel_mean: bool
 ) -> tuple[list[Proposal], float | None]:
-    """A channel each, and the rolling radius by which they make the speed, if it has no column; of it, the motion's may be made."""
+    """A channel each, and the rolling radius by which they make the speed, if it has no column; of
+    it, the motion's may be made.
+    """
     mean = _mean(wheels)
     units = _units(wheels)
     evidence = ["name"]
@@ -149,7 +157,9 @@ def wheel_proposals(
 
 
 def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -> float | None:
-    """Speed of the wheels at the rim over a speed [m/s]; None where they are in no unit of a speed at the rim."""
+    """Speed of the wheels at the rim over a speed [m/s]; None where they are in no unit of a speed
+    at the rim.
+    """
     pairs = [
         (wheel.slow, proposals.by_channel.get(f"wheel_speed_{corner}"))
         for corner, wheel in wheels.items()
@@ -179,7 +189,9 @@ def _named(columns: Sequence[Candidate], channel: str) -> Candidate | None:
 
 
 def _cost(unit: str, scale: float | None, mean: FloatArray) -> tuple[float, float]:
-    """Cost of a unit for a scale of m/s over the column, if it is known, and the radius that goes with it."""
+    """Cost of a unit for a scale of m/s over the column, if it is known, and the radius that goes
+    with it.
+    """
     top = largest(mean)
     if unit in AT_RIM:
         factor = si_factor(unit, "vx")

@@ -1,1 +1,1 @@
-"""What filter estimators share: the single track, unscented filters of cars, and fits of tyres."""
+"""Parts of filter estimators: the single track, unscented filters of cars, fits of tyres."""

@@ -39,21 +39,22 @@ FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
 OBSERVATION = (50.0, 50.0, 0.1, 0.1)
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
 PACE = 10.0  # by which noise learns faster than in units of its deviations
+# added to variances: the rim speed is measured, and is its own reference
 OBSERVED_EXACTLY = (
     0.0,
     0.0,
     0.0,
     1e-3,
-)  # added to variances: the rim speed is measured, and is its own reference
+)
 KAPPA = -2.0  # of the symmetric sigma points
-LEAST_ENTROPY = -9.0  # [nat] of the process noise
+MIN_ENTROPY = -9.0  # [nat] of the process noise
 
 
 class CarFilter(nn.Module):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
     Covariances of noise are constant or depend on the state, and are ``correlated`` or diagonal.
-    The step is in s, ``least`` the smallest possible vx [m/s] and friction; ``repair``: lost
+    The step is in s, ``lower`` the smallest possible vx [m/s] and friction; ``repair``: lost
     definiteness is repaired.
 
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
@@ -73,7 +74,7 @@ class CarFilter(nn.Module):
         noise: NoiseKind,
         *,
         step: float,
-        least: tuple[float, float],
+        lower: tuple[float, float],
         correlated: bool = True,
         repair: bool = True,
     ) -> None:
@@ -90,7 +91,7 @@ class CarFilter(nn.Module):
         self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
         self.step = step
         self.repair = repair
-        self.lower = (least[0], *[-torch.inf] * 3, least[1])
+        self.lower = (lower[0], *[-torch.inf] * 3, lower[1])
         self.rule = symmetric_rule(n, KAPPA)
 
     def reset(self, generator: torch.Generator) -> None:
@@ -117,7 +118,7 @@ class CarFilter(nn.Module):
         )
 
     def initial_covariance(self) -> Tensor:
-        """Of a state that is known, (5, 5)."""
+        """Covariance of a state that is known, (5, 5)."""
         covariance: Tensor = self.initial_noise(
             self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0)
         )
@@ -152,7 +153,7 @@ class CarFilter(nn.Module):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            process = with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY)
+            process = with_entropy(self.process_noise(at, inputs), MIN_ENTROPY)
             observation = self.observation_noise(at, inputs)
         else:
             process, observation = self.noise_at()  # type: ignore[assignment]
@@ -172,12 +173,12 @@ class CarFilter(nn.Module):
     def noise_at(self) -> tuple[StepNoise, StepNoise]:
         """Process and observation noise of filters at work."""
         if not self.constant:
-            return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(
+            return compiled_noise(self.process_noise, MIN_ENTROPY), compiled_noise(
                 self.observation_noise
             )
         zero_state = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            process = with_entropy(self.process_noise(zero_state, zero_state), LEAST_ENTROPY)
+            process = with_entropy(self.process_noise(zero_state, zero_state), MIN_ENTROPY)
             return process.numpy(), self.observation_noise(zero_state, zero_state).numpy()
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
@@ -213,8 +214,9 @@ class CarFilter(nn.Module):
         ):
             if torch.linalg.cholesky_ex(covariance).info:
                 raise DataError(
-                    "training.start_noise=residuals: the training recordings do not move each of the car's states, "
-                    "so that no covariance follows from them; train on other drives, or set training.start_noise=given"
+                    "training.start_noise=residuals: the training recordings do not move each of "
+                    "the car's states, so that no covariance follows from them; train on other "
+                    "drives, or set training.start_noise=given"
                 )
             noise.begin(covariance, PACE, size)
         initial = self.initial_covariance().detach().clone()
@@ -224,10 +226,10 @@ class CarFilter(nn.Module):
         self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """States of training sequences, which start from ``start``, (B, 5), and their covariances,
-        (B, T, 5, 5), differentiable.
+        """States and covariances of training sequences that start from ``start``, (B, 5).
 
-        Gradients reach back ``steps`` samples; none: all.
+        Covariances are (B, T, 5, 5); both are differentiable. Gradients reach back ``steps``
+        samples; none: all.
         """
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
@@ -254,8 +256,9 @@ class CarFilter(nn.Module):
         return torch.cat(means, 1), torch.cat(covariances, 1)
 
     def estimate_for_validation(self, drives: Drive) -> Tensor:
-        """Estimated states, (B, T, 5), as in use: without gradients, and without any true state but
-        the first.
+        """Estimated states, (B, T, 5), as in use.
+
+        Without gradients, and without any true state but the first.
         """
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())

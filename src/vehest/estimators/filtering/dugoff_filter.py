@@ -1,7 +1,7 @@
-"""Filters recordings and single samples by the unscented filter of a single track on Dugoff's
-tyres.
+"""The unscented filter of a single track on Dugoff's tyres, on recordings and samples.
 
-    recordings --split_samples--> measurements (T, 4), inputs (T, 3) --`TrackFilter`--> states --> estimates
+    recordings --split_samples--> measurements (T, 4), inputs (T, 3)
+    --`TrackFilter`--> states --> estimates
     one sample --filter_step--> `FilterStep` --`UnscentedStepper`--> state
 
 Measured are a_y, r and, where tyre forces are measured, those of both axles; forward speed,
@@ -27,7 +27,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.filtering.sigma_point_stepper import (
+    FilterStep,
+    SigmaPointEstimator,
+    normalised_innovations,
+)
 from vehest.estimators.filtering.track_filter import (
     ROLLING,
     Over,
@@ -62,21 +66,24 @@ class PseudoMeasurement(NamedTuple):
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
     variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
-    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's
+    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
+    # filter's
     process: FloatArray | None = None
 
 
 class DugoffFilter(SigmaPointEstimator):
-    """An estimator by an unscented filter over `DugoffTrack`; a subclass has the settings and the
-    fit.
+    """An estimator by an unscented filter over `DugoffTrack`.
+
+    A subclass has the settings and the fit.
 
     Attributes
     ----------
     axle_tyres : array, shape (6,)
-        Cornering stiffness [N/rad], friction [1] and reduction [s/m] of the front, then of the rear axle.
+        Cornering stiffness [N/rad], friction [1] and reduction [s/m] of the front, then of the rear
+        axle.
     levels : dict
-        Standard deviations by name: ``process_vy`` [m/s] and ``process_yaw_rate`` [rad/s] of a step, those
-        of the sensors, and ``force_factor``.
+        Standard deviations by name: ``process_vy`` [m/s] and ``process_yaw_rate`` [rad/s] of a
+        step, those of the sensors, and ``force_factor``.
     """
 
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
@@ -108,7 +115,8 @@ class DugoffFilter(SigmaPointEstimator):
         """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
         if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(
-                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres"
+                f"estimator '{self.name}' has no tyres yet; fit or load it first, or give "
+                "estimator.tyres"
             )
         s = self.settings
         front, rear = (
@@ -117,8 +125,9 @@ class DugoffFilter(SigmaPointEstimator):
         return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        """Covariance of a step, (2, 2), and those of measurements where the car is linear and where
-        it is not, (2, 4, 4).
+        """Covariance of a step, (2, 2), and covariances of measurements, (2, 4, 4).
+
+        The first of measurements is that of the linear range, the second that of the other.
 
         Raises
         ------
@@ -127,7 +136,8 @@ class DugoffFilter(SigmaPointEstimator):
         """
         if any(math.isnan(level) for level in levels.values()):
             raise ConfigurationError(
-                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise"
+                f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give "
+                "estimator.noise"
             )
         process = (
             torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64)
@@ -147,8 +157,9 @@ class DugoffFilter(SigmaPointEstimator):
         return process, torch.diag_embed(variances)
 
     def split_samples(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Measurements (T, 4), NaN where forces are not measured, and inputs (T, 3) of samples (T,
-        n) of ``channels``.
+        """Measurements (T, 4) and inputs (T, 3) of samples (T, n) of ``channels``.
+
+        Forces that are not measured are NaN.
         """
         yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
         wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
@@ -160,8 +171,9 @@ class DugoffFilter(SigmaPointEstimator):
         return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
-        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see
-        `in_nonlinear_range`.
+        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²].
+
+        See `in_nonlinear_range`.
         """
         return in_nonlinear_range(ay, self.nonlinear_from, self.linear_below, before)
 
@@ -174,8 +186,9 @@ class DugoffFilter(SigmaPointEstimator):
         pseudo: Sequence[PseudoMeasurement] | None = None,
         limit: float = 0.0,
     ) -> float:
-        """Mean squared error of sideslip [rad²] over samples fast enough for the model; see
-        `error_over`, and `robust_squares` for the limit [deg].
+        """Mean squared error of sideslip [rad²] over samples fast enough for the model.
+
+        See `error_over`, and `robust_squares` for the limit [deg].
         """
         skip = round(skip_seconds * self.rate_hz)
         sums: list[tuple[float, int]] = []
@@ -199,13 +212,7 @@ class DugoffFilter(SigmaPointEstimator):
             recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)
         ):
             mean, covariance = (part.numpy() for part in steps.filtered)
-            nis = (
-                torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation)
-                .result.mul(steps.innovation)
-                .sum(-1)
-                .numpy()
-            )
-            dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
+            nis, dof = normalised_innovations(steps)
             for place, row in enumerate(rows):
                 n = len(recordings[row])
                 quantities = {
@@ -254,9 +261,8 @@ class DugoffFilter(SigmaPointEstimator):
                     for sensors_only, angle in zip(measured, added, strict=True)
                 ]
                 if added[0].process is not None:
-                    steps_noise = torch.diag_embed(
-                        torch.as_tensor(padded([angle.process for angle in added], None))  # type: ignore[misc]
-                    )
+                    variances = padded([angle.process for angle in added], None)  # type: ignore
+                    steps_noise = torch.diag_embed(torch.as_tensor(variances))
             measurements = torch.as_tensor(padded(measured, np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
             noise = sensors[
@@ -313,15 +319,17 @@ class DugoffFilter(SigmaPointEstimator):
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """A measurement (m,) and its covariance with those that a network adds, whose process noise
-        is left in ``memory``.
+        """A measurement (m,) and its covariance with those that a network adds.
+
+        The network's process noise is left in ``memory``.
         """
         return measurement, noise
 
 
 def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
-    """Covariances of what sensors measure and a network adds, (..., 5, 5), differentiable in the
-    variance.
+    """Covariances of sensors and of a network's angle, (..., 5, 5).
+
+    They are differentiable in the variance of the angle.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Identification of Dugoff's tyres on measured drives, skidpads above all, by a genetic algorithm."""
+"""Identifies Dugoff's tyres on drives, skidpads above all, by a genetic algorithm."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def fit_dugoff(
     for recording in recordings:
         if np.isnan(recording["ax"]).any():
             raise DataError(
-                f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known"
+                f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' "
+                "loads are not known"
             )
     motion = axle_motion(recordings, car, minimum_speed, measured_forces=measured_forces)
     thin = max(1, -(-motion.slip.shape[1] // MAX_SAMPLES))

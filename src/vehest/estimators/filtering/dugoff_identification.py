@@ -1,5 +1,6 @@
-"""Identification of a filter on Dugoff's tyres: tyres, levels of sensors, and process noise, in
-this order.
+"""Identification of a filter on Dugoff's tyres.
+
+Tyres, levels of sensors, and process noise, in this order.
 
     recordings for tyres --identify_tyres--> tyres of both axles
     training recordings --read_sensor_levels--> standard deviations of sensors
@@ -63,8 +64,9 @@ def identify_tyres(
     ]
     if not matching:
         raise DataError(
-            f"no training recording is called '{training.tyres_from}', which tyres are to be identified on; "
-            "set tyres_from in the identification's settings to another pattern ('*' for all), or give estimator.tyres"
+            f"no training recording is called '{training.tyres_from}', which tyres are to be "
+            "identified on; set tyres_from in the identification's settings to another pattern "
+            "('*' for all), or give estimator.tyres"
         )
     return fit_dugoff(
         matching,
@@ -103,11 +105,13 @@ def read_sensor_levels(
             )
         except ValueError as error:
             raise DataError(
-                f"noise of '{name}' in the training recordings: {error}; give estimator.noise.{name}"
+                f"noise of '{name}' in the training recordings: {error}; give "
+                f"estimator.noise.{name}"
             ) from None
         if not levels[name] > 0.0:
             raise DataError(
-                f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise"
+                f"channel '{name}' of the training recordings has no noise that could be read off "
+                "it; give estimator.noise"
             )
     return levels
 
@@ -130,7 +134,8 @@ def search_levels(
     for recording in recordings:
         if "vy_ref" not in recording:
             raise DataError(
-                f"recording '{recording.id}' has no vy_ref to tune noise levels on; set method=data in the identification's settings"
+                f"recording '{recording.id}' has no vy_ref to tune noise levels on; set "
+                "method=data in the identification's settings"
             )
 
     def cost(powers: FloatArray) -> float:

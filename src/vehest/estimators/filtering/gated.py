@@ -10,13 +10,15 @@ from vehest.filters.gating import Gate
 
 
 class GatedFilter(Estimator):
-    """A filter that may refuse measurements in use; it learns without, because noise that is too
-    small would close the gate.
+    """A filter that may refuse measurements in use.
+
+    It learns without, because noise that is too small would close the gate.
     """
 
     gate: float | None = setting(
         None,
-        "standard deviations of an innovation beyond which a measurement is refused in use, such as 5; null: all are taken, as in the papers",
+        "standard deviations of an innovation beyond which a measurement is refused in use, such "
+        "as 5; null: all are taken, as in the papers",
         positive=True,
     )
 
@@ -26,12 +28,12 @@ class GatedFilter(Estimator):
 
     @property
     def gate_suffix(self) -> str:
-        """Of the name of a variant."""
+        """Suffix of a variant's name."""
         return "" if self.gate is None else f"_gate{self.gate:g}"
 
     @property
     def gate_title(self) -> str:
-        """Of the title."""
+        """Suffix of the title."""
         return "" if self.gate is None else f", innovations gated at {self.gate:g} sigma"
 
     def c_values(self) -> dict[str, Any]:

@@ -47,8 +47,9 @@ def rational_c_values(
 
 
 def _tyre_state(name: str) -> dict[str, str]:
-    """A tyre parameter that is a state: its axle, and the member of the axle's force that is its
-    slope.
+    """A tyre parameter that is a state.
+
+    Its axle, and the member of the axle's force that is its slope.
     """
     if name == "friction":
         return {"name": name, "axle": "both", "slope": "per_log_friction"}

@@ -225,8 +225,8 @@ def _reference_sideslip(recording: Recording) -> FloatArray:
     """Reference sideslip [rad], (T,)."""
     if "sideslip_ref" not in recording and "vy_ref" not in recording:
         raise DataError(
-            f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; "
-            "set training.method=data"
+            f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels "
+            "on; set training.method=data"
         )
     return (
         recording["sideslip_ref"]

@@ -1,7 +1,9 @@
-"""Filters of a single track on rational tyres: model, limits and start of a filter, and both
-filters.
+"""Filters of a single track on rational tyres.
 
-    samples (T, 4) of yaw_rate, vx, ay, steer --filter_extended, filter_unscented--> `FilteredStates`
+Model, limits and start of a filter, and both filters.
+
+    samples (T, 4) of yaw_rate, vx, ay, steer
+    --filter_extended, filter_unscented--> `FilteredStates`
 
 State x = (β, r, β', r', θ), (n,): sideslip angle [rad], yaw rate [rad/s], their rates, and
 logarithms of adapted tyre parameters over their start values. Measured are r and a_y; speed and
@@ -116,7 +118,9 @@ class RationalModel:
     def track(self) -> TyreTrack:
         """The equations of motion and measurement in torch."""
         adapted = tuple(TYRE_PARAMETERS.index(name) for name in self.adapted)
-        return TyreTrack(self.car, tuple(self.nominal.tolist()), adapted, self.step)  # type: ignore[arg-type]
+        return TyreTrack(  # type: ignore[arg-type]
+            self.car, tuple(self.nominal.tolist()), adapted, self.step
+        )
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states (T, n): name -> (T,).
@@ -211,8 +215,9 @@ def filter_unscented(
     levels: Mapping[str, float],
     first: Gaussian[FloatArray],
 ) -> FilteredStates:
-    """Filter samples by the unscented Kalman filter (κ = 0); arguments as those of
-    `filter_extended`.
+    """Filter samples by the unscented Kalman filter (κ = 0).
+
+    Arguments as those of `filter_extended`.
 
     Tyre parameters that stay keep their variance (Schmidt's consider states).
     """

@@ -1,5 +1,6 @@
-"""Base of filters of sideslip angle and yaw rate over a single track: settings, the model of a
-recording, estimates.
+"""Base of filters of sideslip angle and yaw rate over a single track.
+
+Settings, the model of a recording, estimates.
 """
 
 from __future__ import annotations
@@ -31,22 +32,21 @@ EXACT_STATE_DEVIATION = 1e-6
 
 
 class FilteredStates(NamedTuple):
-    """What a filter knows after T samples."""
+    """Result of a filter over T samples."""
 
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
-    deviation: (
-        FloatArray | None
-    )  # standard deviations of all states, (T, n), where the filter gives them
+    # standard deviations of all states, (T, n), where the filter gives them
+    deviation: FloatArray | None
     covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
-    innovation: FloatArray  # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T, 2)
+    # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T,
+    # 2)
+    innovation: FloatArray
     innovation_covariance: FloatArray  # (T, 2, 2)
     measured: NDArray[np.bool_]  # (T, 2)
     last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:
-        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured, of some rows;
-        (T,) each.
-        """
+        """Normalised innovation squared, eᵀS⁻¹e, and number of measurements, (T,) each."""
         (first_variance, covariance), (_, second_variance) = np.moveaxis(
             self.innovation_covariance[rows], 0, 2
         )
@@ -60,8 +60,9 @@ class FilteredStates(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What a filter carries on: the last sample, which is filtered again without its measurements,
-    and the state after it.
+    """State of a filter between calls.
+
+    The last sample is filtered again without its measurements.
     """
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
@@ -70,9 +71,7 @@ class FilterState(NamedTuple):
 
 
 class SideslipFilter(GatedFilter, Recursive):
-    """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan
-    β.
-    """
+    """A filter whose state begins with sideslip angle β and yaw rate r; v = u tan β."""
 
     channels = ("yaw_rate", "vx", "ay", "steer")
     skippable = ("yaw_rate", "ay")
@@ -86,8 +85,9 @@ class SideslipFilter(GatedFilter, Recursive):
     )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
-        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k],
-        a_y[k] = C[k] x[k] + D[k] δ[k].
+        """The model in steps at forward speeds vx, (T,) [m/s].
+
+        x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k].
         """
         return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(
             1.0 / self.rate_hz
@@ -96,8 +96,9 @@ class SideslipFilter(GatedFilter, Recursive):
     def first_motion(
         self, sample: FloatArray, deviation: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too,
-        or what a protocol hands over.
+        """β and r before the first sample.
+
+        0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
@@ -122,15 +123,16 @@ class SideslipFilter(GatedFilter, Recursive):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
     ) -> FilteredStates:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its
-        measurement; ``refused``: see `Gate`.
+        """Filter samples of ``channels``, (T, 4).
+
+        ``first`` is the state before the first measurement; ``refused``: see `Gate`.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'"
         )
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
-        """What further states, (T, n), say: name -> (T,)."""
+        """Quantities of an `Estimate` by further states, (T, n): name -> (T,)."""
         return {}
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> FilterState:
@@ -142,9 +144,7 @@ class SideslipFilter(GatedFilter, Recursive):
         )
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
-        """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what
-        further states say.
-        """
+        """Lateral velocity [m/s], yaw rate [rad/s], covariances, innovations, other quantities."""
         rows = samples
         refused = state.refused.copy()
         if state.sample is not None:
@@ -176,7 +176,10 @@ def read_levels(
     The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise.
     Raises `DataError`: a channel has too many gaps, or no noise.
     """
-    label = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+    label = (
+        f"recording{'s' if len(recordings) > 1 else ''} "
+        f"{', '.join(repr(recording.id) for recording in recordings)}"
+    )
     levels = {}
     for name in names:
         try:
@@ -187,6 +190,7 @@ def read_levels(
             ) from None
         if not levels[name] > min_level:
             raise DataError(
-                f"{label}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}"
+                f"{label}: channel '{name}' has no noise that could be read off it; give "
+                f"estimator.noise.{name}"
             )
     return levels

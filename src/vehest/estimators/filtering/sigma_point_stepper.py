@@ -1,6 +1,4 @@
-"""Sigma-point filters online: one stepper for all families that filter by
-`vehest.filters.unscented_scan`.
-"""
+"""Base of families that filter by `vehest.filters.unscented_scan`, and their stepper."""
 
 from __future__ import annotations
 
@@ -8,9 +6,13 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
+import torch
+from torch import Tensor
+
 from vehest.constants import FloatArray
 from vehest.estimators.base import Stepper
 from vehest.estimators.filtering.gated import GatedFilter
+from vehest.filters.gaussian import Filtered
 from vehest.filters.unscented_scan import StepNoise, UnscentedStepper
 
 
@@ -30,18 +32,39 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """A sample of ``channels``, (C,), as the filter takes it; ``memory`` is what earlier
-        samples left, empty at first.
+        """A sample of ``channels``, (C,), as the filter takes it.
+
+        ``memory`` is what earlier samples left, empty at first.
         """
 
     @abstractmethod
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """The filter before its first sample; raises `ConfigurationError`: it has not been fitted."""
+        """The filter before its first sample.
+
+        Raises
+        ------
+        ConfigurationError
+            It has not been fitted.
+        """
 
     def online(self) -> Stepper:
         """A stepper that starts from the first sample it sees."""
         self.require_fitted()
         return SigmaPointStepper(self)
+
+
+def normalised_innovations(steps: Filtered[Tensor]) -> tuple[FloatArray, FloatArray]:
+    """Normalised innovation squared eᵀS⁻¹e, and how many numbers were measured, (B, T) each.
+
+    Parameters
+    ----------
+    steps : Filtered
+        Innovations e (B, T, m), their covariances S (B, T, m, m), and what was measured.
+    """
+    whitened = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result
+    nis = whitened.mul(steps.innovation).sum(-1)
+    dof = torch.as_tensor(steps.measured).sum(-1)
+    return nis.double().numpy(), dof.double().numpy()
 
 
 class SigmaPointStepper(Stepper):

@@ -1,5 +1,6 @@
-"""The unscented filter of a single track on Dugoff's tyres, over batches of drives; differentiable
-in measurements and noise.
+"""The unscented filter of a single track on Dugoff's tyres, over batches of drives.
+
+Differentiable in measurements and noise.
 """
 
 from __future__ import annotations
@@ -25,18 +26,21 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
 
+# m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
 UNKNOWN_MOTION = (
     0.5,
     0.2,
-)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+)
 ROLLING = np.diag(np.square(UNKNOWN_MOTION))
 EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is handed over
 KAPPA = 1.0  # n + κ = 3
 
 
 class TrackFilter:
-    """States v and r; measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward
-    speed, steering angle and ax.
+    """States v and r.
+
+    Measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward speed, steering
+    angle and ax.
 
     Where the car is slower than the track's minimum speed, nothing counts as measured, and the
     state is that of rolling wheels, with the deviations `UNKNOWN`.
@@ -56,8 +60,9 @@ class TrackFilter:
         initial: Gaussian[Tensor] | None = None,
         gate: Gate | None = None,
     ) -> NonlinearFiltered:
-        """Filter sequences of one length; means and covariances are differentiable in measurements
-        and noise.
+        """Filter sequences of one length.
+
+        Means and covariances are differentiable in measurements and noise.
 
         Parameters
         ----------
@@ -100,8 +105,9 @@ class TrackFilter:
     def start(
         self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None
     ) -> Gaussian[Tensor]:
-        """State before the first measurement: straight ahead and unknown, rolling where the car is
-        slow, or what is handed over.
+        """State before the first measurement.
+
+        Straight ahead and unknown, rolling where the car is slow, or what is handed over.
 
         Parameters
         ----------
@@ -124,8 +130,9 @@ class TrackFilter:
 def in_nonlinear_range(
     ay: FloatArray, enter: float, leave: float, before: bool = False
 ) -> NDArray[np.bool_]:
-    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay|
-    ≤ ``leave``, less than that.
+    """Whether the car behaves non-linearly, with a hysteresis.
+
+    From |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, less than that.
 
     Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first
     sample.
@@ -139,8 +146,9 @@ def in_nonlinear_range(
 
 
 def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
-    """One figure of the errors of several recordings, of each the sum of its squared errors, and
-    over how many samples.
+    """One figure of the errors of several recordings.
+
+    ``sums`` has the sum of squared errors and the number of samples of each.
 
     ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the
     recordings' root mean squared errors, in which a recording counts by its error, not by the
@@ -158,8 +166,9 @@ def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
 
 
 def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
-    """Rows of similar length, so many that together, padded to the longest, they hold at most so
-    many samples; one at least.
+    """Groups of rows of similar length, each of at most so many samples when padded.
+
+    A group has at least one row.
     """
     rows: list[int] = []
     for row in sorted(range(len(lengths)), key=lambda index: -lengths[index]):
@@ -172,8 +181,9 @@ def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
 
 
 def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
-    """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with
-    their last row (none).
+    """Arrays (T, n) of different lengths as one, (B, max T, n).
+
+    Shorter ones are filled with a value or, for None, with their last row.
     """
     longest = max(len(array) for array in arrays)
     return np.stack(

@@ -3,7 +3,8 @@
 A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small
 steering angles taken for granted (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
 
-    F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,   α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
+    F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,
+    α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
 
 The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle
 carries what it carries at rest.
@@ -36,14 +37,14 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
 """Names of an axle's parameters, by the kind of its curve: [N/rad]; [rad²], [N/rad]."""
 
 BOUNDS = {"cornering_stiffness": (1e2, 1e8), "c1": (1e-5, 1.0), "c2": (1e2, 1e8)}
-PEAK_SLIP = math.radians(
-    9.0
-)  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+# where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+PEAK_SLIP = math.radians(9.0)
 PEAK_SPREAD = 0.4  # standard deviation of its logarithm
+# mean and standard deviation of ln c₁; the peak lies at √(2c₁)
 ROAD_TYRE_LOG_C1 = (
     math.log(0.5 * PEAK_SLIP**2),
     2.0 * PEAK_SPREAD,
-)  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
+)
 MIN_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
 PASSES = 3  # of weighing what is known against what the drives leave unexplained
 SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
@@ -54,12 +55,14 @@ NORMAL_95 = 1.959964
 
 
 class AxleMotion(NamedTuple):
-    """What the axles do along drives; slips and forces have a row an axle, front and rear."""
+    """Motion of the axles along drives; slips and forces have a row an axle, front and rear."""
 
     slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
     force: FloatArray  # lateral forces, (2, N) [N]
     block: NDArray[np.int64]  # number of the stretch of time a sample belongs to, (N,)
-    driven: FloatArray  # forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN: not measured
+    # forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN:
+    # not measured
+    driven: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +88,9 @@ class TyreFit:
 
 
 def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArray:
-    """Lateral force of an axle at slip angles (...) [rad], (...) [N]; parameters in the order of
-    `PARAMETERS`, (P,).
+    """Lateral force of an axle at slip angles (...) [rad], (...) [N].
+
+    Parameters in the order of `PARAMETERS`, (P,).
 
     C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
     """
@@ -132,7 +136,8 @@ def axle_motion(
         length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
         if length <= SMOOTHING_ORDER:
             raise DataError(
-                f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more"
+                f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw "
+                "acceleration; take 4 Hz or more"
             )
         if len(recording) < length:
             continue
@@ -153,8 +158,8 @@ def axle_motion(
     if count < MIN_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
         raise DataError(
-            f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {MIN_SAMPLES} are needed "
-            f"(recordings: {named})"
+            f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels "
+            f"known, {MIN_SAMPLES} are needed (recordings: {named})"
         )
     return AxleMotion(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
 
@@ -241,21 +246,24 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
 def _fitted(
     kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted,
-    so that all stay positive.
+    """Parameters of one axle, their covariance and the rms of what is left.
+
+    Logarithms are fitted, so that all stay positive.
     """
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
     squares = float(slip @ slip)
     if not squares > 0.0:
         raise DataError(
-            "tyre curves: the axles never slip, since the car goes straight on; fit them to drives with bends"
+            "tyre curves: the axles never slip, since the car goes straight on; fit them to "
+            "drives with bends"
         )
     stiffness = float(slip @ force) / squares
     scale = math.sqrt(float(np.mean(force**2)))
     if not stiffness > 0.0:
         raise DataError(
-            f"tyre curves: forces run against slip angles (slope {stiffness:.3g} N/rad); check the signs of steer, ay and vy_ref"
+            f"tyre curves: forces run against slip angles (slope {stiffness:.3g} N/rad); check "
+            "the signs of steer, ay and vy_ref"
         )
     guess = {
         "cornering_stiffness": stiffness,

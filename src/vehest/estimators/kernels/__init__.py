@@ -1,1 +1,1 @@
-"""Compiled recursions (numba) of the networks, each equal in value and gradient to its plain PyTorch module."""
+"""Compiled recursions (numba), equal in value and gradient to their PyTorch modules."""

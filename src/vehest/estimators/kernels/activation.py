@@ -1,5 +1,6 @@
-"""Functions for compiled loops that become vector instructions in float32; tanh and the logistic
-function also of `vehest.lanes`.
+"""Functions for compiled loops that become vector instructions in float32.
+
+Tanh and the logistic function also of `vehest.lanes`.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ _F = numba.float32
 
 
 def tanh(x: Any) -> Any:
-    """tanh(x); in compiled float32 code a rational function, whose loops become vector
-    instructions.
+    """tanh(x).
+
+    In compiled float32 code a rational function, whose loops become vector instructions.
     """
     return each(math.tanh, x)
 
@@ -41,8 +43,9 @@ def arctan(x: Any) -> Any:
 
 
 def rational_tanh(x: Any) -> Any:
-    """tanh by Lambert's continued fraction n/d at x/4, then tanh(2y) = 2nd/(d² + n²) twice, divided
-    once; error below 2e-7.
+    """tanh by Lambert's continued fraction n/d at x/4; error below 2e-7.
+
+    tanh(2y) = 2nd/(d² + n²) follows twice, divided once.
 
     Source: Abramowitz & Stegun, equations 4.5.70 and 4.5.24.
     """
@@ -58,14 +61,14 @@ _rational_tanh = numba.njit(inline="always")(rational_tanh)
 
 
 @overload(tanh)
-def _compiled_tanh(x):  # type: ignore[no-untyped-def]
+def _compiled_tanh(x):
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _rational_tanh(x)
     return (lambda x: each(math.tanh, x)) if isinstance(x, Lanes) else (lambda x: math.tanh(x))
 
 
 @overload(sigmoid)
-def _compiled_sigmoid(x):  # type: ignore[no-untyped-def]
+def _compiled_sigmoid(x):
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _F(0.5) + _F(0.5) * _rational_tanh(_F(0.5) * x)
     return lambda x: 0.5 + 0.5 * tanh(0.5 * x)
@@ -80,14 +83,15 @@ def _of_bits(typing: Any, bits: Any) -> Any:
 
 
 @overload(softplus)
-def _compiled_softplus(x):  # type: ignore[no-untyped-def]
-    """exp(-|x|) = 2ⁿ exp(r) with |r| < 0.35 (polynomial of Cephes' expf), and log(1 + e) = 2
-    artanh(e/(2 + e)) by its series.
+def _compiled_softplus(x):
+    """Softplus in float32, by exp(-|x|) = 2ⁿ exp(r) and log(1 + e) = 2 artanh(e/(2 + e)).
+
+    |r| < 0.35; exp(r) is the polynomial of Cephes' expf, artanh its series.
     """
     if x != types.float32:
         return lambda x: max(x, x * 0) + math.log1p(math.exp(-abs(x)))
 
-    def compute(x):  # type: ignore[no-untyped-def]
+    def compute(x):
         y = max(-abs(x), _F(-87.0))
         n = np.floor(y * _F(1.44269504) + _F(0.5))
         r = y - n * _F(0.693147181)
@@ -105,12 +109,12 @@ def _compiled_softplus(x):  # type: ignore[no-untyped-def]
 
 
 @overload(arctan)
-def _compiled_arctan(x):  # type: ignore[no-untyped-def]
+def _compiled_arctan(x):
     """Abramowitz & Stegun, equation 4.4.49, and π/2 - arctan(1/x) beyond 1."""
     if x != types.float32:
         return lambda x: math.atan(x)
 
-    def compute(x):  # type: ignore[no-untyped-def]
+    def compute(x):
         a = abs(x)
         y = min(a, _F(1.0)) / max(a, _F(1.0))
         s = y * y

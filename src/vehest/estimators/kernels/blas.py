@@ -11,9 +11,10 @@ from threadpoolctl import ThreadpoolController
 _controller = cache(ThreadpoolController)
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
-    """Matrix products within stay on their thread: those of small blocks gain nothing from more,
-    and several threads call them.
+def single_blas_thread() -> AbstractContextManager[object]:
+    """Matrix products within stay on their thread.
+
+    Those of small blocks gain nothing from more, and several threads call them.
     """
     limited: AbstractContextManager[object] = _controller().limit(limits=1, user_api="blas")
     return limited

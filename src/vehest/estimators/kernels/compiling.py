@@ -1,5 +1,6 @@
-"""How kernels whose sums may be reordered are compiled: with the same digits on the first run as on
-every later one.
+"""How kernels whose sums may be reordered are compiled.
+
+With the same digits on the first run as on every later one.
 
 A compiled function that calls another has a copy of it in its own object, optimised once more for
 where it stands. The process that compiles runs the callee's first version, one that reads the cache
@@ -18,15 +19,17 @@ import numba
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that Python calls, kept in the compile cache; ``options`` as those of
-    ``numba.njit``.
+    """Decorator of a function that Python calls, kept in the compile cache.
+
+    ``options`` as those of ``numba.njit``.
     """
     return numba.njit(cache=True, error_model="numpy", **options)  # type: ignore[no-any-return]
 
 
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that only compiled functions call; ``options`` as those of
-    ``numba.njit``.
+    """Decorator of a function that only compiled functions call.
+
+    ``options`` as those of ``numba.njit``.
 
     With ``_nrt=False`` it counts no references of arrays, which compiles sooner; it may then
     neither make nor return one.
@@ -41,8 +44,9 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def has_to_compile(location: str) -> bool:
-    """Whether an entry, ``module:function``, compiles on this machine before it first runs; later
-    runs load the result.
+    """Whether an entry, ``module:function``, compiles on this machine before it first runs.
+
+    Later runs load the result.
     """
     name, _, entry_name = location.partition(":")
     if not name:

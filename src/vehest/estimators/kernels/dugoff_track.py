@@ -1,5 +1,4 @@
-"""Sigma points through the single track on Dugoff's tyres (`DugoffTrack`), compiled, with the
-adjoint.
+"""Sigma points through `DugoffTrack`, a single track on Dugoff's tyres, and the adjoint.
 
 Equations: see `vehest.vehicle.dugoff`, which is the readable definition in torch. With F_F, F_R the
 axle forces and F' their derivatives by the lateral velocity of their axle, which the forward pass
@@ -9,8 +8,8 @@ saves beside the inputs:
     F̄_F = Δt (v̄⁺/m + l_F r̄⁺/I_zz) F_F',   F̄_R = Δt (v̄⁺/m - l_R r̄⁺/I_zz) F_R'
     v̄ = v̄⁺ + F̄_F + F̄_R,   r̄ = r̄⁺ - Δt u v̄⁺ + l_F F̄_F - l_R F̄_R
 
-The observation (a_y, r, F_F, F_R and, for five measurements, β = atan v/u) is treated alike. There
-are no sums over points.
+The observation (a_y, r, F_F, F_R and, for five measurements, β = atan v/u) is treated alike. Order
+of sums: there are none over points.
 """
 
 from __future__ import annotations
@@ -57,15 +56,16 @@ class CompiledDugoffTrack(PointModel):
 
 
 @piece
-def _set_row(values, row, b, vector, end):  # type: ignore[no-untyped-def]
+def _set_row(values, row, b, vector, end):
     """Write a vector to a row of the sequences from b to ``end``."""
     store_some(values, row * values.shape[values.ndim - 1] + b, vector, end - b)
 
 
 @piece
-def _input_terms(inputs, b, car):  # type: ignore[no-untyped-def]
-    """Terms of one sample that all points share: speed, tangent and cosine of the steering angle,
-    loads of both axles.
+def _input_terms(inputs, b, car):
+    """Terms of one sample that all points share.
+
+    Speed, tangent and cosine of the steering angle, loads of both axles.
     """
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
@@ -87,7 +87,7 @@ def _input_terms(inputs, b, car):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
+def _axle(tangent, load, vx, axle, smooth):
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
     unity = axle.dtype.type(1.0)
@@ -113,7 +113,7 @@ def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _forces(points, s, b, input_terms, track):  # type: ignore[no-untyped-def]
+def _forces(points, s, b, input_terms, track):
     """Forces across the body at point s, front and rear, and the derivative of each by the lateral
     velocity of its axle.
     """
@@ -142,7 +142,7 @@ def _forces(points, s, b, input_terms, track):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _save_slopes(inputs, entry, s, b, by_front, by_rear, end):  # type: ignore[no-untyped-def]
+def _save_slopes(inputs, entry, s, b, by_front, by_rear, end):
     """Save the derivatives of the forces at point s by the lateral velocities of their axles, where
     inputs have rows for them.
     """
@@ -153,14 +153,14 @@ def _save_slopes(inputs, entry, s, b, by_front, by_rear, end):  # type: ignore[n
 
 
 @piece
-def _saved_slopes(inputs, entry, s, b):  # type: ignore[no-untyped-def]
+def _saved_slopes(inputs, entry, s, b):
     """Derivatives that `_save_slopes` saved for point s."""
     row = DRIVEN + 4 * s + 2 * entry
     return at_row(inputs, row, b), at_row(inputs, row + 1, b)
 
 
 @compiled
-def _transition(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, track, out, first, end):
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
@@ -177,7 +177,7 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
 
 
 @compiled
-def _observation(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
+def _observation(points, inputs, track, out, first, end):
     car = track[0]
     m = out.shape[1]
     for b in range(first, end, width(points)):
@@ -194,7 +194,7 @@ def _observation(points, inputs, track, out, first, end):  # type: ignore[no-unt
 
 
 @compiled
-def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
@@ -212,7 +212,7 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
 
 
 @compiled
-def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):
     car = track[0]
     m = upstream.shape[1]
     mass, _, front_arm, rear_arm, _, _, minimum_speed = car

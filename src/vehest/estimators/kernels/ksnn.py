@@ -1,8 +1,8 @@
 """The KS-NN recursion, compiled: predictions and, in the same pass, their derivatives.
 
 One step of a window (Da Lio et al. 2023, Eq. 7), with φ_p the weights of the local models p at |ω|
-(Eq. 9), e = û - u, γ = Σ_p φ_p γ_p and likewise β, and f_i(e) = b_i + w_i e + Σ_j w₃ tanh(w₂ e +
-b₂) blended likewise (Eq. 8):
+(Eq. 9), e = û - u, γ = Σ_p φ_p γ_p and likewise β, and
+f_i(e) = b_i + w_i e + Σ_j w₃ tanh(w₂ e + b₂) blended likewise (Eq. 8):
 
     v⁺ = γ₁ v + β₁ τ (a_y - u ω) - ω f₁(e)
     û⁺ = γ₂ û + β₂ τ (a_x + v ω) - f₂(e)
@@ -12,12 +12,15 @@ Adjoint, with f̄₁ = -ω v̄⁺, f̄₂ = -û̄⁺:
 
     v̄ = γ₁ v̄⁺ + β₂ τ ω û̄⁺,   û̄ = γ₂ û̄⁺ + Σ_i f_i' f̄_i
     γ̄₁,p += φ_p v v̄⁺,  β̄₁,p += φ_p τ (a_y - u ω) v̄⁺,  γ̄₂,p, β̄₂,p likewise with û̄⁺
-    w̄_i,p += φ_p e f̄_i,  b̄_i,p += φ_p f̄_i,  and through tanh' = 1 - tanh² to w₂, b₂, w₃ of the active models
+    w̄_i,p += φ_p e f̄_i,  b̄_i,p += φ_p f̄_i
+
+and through tanh' = 1 - tanh² to w₂, b₂, w₃ of the active models.
 
 Order of sums: local models in order of p, then neurons in order of j; gradients over samples
 backwards in time, lane by lane, and over lanes at the end of a batch.
 
-    flat parameters --slots--> theta --_forward, k = 0 … N-1--> predictions --slopes_of--> _backward, k = N-1 … 0 --> gradient
+    flat parameters --slots--> theta --_forward, k = 0 … N-1--> predictions
+    --slopes_of--> _backward, k = N-1 … 0 --> gradient
 
 Windows lie side by side in lanes. The parameters of local models that enter linearly are blended
 before they are used, and the neurons are those of each lane's two active models.
@@ -93,8 +96,9 @@ def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
 def c_tables(
     theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool
 ) -> dict[str, Any]:
-    """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their
-    biases are left out.
+    """Values of the C template of a network with rows of `packed`, (P, 8 + 6 Q).
+
+    Biases are left out without ``bias``.
     """
     n_local = len(theta)
     n_hidden = (theta.shape[1] - LINEAR) // 6
@@ -112,8 +116,9 @@ def c_tables(
 
 
 def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
-    """The recursion of a network with parameters in the order of `shapes_of`; its last local model
-    is centred at a yaw rate [rad/s].
+    """The recursion of a network with parameters in the order of `shapes_of`.
+
+    Its last local model is centred at a yaw rate [rad/s].
     """
     views = {}
     first = 0
@@ -139,7 +144,7 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
 
 
 @entry(nogil=True)
-def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
+def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):
     """See `vehest.estimators.kernels.recursion.Recursion`."""
     slots, n_local, n_hidden, n_window, step, per_width = constants
     lanes = width(series)
@@ -189,9 +194,10 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
 
 
 @part(_nrt=False)
-def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
-    """v and û after step k in all lanes; leaves ``saved`` rows and neurons' ``outputs`` for
-    `_backward`.
+def _forward(car, room, k, v, u):
+    """v and û after step k in all lanes.
+
+    Leaves ``saved`` rows and neurons' ``outputs`` for `_backward`.
     """
     theta, n_local, n_hidden, step, per_width = car
     windows, saved, outputs = room
@@ -259,7 +265,7 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _model(position, n_local):  # type: ignore[no-untyped-def]
+def _model(position, n_local):
     """First active local model of each lane."""
     model = position * 0
     for p in range(1, n_local - 1):
@@ -268,7 +274,7 @@ def _model(position, n_local):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
+def _chosen(theta, column, model, n_local, row):
     """w₂, b₂, w₃ of one neuron of the lanes' active models."""
     w2 = model * 0 + theta[column]
     b2 = model * 0 + theta[column + 1]
@@ -283,9 +289,10 @@ def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _backward(car, room, k, v_bar, u_bar, sums):  # type: ignore[no-untyped-def]
-    """Adjoint of step k: v̄ and û̄ before it from those after it; adds the gradients of parameters
-    to ``sums``.
+def _backward(car, room, k, v_bar, u_bar, sums):
+    """Adjoint of step k.
+
+    v̄ and û̄ before it from those after it; adds the gradients of parameters to ``sums``.
     """
     theta, n_local, n_hidden, step, per_width = car
     windows, saved, outputs = room

@@ -1,6 +1,7 @@
 """Sigma points through the planar cars of `vehicle.dynamics`, compiled, with the adjoint.
 
-    points (S, n, B) --_gather_points--> columns --_stages: _motion, _rates--> x⁺ --_scatter_points--> points
+    points (S, n, B) --_gather_points--> columns --_stages: _motion, _rates--> x⁺
+    --_scatter_points--> points
 
 Equations: see `vehest.vehicle.dynamics` (cars, network) and `vehest.vehicle.planar` (chassis), the
 readable definitions in torch. A step is x⁺ = x + Δt/6 (k₁ + 2 k₂ + 2 k₃ + k₄). Its adjoint computes
@@ -33,7 +34,7 @@ import torch
 
 from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
-from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.blas import single_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.filters.unscented_scan import Array, PointModel
 from vehest.lanes import width
@@ -59,9 +60,10 @@ piece = part(**_FAST)
 
 
 @piece
-def copy_rows(rows, out):  # type: ignore[no-untyped-def]
-    """The first rows of ``out`` become ``rows``. An assignment would take longer to compile: it
-    checks shapes and words a message.
+def copy_rows(rows, out):
+    """The first rows of ``out`` become ``rows``.
+
+    An assignment would take longer to compile: it checks shapes and words a message.
     """
     for i in range(rows.shape[0]):
         for p in range(rows.shape[1]):
@@ -113,11 +115,11 @@ class CompiledPlanarCar(PointModel):
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
-        """With matrix products on their thread."""
-        return one_blas_thread()
+        """Context in which matrix products stay on their thread."""
+        return single_blas_thread()
 
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
-        """With whether they are wanted; those that are not are never written."""
+        """Gradients and whether they are required; otherwise they are never written."""
         learning = bool(self.parameters)
         return (*(gradients if learning else (*self.car[0][:6], self.car[1])), learning)
 
@@ -141,9 +143,10 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 
 
 @piece
-def _columns(points, first, end, padding, x):  # type: ignore[no-untyped-def]
-    """Points of some sequences side by side; columns beyond them are ``padding`` times the last
-    one.
+def _columns(points, first, end, padding, x):
+    """Points of some sequences side by side.
+
+    Columns beyond them are ``padding`` times the last one.
     """
     count, n = points.shape[:2]
     for b in range(first, end):
@@ -157,7 +160,7 @@ def _columns(points, first, end, padding, x):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
+def _driven(inputs, first, end, count, u):
     """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
     for b in range(first, end):
         sine = math.sin(inputs[0, b])
@@ -170,7 +173,7 @@ def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _scatter_points(rows, points, first, end):  # type: ignore[no-untyped-def]
+def _scatter_points(rows, points, first, end):
     """Rows back into points of some sequences."""
     count = points.shape[0]
     for b in range(first, end):
@@ -180,7 +183,7 @@ def _scatter_points(rows, points, first, end):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
+def _hidden(below, transposed, offset, above):
     """A hidden layer: above = σ(below Wᵀ + offset)."""
     np.dot(below, transposed, above)
     for p in range(above.shape[0]):
@@ -189,9 +192,10 @@ def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
-    """Slope of a squashed value, its distances from both ends multiplied; none where it has reached
-    one but for rounding.
+def _rise(above, below, flat, nothing):
+    """Slope of a squashed value, its distances from both ends multiplied.
+
+    None where it has reached one but for rounding.
 
     At a crawl slips change by a million per m/s, and rounding would count.
     """
@@ -199,7 +203,7 @@ def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
+def _network(layers, f, h1, h2, o):
     """Outputs o (4, P) of the network for features f (P, F); columns beyond the points are zero."""
     T1, b1, T2, b2, _, b3, _, _, T3 = layers
     _hidden(f, T1, b1, h1)
@@ -214,7 +218,7 @@ def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
+def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):
     """Writes ``f_bar``, and adds to the gradients when learning."""
     _, _, _, _, W3, _, W1, W2, _ = layers
     h2_bar = np.empty_like(h2)
@@ -239,7 +243,7 @@ def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients)
 
 
 @piece
-def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
+def _through_hidden(rows, flat, rows_bar):
     """Multiply gradients of a hidden layer by its slope σ (1 - σ), in place."""
     unity = rows.dtype.type(1)
     nothing = rows.dtype.type(0)
@@ -249,7 +253,7 @@ def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _add_product(first, second, out):  # type: ignore[no-untyped-def]
+def _add_product(first, second, out):
     """out += firstᵀ second."""
     product = np.empty_like(out)
     np.dot(first.T, second, product)
@@ -259,7 +263,7 @@ def _add_product(first, second, out):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _add_rows(rows, out):  # type: ignore[no-untyped-def]
+def _add_rows(rows, out):
     """out += sum of the rows."""
     for p in range(rows.shape[0]):
         for i in range(rows.shape[1]):
@@ -267,7 +271,7 @@ def _add_rows(rows, out):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _slips_and_features(x, u, car, f, slips):  # type: ignore[no-untyped-def]
+def _slips_and_features(x, u, car, f, slips):
     """Write slips (front, rear, ratio), and the features that the network receives."""
     _, theta, constants, kind = car
     lr = theta[0]
@@ -296,7 +300,7 @@ def _slips_and_features(x, u, car, f, slips):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _curve(slip, stiffness, shape, unity):  # type: ignore[no-untyped-def]
+def _curve(slip, stiffness, shape, unity):
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
     angle = arctan(stiffness * slip)
     slope = math.cos(shape * angle)
@@ -305,14 +309,14 @@ def _curve(slip, stiffness, shape, unity):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _loads(theta, constants):  # type: ignore[no-untyped-def]
+def _loads(theta, constants):
     """Weight over wheelbase [N/m], and static loads of front and rear axle [N]."""
     weight = constants[0] * constants[8] / constants[1]
     return weight, weight * theta[0], weight * (constants[1] - theta[0])
 
 
 @piece
-def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
+def _forces(x, car, slips, o, forces):
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
     points = x.shape[1]
@@ -341,7 +345,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):
     """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and
     adds to the others.
     """
@@ -408,7 +412,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
 
 
 @piece
-def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
+def _chassis(x, u, car, forces, out):
     """Rows of ``out`` are ax, ay, dr/dt, dω/dt."""
     _, theta, constants, _ = car
     mass, wheelbase, radius = constants[:3]
@@ -442,9 +446,10 @@ def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
-    """Writes the gradients of the forces, rows of ``slope``, and adds to the others; ``out`` is
-    what `_chassis` wrote.
+def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):
+    """Writes the gradients of the forces, rows of ``slope``, and adds to the others.
+
+    ``out`` is what `_chassis` wrote.
     """
     _, theta, constants, _ = car
     mass, wheelbase, radius = constants[:3]
@@ -507,7 +512,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
 
 
 @piece
-def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
+def _motion(x, u, car, room, out):
     """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is saved for the adjoint."""
     layers, _, _, kind = car
     f, slips, h1, h2, o, forces, plain = room
@@ -531,7 +536,7 @@ def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # type: ignore[no-untyped-def]
+def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):
     """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
     layers, theta, constants, kind = car
     f, slips, h1, h2, o, forces, plain = room
@@ -570,7 +575,7 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
 
 
 @piece
-def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):
     """Add the gradients of slips to those of the state and, when learning, of the distance of the
     rear axle.
     """
@@ -603,7 +608,7 @@ def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # typ
 
 
 @piece
-def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
+def _rates(x, motion, rates):
     """dx/dt from accelerations: dvx/dt = ax + vy r, dvy/dt = ay - vx r; friction stays."""
     for p in range(x.shape[1]):
         rates[0, p] = motion[0, p] + x[1, p] * x[2, p]
@@ -614,7 +619,7 @@ def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _block_of(sequences, count):  # type: ignore[no-untyped-def]
+def _block_of(sequences, count):
     """Sequences in a block, so that blocks are about equal."""
     max_sequences = max(BLOCK // count, 1)
     pieces = (sequences + max_sequences - 1) // max_sequences
@@ -622,9 +627,10 @@ def _block_of(sequences, count):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _gather_points(points, inputs, first, end):  # type: ignore[no-untyped-def]
-    """Points of some sequences and their inputs, in as many columns as fill whole vectors; see
-    `_columns` and `_driven`.
+def _gather_points(points, inputs, first, end):
+    """Points of some sequences and their inputs, in as many columns as fill whole vectors.
+
+    See `_columns` and `_driven`.
     """
     count, n, _ = points.shape
     lanes = width(points)
@@ -637,7 +643,7 @@ def _gather_points(points, inputs, first, end):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _room(points, x, car):  # type: ignore[no-untyped-def]
+def _room(points, x, car):
     """For what the network sees of so many points, slips, both hidden layers, its outputs, forces,
     and rates without what it adds.
     """
@@ -656,7 +662,7 @@ def _room(points, x, car):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _stages(x0, u, car, rooms):  # type: ignore[no-untyped-def]
+def _stages(x0, u, car, rooms):
     """States and rates at the four stages of the Runge-Kutta method."""
     step = car[2][3]
     half = x0.dtype.type(0.5)
@@ -677,7 +683,7 @@ def _stages(x0, u, car, rooms):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, car, out, start, stop):
     count, n, _ = points.shape
     sixth = points.dtype.type(car[2][3] / 6)
     two = points.dtype.type(2)
@@ -696,7 +702,7 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
 
 
 @compiled
-def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+def _observation(points, inputs, car, out, start, stop):
     count = points.shape[0]
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
@@ -711,7 +717,7 @@ def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-unty
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):
     learning = gradients[7]
     count, n, _ = points.shape
     step = car[2][3]
@@ -757,7 +763,7 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):
     learning = gradients[7]
     count = points.shape[0]
     size = _block_of(stop - start, count)

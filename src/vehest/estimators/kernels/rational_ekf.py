@@ -1,5 +1,4 @@
-"""The extended Kalman filter over `TyreTrack`, compiled: analytic Jacobians, one pass over a
-recording.
+"""The extended Kalman filter over `TyreTrack`, compiled: one pass with analytic Jacobians.
 
 For each sample, with A = ∂f/∂x, H = ∂h/∂x (the readable definition of f and h in torch is
 `vehest.vehicle.tyre_track`):
@@ -30,7 +29,7 @@ _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, out):  # type: ignore[no-untyped-def]
+def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, out):
     """Filter samples of yaw_rate, vx, ay, steer, (T, 4); NaN in yaw_rate and ay is skipped.
 
     Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, and tyre parameters
@@ -132,7 +131,7 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
 
 
 @numba.njit(inline="always")
-def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):  # type: ignore[no-untyped-def]
+def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):
     """f: mean one step later, in place; writes the rows of A for β' and r', returns the front
     axle's force and slopes.
     """
@@ -176,9 +175,10 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
 
 
 @numba.njit(inline="always")
-def _propagate(cov, per_rate, per_turn, step, product):  # type: ignore[no-untyped-def]
-    """A P Aᵀ, in place: β and r are moved by their rates, β' and r' come from all states, tyre
-    parameters stay.
+def _propagate(cov, per_rate, per_turn, step, product):
+    """A P Aᵀ, in place.
+
+    β and r are moved by their rates, β' and r' come from all states, tyre parameters stay.
     """
     n = len(cov)
     for j in range(n):  # A P
@@ -208,10 +208,8 @@ def _propagate(cov, per_rate, per_turn, step, product):  # type: ignore[no-untyp
 
 
 @numba.njit(inline="always")
-def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ignore[no-untyped-def]
-    """Q = Δt B Λ Bᵀ of the steering angle and, where they wander, of the tyre parameters; Eqs. 41
-    to 45.
-    """
+def _add_noise(cov, front, car, speed, step, variances, wandering):
+    """Q = Δt B Λ Bᵀ of the steering angle and of tyre parameters that wander; Eqs. 41 to 45."""
     rate = front.per_slip * (1.0 / (car[0] * speed))
     acceleration = car[2] * front.per_slip / car[1]
     spread = step * variances[2]
@@ -226,7 +224,7 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
 
 
 @numba.njit(inline="always")
-def _innovate(  # type: ignore[no-untyped-def]
+def _innovate(
     mean,
     cov,
     sample,
@@ -240,8 +238,9 @@ def _innovate(  # type: ignore[no-untyped-def]
     S,
     measured,
 ):
-    """Innovations of yaw rate and ay, their covariance S and P Hᵀ; of what was not measured 0, the
-    identity's rows and 0.
+    """Innovations of yaw rate and ay, their covariance S and P Hᵀ.
+
+    Of what was not measured 0, the identity's rows and 0.
 
     What is refused counts as not measured.
     """
@@ -275,7 +274,7 @@ def _innovate(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _gain(cross, S, holds_tyres, gain):  # type: ignore[no-untyped-def]
+def _gain(cross, S, holds_tyres, gain):
     """K = P Hᵀ S⁻¹; the rows of tyre parameters are 0 where these stay."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
     for i in range(len(gain)):
@@ -286,9 +285,10 @@ def _gain(cross, S, holds_tyres, gain):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _reduce(cov, gain, cross, vx, crossfall, variances, measured, product):  # type: ignore[no-untyped-def]
-    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row: Joseph's form, which holds for any
-    gain.
+def _reduce(cov, gain, cross, vx, crossfall, variances, measured, product):
+    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row.
+
+    Joseph's form, which holds for any gain.
     """
     n = len(cov)
     for i in range(n):
@@ -310,7 +310,7 @@ def _reduce(cov, gain, cross, vx, crossfall, variances, measured, product):  # t
 
 
 @numba.njit(inline="always")
-def roll_without_slip(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
+def roll_without_slip(mean, cov, rolling, car, vx, steer):
     """Set the motion to that of a car that rolls, with variances ``rolling``, independent of all
     else.
     """
@@ -327,7 +327,7 @@ def roll_without_slip(mean, cov, rolling, car, vx, steer):  # type: ignore[no-un
 
 
 @numba.njit(inline="always")
-def _record(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-untyped-def]
+def _record(k, mean, cov, means, deviations, sideslip_cov):
     """Write mean, deviations and the covariance of β and r of sample k."""
     means[k] = mean
     for i in range(len(mean)):
@@ -338,7 +338,7 @@ def _record(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-u
 
 
 @numba.njit(inline="always")
-def _clip(mean, bounds):  # type: ignore[no-untyped-def]
+def _clip(mean, bounds):
     """Clip states to ±bounds, in place."""
     for i in range(len(mean)):
         mean[i] = min(max(mean[i], -bounds[i]), bounds[i])

@@ -36,7 +36,7 @@ BLOCK = 4  # inputs whose weights' gradients are summed together
 
 
 @entry(nogil=True)
-def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
+def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):
     """See `vehest.estimators.kernels.recursion.Recursion`."""
     gates, states, n_window, mean, scale = constants
     lanes = width(series)
@@ -79,9 +79,8 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
                     add(sums, (readout + states) * lanes, slope)
                     for i in range(states):
                         add(sums, (readout + i) * lanes, slope * load(state, i * lanes))
-                        store(
-                            state, i * lanes, slope * parameters[readout + i]
-                        )  # from here on the adjoint of the state
+                        # from here on the adjoint of the state
+                        store(state, i * lanes, slope * parameters[readout + i])
                         store(state, (states + i) * lanes, slope * 0)
                     for k in range(n_window - 1, -1, -1):
                         if gates == GRU:
@@ -99,9 +98,10 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
 
 
 @part(_nrt=False)
-def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
-    """Save the arguments of the gates at step k and return where; a GRU candidate's is without U_n
-    h, which is one row later.
+def _arguments(flat, size, room, k):
+    """Save the arguments of the gates at step k and return where.
+
+    A GRU candidate's is without U_n h, which is one row later.
     """
     gates, states, channels = size
     windows, saved, state = room
@@ -129,7 +129,7 @@ def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _gru(row, saved, state, first):  # type: ignore[no-untyped-def]
+def _gru(row, saved, state, first):
     """One step of a GRU from its gates' arguments; saves reset, update, candidate and U_n h."""
     lanes = width(state)
     for at in range(first, first + 2 * row, lanes):
@@ -142,7 +142,7 @@ def _gru(row, saved, state, first):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _lstm(row, saved, state, first):  # type: ignore[no-untyped-def]
+def _lstm(row, saved, state, first):
     """One step of an LSTM; saves the four gates, tanh of the new cell, and the cell before."""
     lanes = width(state)
     for at in range(first, first + 3 * row, lanes):
@@ -161,8 +161,9 @@ def _lstm(row, saved, state, first):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
-    """Adjoint of `_gru`: ``state`` is the gradient of the state after the step, then before it;
+def _gru_adjoint(size, room, k):
+    """Adjoint of `_gru`: ``state`` is the gradient of the state after the step, then before it.
+
     ``saved`` becomes that of the arguments.
     """
     _, states, channels = size
@@ -195,9 +196,10 @@ def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
-    """Adjoint of `_lstm`, as `_gru_adjoint`; the second half of ``state`` is the gradient of the
-    cell.
+def _lstm_adjoint(size, room, k):
+    """Adjoint of `_lstm`, as `_gru_adjoint`.
+
+    The second half of ``state`` is the gradient of the cell.
     """
     _, states, _ = size
     _, saved, state = room
@@ -223,15 +225,16 @@ def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
-    """Which saved row is the adjoint of what the state adds to gate g's argument: a candidate's is
-    its own times the reset.
+def _row_of_state(gates, g):
+    """Saved row of the adjoint of U_g h, the state's part of gate g's argument.
+
+    That of a candidate is multiplied by the reset.
     """
     return 3 if gates == GRU and g == 2 else g
 
 
 @part(_nrt=False)
-def _to_state(flat, size, saved, first, state):  # type: ignore[no-untyped-def]
+def _to_state(flat, size, saved, first, state):
     """Add what goes through the gates' arguments to the adjoint of the state before."""
     gates, states, channels = size
     lanes = width(flat)
@@ -247,9 +250,11 @@ def _to_state(flat, size, saved, first, state):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _sum(size, room, sums):  # type: ignore[no-untyped-def]
-    """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps,
-    a few inputs at a time in registers.
+def _sum(size, room, sums):
+    """Gradients by the weights.
+
+    Products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in
+    registers.
     """
     gates, states, channels = size
     windows, saved, _ = room
@@ -265,9 +270,8 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
             for k in range(steps):
                 offset = offset + load(saved, k * SAVED_ROWS * row + at)
             store(sums, (gates * states * (channels + states) + unit) * lanes, offset)
-            for first in range(
-                0, channels + 1, channels
-            ):  # measurements, then states; a zero by itself would be compiled for anew
+            # measurements, then states; a zero by itself would be compiled for anew
+            for first in range(0, channels + 1, channels):
                 adjoint_at = (g if first == 0 else _row_of_state(gates, g)) * row + i * lanes
                 weights, count = (
                     (unit * channels, channels)
@@ -287,9 +291,10 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def _sum_block(windows, saved, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
-    """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap
-    the one before.
+def _sum_block(windows, saved, sums, at, first, count, strides, weights):
+    """Sum products of ``count`` inputs from ``first`` on with one row of adjoints.
+
+    The last block may overlap the one before.
     """
     steps, row, inputs = strides
     lanes = width(sums)

@@ -1,11 +1,11 @@
-"""Compiled recursions over windows, for members together: predictions, gradients, and batches of
-training.
+"""Predictions, gradients and training of compiled recursions over windows, for batched members.
 
-    parameters (M, K), series (T, C), starts (M, B) --`Recursion.loop`--> predictions (M, B), gradient (M, K), steps of Adam
+    parameters (M, K), series (T, C), starts (M, B)
+    --`Recursion.loop`--> predictions (M, B), gradient (M, K), steps of Adam
 
 A network's module supplies one compiled loop over members and batches; this one calls it on several
 threads, each for its own members, without a barrier between the steps of training. Windows lie side
-by side in `vehest.lanes`.
+by side in `vehest.lanes`. Order of sums: that of the network's module; members do not mix.
 """
 
 from __future__ import annotations
@@ -69,8 +69,9 @@ class Recursion(NamedTuple):
         batch: int,
         adam: tuple[Any, ...],
     ) -> Floats:
-        """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,),
-        float64.
+        """Steps of Adam on mean squared errors, in place.
+
+        Returns sums of squared errors, (M,), float64.
 
         Parameters
         ----------
@@ -138,7 +139,7 @@ class Recursion(NamedTuple):
 
 
 @part(_nrt=False)
-def gather(series, channels, starts, first, rows, windows, stride):  # type: ignore[no-untyped-def]
+def gather(series, channels, starts, first, rows, windows, stride):
     """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of
     lanes a sample, as many as fit.
 
@@ -154,9 +155,10 @@ def gather(series, channels, starts, first, rows, windows, stride):  # type: ign
 
 
 @part(_nrt=False)
-def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-untyped-def]
-    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0
-    in lanes without a window.
+def slopes_of(values, targets, first, squared, scratch):
+    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``.
+
+    0 in lanes without a window.
     """
     count = values.size
     for lane in range(scratch.size):
@@ -172,7 +174,7 @@ def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-unty
 
 
 @part(_nrt=False)
-def squared_error(values, targets):  # type: ignore[no-untyped-def]
+def squared_error(values, targets):
     """Sum of squared errors, in double precision."""
     result = 0.0
     for at in range(values.size):
@@ -182,9 +184,10 @@ def squared_error(values, targets):  # type: ignore[no-untyped-def]
 
 
 @part(_nrt=False)
-def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-def]
-    """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the
-    bounds (Kingma & Ba 2015, Algorithm 1).
+def step_of_adam(flat, gradient, adam, m, batches):
+    """Step ``batches`` of this call for member m, as `torch.optim.Adam`, back into the bounds.
+
+    Source: Kingma & Ba 2015, Algorithm 1.
 
     The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t
     (Section 7.2).
@@ -209,6 +212,6 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
 
 
 @part(_nrt=False)
-def add(sums, at, value):  # type: ignore[no-untyped-def]
+def add(sums, at, value):
     """Add a vector to the lanes of ``sums`` from a place on."""
     store(sums, at, load(sums, at) + value)

@@ -1,13 +1,14 @@
-"""Networks of two hidden layers over single samples, compiled, with masks of dropout that follow
-from seeds.
+"""Networks of two hidden layers over single samples, compiled, with seeded dropout.
 
-    h₁ = d₁ relu(W₁ x + b₁),  h₂ = d₂ relu(W₂ h₁ + b₂),  o = W₃ h₂ + b₃,  d: 0 or 256/(256 - dropped) (dropout)
+    h₁ = d₁ relu(W₁ x + b₁),  h₂ = d₂ relu(W₂ h₁ + b₂),  o = W₃ h₂ + b₃
+    d: 0 or 256/(256 - dropped) (dropout)
 
 Adjoint: W̄₃ = h₂ᵀ ō, b̄₃ = Σ ō, h̄₂ = ō W₃ᵀ; through a layer ā = h̄ d where h > 0, else 0; W̄, b̄
 and the layer below likewise. Order of sums: matrix products as BLAS has them; biases' gradients
 over samples in order.
 
-    inputs, parameters --outputs_of--> outputs      table, rows, parameters --losses_of--> loss and gradient of each member
+    inputs, parameters --outputs_of--> outputs
+    table, rows, parameters --losses_of--> loss and gradient of each member
 
 Members are computed one by one, since the layers of one member fit the processor's cache and those
 of all members together do not. A mask is not stored: what it hides is zero in the hidden layer,
@@ -33,16 +34,18 @@ LEVELS = 256  # dropout drops a whole number of so many parts of hidden values
 LAYERS = 3  # two hidden ones and the output
 
 Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
-"""Of outputs (B, O) and targets (B,): the mean loss; its gradient by the outputs, (B, O), is
-written into the last argument.
+"""Loss of outputs (B, O) and targets (B,): the mean.
+
+Its gradient by the outputs, (B, O), is written into the last argument.
 """
 
 
 def outputs_of(
     inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | None = None, dropout: float = 0.0
 ) -> Tensor:
-    """Outputs of M members, (M, B, O), differentiable in the parameters; h = d(relu(W x + b))
-    twice, then W h + b.
+    """Outputs of M members, (M, B, O), differentiable in the parameters.
+
+    h = d(relu(W x + b)) twice, then W h + b.
 
     Parameters
     ----------
@@ -60,8 +63,7 @@ def outputs_of(
     """
     dropped_parts = round(LEVELS * dropout) if seeds is not None else 0
     drawn = np.zeros(len(parameters[0]), np.int64) if seeds is None else seeds.numpy()
-    outputs: Tensor = _Outputs.apply(inputs, drawn, dropped_parts, *parameters)  # type: ignore[no-untyped-call]
-    return outputs
+    return _Outputs.apply(inputs, drawn, dropped_parts, *parameters)  # type: ignore
 
 
 def losses_of(
@@ -204,7 +206,7 @@ class _Losses(torch.autograd.Function):
 
 
 @compiled
-def squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+def squared_error(outputs, targets, gradient):
     """Mean of (o - t)²; a `Criterion` of one output."""
     total = 0.0
     count = len(targets)
@@ -216,7 +218,7 @@ def squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+def gaussian_likelihood(outputs, targets, gradient):
     """Mean of (log v + (o - t)²/v)/2 with v = softplus(o₂) + 1e-6; a `Criterion` of two outputs.
 
     Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty
@@ -236,7 +238,7 @@ def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-
 
 
 @compiled
-def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out):  # type: ignore[no-untyped-def]
+def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out):
     np.dot(x, w1, first)
     _activate(first, b1, seed, 0, dropped_parts)
     np.dot(first, w2, second)
@@ -248,7 +250,7 @@ def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out)
 
 
 @compiled
-def _backward(  # type: ignore[no-untyped-def]
+def _backward(
     x, w2, w3, dropped_parts, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar
 ):
     np.dot(second.T, up, w3_bar)
@@ -264,9 +266,10 @@ def _backward(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _activate(values, bias, seed, layer, dropped_parts):  # type: ignore[no-untyped-def]
-    """relu(values + bias), masked and scaled, in place; eight bytes of every random word decide of
-    eight values (SplitMix64).
+def _activate(values, bias, seed, layer, dropped_parts):
+    """relu(values + bias), masked and scaled, in place.
+
+    Eight bytes of every random word decide of eight values (SplitMix64).
     """
     rows, columns = values.shape
     scale = values.dtype.type(256.0 / (256 - dropped_parts))
@@ -295,7 +298,7 @@ def _activate(values, bias, seed, layer, dropped_parts):  # type: ignore[no-unty
 
 
 @compiled
-def _gate(values, bars, dropped_parts, bias_bar):  # type: ignore[no-untyped-def]
+def _gate(values, bars, dropped_parts, bias_bar):
     """Adjoint of `_activate`, in place; that of the bias is written."""
     scale = values.dtype.type(256.0 / (256 - dropped_parts))
     zero = values.dtype.type(0.0)
@@ -308,7 +311,7 @@ def _gate(values, bars, dropped_parts, bias_bar):  # type: ignore[no-untyped-def
 
 
 @compiled
-def _summed(bars, total):  # type: ignore[no-untyped-def]
+def _summed(bars, total):
     """Write the sum over samples, (B, O) -> (O,)."""
     total[:] = total.dtype.type(0.0)
     for row in range(bars.shape[0]):

@@ -22,14 +22,14 @@ STATES = 8
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
-# lagged signals: those of the axle's equation, then those of the candidates' residuals
-LAGS = 15
+# lagged signals: those of the axle's equation, those of the candidates' residuals, and the mean square of the axle's
+# error s e over the last moments
+LAGS = 16
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
-SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED = range(10, LAGS)
-# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v, and the mean
-# square of the residual of v' over the last moments
-MOMENTS = 9
-SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST, RECENT = range(MOMENTS)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE = range(10, LAGS)
+# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, and last v
+MOMENTS = 8
+SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(MOMENTS)
 # rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
 AT = np.array(
     [
@@ -46,6 +46,9 @@ SHARED = STATES + 50
 ROWS = STATES + 58  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
+MAX_ERROR_OF_PLACE = (
+    1.0  # of |e|, in deviations of its prior, above which b stays: a slide is not the unit's place
+)
 
 
 class State(NamedTuple):
@@ -54,8 +57,8 @@ class State(NamedTuple):
     means: FloatArray  # (J, 8)
     covariances: FloatArray  # (J, 8, 8)
     log_weights: FloatArray  # (J,)
-    lags: FloatArray  # (15,)
-    candidates: FloatArray  # (3, 9)
+    lags: FloatArray  # (16,)
+    candidates: FloatArray  # (3, 8)
     weights: FloatArray  # (3,), of the candidates
     last: FloatArray  # (4,), the sample before
     window: FloatArray  # (N, 4), the last samples, the oldest first; the first sample stands for those before it
@@ -165,20 +168,24 @@ def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-
 def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-untyped-def]
     """Take a measurement whose covariances with the states are known; returns half the square of its normalised residual.
 
-    Beyond ``gate`` deviations a residual is cut off; parameters stay where the filter does not learn (a Schmidt-Kalman update).
+    Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: all parameters where the filter does not
+    learn, b where the axle slides.
     """
     lanes = width(f)
     limit = gate * root(variance)
     inverse = 1.0 / variance
     residual = most(least(residual, limit), -limit)
+    slides = abs(load(f, ERROR * lanes)) > MAX_ERROR_OF_PLACE
     for i in range(states):
         held = not learns and LEAKAGE <= i <= COMPLIANCE
         gain = load(f, (SHARED + i) * lanes) * inverse
+        step = choose(slides, 0.0 * gain, gain) if i == REAR else gain
         if not held:
-            store(f, i * lanes, load(f, i * lanes) + gain * residual)
+            store(f, i * lanes, load(f, i * lanes) + step * residual)
         for c in range(i, states):
             if not (held and c <= COMPLIANCE):
-                store(f, AT[i, c], load(f, AT[i, c]) - gain * load(f, (SHARED + c) * lanes))
+                share = step if c == i else gain
+                store(f, AT[i, c], load(f, AT[i, c]) - share * load(f, (SHARED + c) * lanes))
     return 0.5 * residual * residual * inverse
 
 
@@ -249,7 +256,7 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
 
 
 @part()
-def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, g_recent, moving):  # type: ignore[no-untyped-def]
+def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
     """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u and of u' = ax + ω v."""
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
@@ -278,7 +285,6 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, g_recent
         leakage = min(
             max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage
         )
-        one[RECENT] += g_recent * ((y - leakage * ay) ** 2 - one[RECENT])
         square_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0)
         score = n.lateral_power * math.log(
             square_y / time + floor
@@ -306,7 +312,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
     g = -math.expm1(-n.dt / n.axle_lag)
     g_1 = -math.expm1(-n.dt / n.residual_time)
     g_slow = -math.expm1(-n.dt / n.slow_time)
-    g_recent = -math.expm1(-n.dt / n.band_time)
+    g_band = -math.expm1(-n.dt / n.band_time)
     lags = state.lags
     log_weights = state.log_weights
     lanes = width(grips)
@@ -410,12 +416,11 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
             n,
             g_1,
             g_slow,
-            g_recent,
             moving,
         )
         _at_point(bank, n.is_moved, n.point, sample[0], moments)
-        moments[2] = (size * states[ERROR]) ** 2
-        _combine(values, state.weights, state.candidates, states, moments, sample, n, found[t])
+        lags[SLIDE] += g_band * ((size * states[ERROR]) ** 2 - lags[SLIDE])
+        _combine(values, state.weights, lags[SLIDE], states, moments, sample, n, found[t])
         for i in range(4):
             last[i] = sample[i]
     lags[PREDICTED] = series[4, len(samples)]
@@ -497,7 +502,7 @@ def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _combine(values, weights, candidates, states, moments, sample, n, found):  # type: ignore[no-untyped-def]
+def _combine(values, weights, slide, states, moments, sample, n, found):  # type: ignore[no-untyped-def]
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     shares = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
@@ -509,11 +514,9 @@ def _combine(values, weights, candidates, states, moments, sample, n, found):  #
     values[STEADY] += shift
     mean = shares[0] * values[0] + shares[1] * values[1] + shares[2] * values[2]
     spread = 0.0
-    recent = 0.0
     for c in range(CANDIDATES):
         spread += shares[c] * (values[c] - mean) ** 2
-        recent += shares[c] * candidates[c, RECENT]
     found[0] = mean
     found[1] = n.variance_share * ((1.0 - shares[2]) * moments[1] + shares[2] * steady + spread)
-    found[1] += n.residual_share * recent + (n.angle_floor * sample[1]) ** 2
-    found[1] += (n.point_deviation * sample[0]) ** 2 + n.error_share * moments[2]
+    found[1] += n.error_share * slide + (n.angle_floor * sample[1]) ** 2
+    found[1] += (n.point_deviation * sample[0]) ** 2

@@ -1,5 +1,6 @@
-"""Members on several threads: compiled loops that release Python's lock, each thread on its own
-members.
+"""Members on several threads.
+
+Compiled loops that release Python's lock, each thread on its own members.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ _allowed = ContextVar("_allowed", default=0)
 
 @contextmanager
 def threads_for_members() -> Iterator[None]:
-    """Within, `over_members` has the threads that torch was allowed, and torch one: its small
-    operations would wait for threads held up.
+    """Within, `over_members` has the threads that torch was allowed, and torch one.
+
+    Its small operations would wait for threads held up.
     """
     import torch
 
@@ -67,7 +69,6 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="vehest-members")
 
 
-if hasattr(
-    os, "register_at_fork"
-):  # a forked process does not inherit the threads; Windows forks none
+# a forked process does not inherit the threads; Windows forks none
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,1 +1,1 @@
-"""What network estimators share: over windows, over all samples so far, and over single instants."""
+"""Bases of network estimators over windows, over all samples so far, and over single instants."""

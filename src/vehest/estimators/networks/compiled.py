@@ -1,5 +1,6 @@
-"""Compiled recursions (`vehest.estimators.kernels.recursion`) as torch uses them: differentiable,
-and trained several steps at a time.
+"""Compiled recursions (`vehest.estimators.kernels.recursion`) as torch uses them.
+
+Differentiable, and trained several steps at a time.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from vehest.estimators.kernels.recursion import Recursion
 
 
 class CompiledNetwork(ABC):
-    """What a network with a `recursion` has for `vehest.training.members`."""
+    """Base of networks with a compiled `recursion`, for `vehest.training.members`."""
 
     @abstractmethod
     def recursion(self) -> Recursion:
@@ -26,8 +27,7 @@ class CompiledNetwork(ABC):
     ) -> Tensor:
         """Predictions of M members, each on its own windows, (M, B)."""
         flat = torch.cat([values.reshape(len(values), -1) for values in parameters.values()], 1)
-        result: Tensor = _Predict.apply(flat, prepared, starts, self.recursion())  # type: ignore[no-untyped-call]
-        return result
+        return _Predict.apply(flat, prepared, starts, self.recursion())  # type: ignore
 
     def compiled_descent(
         self,
@@ -39,8 +39,10 @@ class CompiledNetwork(ABC):
         batch: int,
         *adam_options: Any,
     ) -> Tensor:
-        """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq``
-        as torch names them, and ``average``.
+        """See `Recursion.descend`.
+
+        ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq`` as torch names them, and
+        ``average``.
         """
         rate, bounds, averaging = adam_options
         names = ("exp_avg", "exp_avg_sq", "average" if "average" in moments else "exp_avg")

@@ -1,5 +1,6 @@
-"""The network of the KS-NN in PyTorch, with its compiled recursion
-(`vehest.estimators.kernels.ksnn`) differentiable.
+"""The network of the KS-NN in PyTorch, its readable definition.
+
+The compiled recursion is `vehest.estimators.kernels.ksnn`, differentiable here.
 """
 
 from __future__ import annotations
@@ -90,8 +91,9 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
             parameters["beta"][..., 0].clamp_(min=bound, max=2.0 - bound)
 
     def activations(self, yaw_rate: Tensor) -> Tensor:
-        """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the
-        last one alone.
+        """Weights φ of the local models (Fig. 3), (...) -> (..., P).
+
+        Beyond the last centre the last one alone.
         """
         position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(
             max=self.settings.n_local - 1

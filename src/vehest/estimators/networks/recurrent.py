@@ -1,4 +1,4 @@
-"""What the GRU and LSTM benchmarks share: gates with one bias each and a linear read-out."""
+"""Base of the GRU and LSTM benchmarks: gates with one bias each and a linear read-out."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class HiddenStateEstimator(Network):
 
     @property
     def full_title(self) -> str:
-        """With the number of states."""
+        """Title with the number of states."""
         return f"{self.title}, {self.n_states} states"
 
 

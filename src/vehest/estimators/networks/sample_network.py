@@ -1,5 +1,6 @@
-"""What networks share that map the measurements of one instant to a sideslip angle: inputs, the
-network, its samples, its weights.
+"""Base of networks that map the measurements of one instant to a sideslip angle.
+
+Inputs, the network, its samples, its weights.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ without.
 
 Normalisation = Literal["range", "standard"]
 NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
-"""What a normalisation adds to the name of a variant."""
+"""Normalisation -> suffix of the variant's name."""
 
 CHUNK = 50_000  # samples that are estimated at a time
 STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
@@ -62,13 +63,14 @@ class SampleNetworkEstimator(Network):
         super().check()
         if min(self.hidden) < 1 or max(self.hidden) > MAX_WIDTH:
             raise ConfigurationError(
-                f"estimator.hidden must be the widths of two layers, at most {MAX_WIDTH}, such as [250, 125], not {list(self.hidden)}"
+                f"estimator.hidden must be the widths of two layers, at most {MAX_WIDTH}, such as "
+                f"[250, 125], not {list(self.hidden)}"
             )
 
     def prepare_network(
         self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
     ) -> tuple[SampleNetwork, Samples, Samples]:
-        """A new network with initial weights, a seed a member, and samples of training and
+        """A new network with initial weights, one seed a member, and samples of training and
         validation as it takes them.
         """
         raw, judged = (
@@ -90,8 +92,9 @@ class SampleNetworkEstimator(Network):
         seeds: Sequence[int],
         minimum_speed: float = -np.inf,
     ) -> FitRecord:
-        """Train members, each of a seed, on samples in random order; squared errors are in rad²,
-        other losses in the network's units.
+        """Train members, each of a seed, on samples in random order.
+
+        Squared errors are in rad², other losses in the network's units.
         """
         network, train, validation = self.prepare_network(data, training, seeds, minimum_speed)
         unit = network.unit**2 if criterion is squared_error else 1.0
@@ -108,13 +111,14 @@ class SampleNetworkEstimator(Network):
             lambda: network.validation_losses(validation, criterion) * unit,
         )
         return record_of_phases(
-            train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
+            train_phases([phase], self.fit_seed, context, index, training.checkpoint_seconds)
         )
 
 
 class SampleNetwork(nn.Module):
-    """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1
-    convolutions over time.
+    """M networks of two hidden layers with rectifiers and dropout, each sample by itself.
+
+    1x1 convolutions over time.
 
     Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0
     and a deviation of 1; a constant one becomes 0. Targets are divided by their root mean square in
@@ -173,8 +177,9 @@ class SampleNetwork(nn.Module):
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
 
     def scaled(self, inputs: Tensor) -> Tensor:
-        """Inputs as the network takes them, (..., C), of measured ones in SI units; those of
-        training lie in 0 … 1.
+        """Inputs as the network takes them, (..., C), of measured ones in SI units.
+
+        Those of training lie in 0 … 1.
         """
         return (inputs - self.input_low) / self.input_span
 
@@ -198,7 +203,7 @@ class SampleNetwork(nn.Module):
         )
 
     def outputs(self, inputs: FloatArray) -> NDArray[Any]:
-        """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's own units."""
+        """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's units."""
         pieces = []
         with torch.no_grad():
             for first in range(0, len(inputs), CHUNK):
@@ -249,7 +254,8 @@ def learnt_samples(
     fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
     if not fast.any():
         raise DataError(
-            f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s"
+            f"no sample of the training of estimator '{estimator}' is faster than "
+            f"{minimum_speed:g} m/s"
         )
     inputs = np.concatenate([recording.stack(channels) for recording in recordings])
     return inputs[fast], np.concatenate(
@@ -258,7 +264,7 @@ def learnt_samples(
 
 
 def reference_sideslip(recording: Recording) -> FloatArray:
-    """What is learnt and scored: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
+    """Reference of training and scores: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
     return np.arctan2(recording["vy_ref"], recording["vx"])
 
 

@@ -1,5 +1,6 @@
-"""What recurrent networks share that estimate a car's velocities from all samples so far: training,
-estimating, running online.
+"""Base of recurrent networks that estimate a car's velocities from all samples so far.
+
+It trains them on sequences, estimates, and runs them online.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ CHUNK = 10_000  # samples that are estimated at a time
 TRIAL = Trial(
     11,
     "recurrent networks over all samples so far; minutes",
-    "estimator.inputs=[yaw_rate,ax,ay,vx,steer] estimator.outputs=[vy] estimator.rate_hz=20 training.phase.max_epochs=100",
+    "estimator.inputs=[yaw_rate,ax,ay,vx,steer] estimator.outputs=[vy] estimator.rate_hz=20 "
+    "training.phase.max_epochs=100",
     samples=300,
 )
 
@@ -50,8 +52,9 @@ State = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class SequenceSettings(Group):
-    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024,
-    Section IV).
+    """Training of recurrent networks on sequences cut from recordings.
+
+    Source: Węgrzynowski et al. 2024, Section IV.
     """
 
     group = "training"
@@ -71,8 +74,9 @@ class SequenceSettings(Group):
     )
     truncate_steps: int = setting(
         0,
-        "samples that gradients reach back: drives are then cut whole into sequences of sequence_steps and less, with a step after every "
-        "so many samples, the hidden state carried on; 0: to the start of the sequence, and remainders are left out",
+        "samples that gradients reach back: drives are then cut whole into sequences of "
+        "sequence_steps and less, with a step after every so many samples, the hidden state "
+        "carried on; 0: to the start of the sequence, and remainders are left out",
         least=0,
     )
     mirrored: float = setting(
@@ -84,7 +88,8 @@ class SequenceSettings(Group):
     batch_size: int = setting(4, "sequences in a batch", least=1)
     loss_limit: float = setting(
         0.0,
-        "error of each output beyond which its square is continued by its tangent (Huber's loss), in the output's unit; 0: none",
+        "error of each output beyond which its square is continued by its tangent (Huber's "
+        "loss), in the output's unit; 0: none",
         least=0.0,
     )
     weight_vx: float = setting(0.2225, "of the squared error of vx in the loss", least=0.0)
@@ -101,7 +106,8 @@ class SequenceSettings(Group):
         ):
             if getattr(self, name) <= dropped:
                 raise ConfigurationError(
-                    f"training.{name} must be more than dropped_steps ({dropped}), not {getattr(self, name)}"
+                    f"training.{name} must be more than dropped_steps ({dropped}), not "
+                    f"{getattr(self, name)}"
                 )
 
     @property
@@ -127,8 +133,10 @@ class VelocityNetwork(StandardisedNetwork):
         super().__init__(len(settings.inputs), (len(settings.outputs),))
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden
-        state for gates; biases alike.
+        """Draw initial weights.
+
+        Uniform within 1/√n, n the size of what feeds a layer, the hidden state for gates; biases
+        alike.
         """
         with torch.no_grad():
             for module in self.modules():
@@ -146,8 +154,7 @@ class VelocityNetwork(StandardisedNetwork):
     def forward(
         self, measured: Tensor, state: State, mask: Tensor | None = None
     ) -> tuple[Tensor, State]:
-        """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the
-        last, of measurements (B, T, C) [SI].
+        """Velocities (B, T, O) [m/s, rad/s] of measurements (B, T, C) [SI], and the last state.
 
         The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B,
         T, H), is what the hidden state is multiplied by on its way out, none outside training.
@@ -215,7 +222,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         for name in ("inputs", "outputs"):
             if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
                 raise ConfigurationError(
-                    f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}"
+                    f"estimator.{name} must be a list of different channels, not "
+                    f"{getattr(self, name)!r}"
                 )
         for name in self.inputs:
             try:
@@ -224,11 +232,13 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
                 raise ConfigurationError(f"estimator.inputs: {error}") from None
             if reference:
                 raise ConfigurationError(
-                    f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees"
+                    f"estimator.inputs: '{name}' comes from a reference sensor, which no "
+                    "estimator may read"
                 )
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
             raise ConfigurationError(
-                f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}"
+                f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not "
+                f"{', '.join(self.outputs)}"
             )
 
     def fit_member(
@@ -241,9 +251,11 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         )
         network = self.network = self.new_network().to(getattr(torch, training.dtype))
         network.standardise(data.train, self.inputs, self.learns_from)
-        network.reset(torch.Generator().manual_seed(self._seed))
+        network.reset(torch.Generator().manual_seed(self.fit_seed))
         phase = _phase(network, self.settings, training, train, validation)
-        (record,) = train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
+        (record,) = train_phases(
+            [phase], self.fit_seed, context, index, training.checkpoint_seconds
+        )
         metrics = {
             "best_epoch": record.best_epoch,
             "best_validation_loss": record.best_loss,
@@ -255,9 +267,10 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             record.train_loss, record.validation_loss, metrics, record.interrupted
         )
 
-    def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
-        """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read,
-        and 0 for the lateral velocity.
+    def measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """Outputs as measured, (T, O).
+
+        They are vx, the yaw rate where it is read, and 0 for the lateral velocity.
         """
         n = len(channels["vx"])
         columns = [
@@ -268,7 +281,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> State:
         """State of the network that starts from given velocities, else measured ones."""
-        measured = self._measured_velocities(
+        measured = self.measured_velocities(
             {
                 name: np.array([value])
                 for name, value in zip(self.channels, sample.tolist(), strict=True)
@@ -318,15 +331,13 @@ class _Batch(NamedTuple):
     inputs: Tensor  # measurements, (B, T, C)
     targets: Tensor  # references, (B, T, O)
     mask: Tensor | None = None  # of dropout, (B, T, H)
-    counted: Tensor | None = (
-        None  # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
-    )
-    goes_on: bool = (
-        False  # whether the batch continues the one before, whose hidden state it starts from
-    )
+    # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
+    counted: Tensor | None = None
+    # whether the batch continues the one before, whose hidden state it starts from
+    goes_on: bool = False
 
     def stretch(self, first: int, end: int) -> _Batch:
-        """Its samples from ``first`` to ``end``."""
+        """The batch restricted to samples ``first`` to ``end``."""
         parts = {name: getattr(self, name) for name in ("inputs", "targets", "mask", "counted")}
         return self._replace(
             goes_on=first > 0,
@@ -335,9 +346,7 @@ class _Batch(NamedTuple):
 
 
 class _Drives:
-    """Recordings one after another as tensors, (N, …), from which sequences are cut by their first
-    samples.
-    """
+    """Recordings one after another as tensors, (N, …), from which sequences are cut."""
 
     def __init__(
         self,
@@ -349,7 +358,7 @@ class _Drives:
         self.names = [recording.id for recording in recordings]
         self.lengths = [len(recording) for recording in recordings]
         parts = (
-            [estimator._measured_velocities(recording.channels) for recording in recordings],
+            [estimator.measured_velocities(recording.channels) for recording in recordings],
             [recording.stack(estimator.inputs) for recording in recordings],
             [recording.stack(estimator.learns_from) for recording in recordings],
         )
@@ -364,13 +373,14 @@ class _Drives:
         mask: Tensor | None = None,
         counted: Tensor | None = None,
     ) -> _Batch:
-        """Sequences of the samples at ``places``, (T,) or (B, T), after the rows ``firsts`` (B,)."""
+        """Sequences of the samples at ``places``, (T,) or (B, T), after rows ``firsts`` (B,)."""
         rows = firsts.unsqueeze(1) + places
         return _Batch(self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted)
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
-        """All drives, cut whole at random places into pieces of ``steps`` samples and less: first
-        row and length of each, (N, 2).
+        """All drives, cut whole at random places into pieces of ``steps`` samples and less.
+
+        First row and length of each, (N, 2).
         """
         spans = []
         offset = 0
@@ -382,8 +392,9 @@ class _Drives:
         return torch.tensor(spans)
 
     def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
-        """Pieces of different lengths side by side, as long as the longest; what is beyond a
-        piece's end does not count.
+        """Pieces of different lengths side by side, as long as the longest.
+
+        What is beyond a piece's end does not count.
         """
         firsts, lengths = pieces.unbind(1)
         places = torch.arange(int(lengths.max()))
@@ -392,8 +403,9 @@ class _Drives:
         return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
 
     def for_validation(self, training: SequenceSettings) -> list[_Batch]:
-        """Sequences without overlap from the start of each recording; of one that is too short, all
-        of it.
+        """Sequences without overlap from the start of each recording.
+
+        Of one that is too short, all of it.
         """
         batches = []
         offset = 0
@@ -401,8 +413,9 @@ class _Drives:
             steps = min(length, training.validation_steps)
             if steps <= training.settling_steps:
                 raise DataError(
-                    f"recording '{name}' is {length} samples long: too short to validate on with training.dropped_steps "
-                    f"{training.settling_steps}; choose a longer range in conf/split"
+                    f"recording '{name}' is {length} samples long: too short to validate on with "
+                    f"training.dropped_steps {training.settling_steps}; choose a longer range in "
+                    "conf/split"
                 )
             batches.append(
                 self.cut(offset + steps * torch.arange(length // steps), torch.arange(steps))
@@ -418,7 +431,7 @@ def _phase(
     train: _Drives,
     validation: _Drives,
 ) -> Phase:
-    """Squared errors, each output with its weight, over sequences at random places of the drives."""
+    """Weighted squared errors over sequences at random places of the drives."""
     steps = training.sequence_steps
     truncated = training.truncate_steps
     dtype = train.inputs.dtype
@@ -427,7 +440,8 @@ def _phase(
             f"'{name}' {length}" for name, length in zip(train.names, train.lengths, strict=True)
         )
         raise DataError(
-            f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it"
+            f"training.sequence_steps is {steps}, but no training recording is as long: "
+            f"{lengths}; lower it"
         )
     judged = validation.for_validation(training)
     weights = torch.tensor(

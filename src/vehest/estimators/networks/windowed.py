@@ -1,4 +1,4 @@
-"""What networks over windows of past samples share: fitting, estimating, running online, saving."""
+"""Base of networks over windows of past samples: fitting, estimating, running online, saving."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ TARGET = "vy_ref"
 
 
 class WindowedEstimator(Network):
-    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et
-    al. 2023, Fig. 1).
+    """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1.
+
+    Source: Da Lio et al. 2023, Fig. 1.
 
     The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it
     may have besides, a compiled recursion for example, is in `vehest.training.members`.
@@ -48,8 +49,9 @@ class WindowedEstimator(Network):
     window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
-        """A network that knows the ranges of the training recordings: means and deviations if it is
-        a `StandardisedNetwork`.
+        """A network that knows the ranges of the training recordings.
+
+        Means and deviations if it is a `StandardisedNetwork`.
         """
         from vehest.estimators.networks.standardised import StandardisedNetwork
 
@@ -89,64 +91,68 @@ class WindowedEstimator(Network):
             for part in (data.train, data.validation)
         )
         started = (
-            first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
+            first.weights_of_model(Path(training.start_from))
+            if training.start_from is not None
+            else {}
         )
         for member in members:
-            member.network = member._seeded_network(list(data.train), dtype)
+            member.network = member.seeded_network(list(data.train), dtype)
             if started:
                 member.network.load_state_dict(
                     {name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()}
                 )
-        seeds = [member._seed for member in members]
+        seeds = [member.fit_seed for member in members]
         compiled = training.compiled and hasattr(first.network, "compiled_descent")
         with threads_for_members() if compiled else nullcontext():
             return train_members(
                 [member.network for member in members], seeds, train, validation, training, context
             )
 
-    def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
+    def seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
         from torch import Generator
 
         from vehest.training.members import random_numbers
 
-        with random_numbers(self._seed):
+        with random_numbers(self.fit_seed):
             network = self.network_for(train)
         _check_state(network)
         network = network.to(dtype)
         reset = getattr(network, "reset", None)
         if reset is not None:
-            reset(Generator().manual_seed(self._seed))
+            reset(Generator().manual_seed(self.fit_seed))
         return network
 
-    def _weights_of(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-        """Weights and ranges of another model of the same family and settings, to start a training
-        from (fine-tuning).
-        """
+    def weights_of_model(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
+        """Weights and ranges of a model of the same family and settings, for fine-tuning."""
         start_model = load_model(folder)
         if (start_model.name, start_model.settings) != (self.name, self.settings):
             raise ConfigurationError(
-                f"training.start_from: '{folder.name}' is {start_model.full_title} with {asdict(start_model.settings)}; "
-                f"training starts from a model of the same family and settings, here {self.full_title} with {asdict(self.settings)}"
+                f"training.start_from: '{folder.name}' is {start_model.full_title} with "
+                f"{asdict(start_model.settings)}; training starts from a model of the same family "
+                f"and settings, here {self.full_title} with {asdict(self.settings)}"
             )
         return start_model.weights()
 
-    def _estimate_one(
+    def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
+        """Estimate a checked recording; raises `ConfigurationError` for an initial state."""
         if initial_state is not None:
             raise ConfigurationError(
-                f"estimator '{self.name}' has no state to start from: it sees a window of samples only; set evaluation.initial_state=false"
+                f"estimator '{self.name}' has no state to start from: it reads a window of samples "
+                "only; set evaluation.initial_state=false"
             )
         vy = np.full(len(recording), np.nan)
         starts = window_starts(len(recording), self.window)
         if len(starts):
-            vy[self.window :] = self._predict(recording.stack(self.channels), starts)
+            vy[self.window :] = self.predict(recording.stack(self.channels), starts)
         return self._wrapped(recording, vy)
 
-    def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
-        """Lateral velocity [m/s] one step after the windows of measurements (T, C) that begin at
-        ``starts``, (B,).
+    def predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
+        """Lateral velocity [m/s] one step after windows of measurements (T, C), (B,).
+
+        ``starts``, (B,), are the first rows of the windows.
         """
         import torch
 
@@ -186,7 +192,7 @@ class WindowStepper(Stepper):
             return {"vy": float("nan")}
         return {
             "vy": float(
-                self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0]
+                self._estimator.predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0]
             )
         }
 
@@ -199,11 +205,12 @@ def _check_state(network: nn.Module) -> None:
     for name, module in network.named_modules():
         if getattr(module, "track_running_stats", False):
             raise ConfigurationError(
-                f"{kind}: layer '{name}' ({type(module).__name__}) keeps running statistics, which members do not have; "
-                f"use LayerNorm, or track_running_stats=False"
+                f"{kind}: layer '{name}' ({type(module).__name__}) keeps running statistics, "
+                "which batched trainings do not have; use LayerNorm, or track_running_stats=False"
             )
     for name, tensor in network.state_dict().items():
         if not tensor.is_floating_point():
             raise ConfigurationError(
-                f"{kind}: buffer '{name}' is {tensor.dtype}, no floating point; register it with persistent=False"
+                f"{kind}: buffer '{name}' is {tensor.dtype}, no floating point; register it with "
+                "persistent=False"
             )

@@ -169,7 +169,7 @@ class Explorer {
     };
     const moved = (share) => this.look(this.view.map((end) => end + share * (this.view[1] - this.view[0])));
     add("whole range", () => this.look(this.whole));
-    add(`busiest ${Math.round(zoom[1] - zoom[0])} s`, () => this.look(zoom));
+    add(`${Math.round(zoom[1] - zoom[0])} s of largest sideslip`, () => this.look(zoom));
     add("\u2212", () => scaled(2), "zoom out");
     add("+", () => scaled(0.5), "zoom in");
     add("\u25c0", () => moved(-0.5), "earlier");

@@ -1,1 +1,3 @@
-"""`vehest new`: logs -> inspect -> questions -> dataset -> write -> conf/dataset, conf/split and pipelines."""
+"""`vehest new`: logs -> inspect -> questions -> dataset -> write -> conf/dataset, conf/split and
+pipelines.
+"""

@@ -1,4 +1,6 @@
-"""Makes a data set of proposals and reads it once: Examined -> configuration -> recordings, checks, delays, steering ratio -> Draft."""
+"""Makes a data set of proposals and reads it once: Examined -> configuration -> recordings, checks,
+delays, steering ratio -> Draft.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,10 @@ POLICIES = {
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
 MIN_GAP_SECONDS = 0.05  # s
-GAPS = "it has missing samples, which are interpolated, or cut out beyond one second, only in a log with times"
+GAPS = (
+    "it has missing samples, which are interpolated, or cut out beyond one second, only in a log "
+    "with times"
+)
 CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
 CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
@@ -122,9 +127,10 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        causes = f"duplicates, repeated names, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
+        causes = f"duplicates, text, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
         notes.append(
-            f"data rows of '{stem}' left out by drop_rows ({causes}): {counted([str(row) for row in rows])}"
+            f"data rows of '{stem}' left out by drop_rows ({causes}): "
+            f"{counted([str(row) for row in rows])}"
         )
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
@@ -140,8 +146,10 @@ def draft(examined: Examined) -> Draft:
     )
     if ratio and used_ratio is None:
         notes.append(
-            f"'steer' is left out: the steering ratio estimated from slow corners is {ratio[0]:.3g} ± {ratio[1]:.2g}, "
-            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by --steering-ratio to add it"
+            "'steer' is left out: the steering ratio estimated from slow corners is "
+            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, "
+            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by "
+            "--steering-ratio to add it"
         )
     crawl_speed = max(map(_crawl_speed, recordings))
     if crawl_speed:
@@ -173,7 +181,9 @@ def draft(examined: Examined) -> Draft:
 
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
-    """The data set with the strictest clock that all files keep and that has a plain rate, as a downsampling needs; its recordings."""
+    """The data set with the strictest clock that all files keep and that has a plain rate, as a
+    downsampling needs; its recordings.
+    """
     for policy in POLICIES.get(dataset["source"], ()):
         with suppress(DataError):
             with_clock = dataset | {"clock": policy}
@@ -194,7 +204,9 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
 
 
 def _crawl_speed(recording: Recording) -> float:
-    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout or no speed is known."""
+    """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout or no
+    speed is known.
+    """
     name = speed_of_reference(recording)
     if not {"sideslip_ref", name} <= set(recording.channels):
         return 0.0
@@ -218,12 +230,13 @@ def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterat
         if len(seconds) > 1:
             yield (
                 f"'{file}' is split into {len(seconds)} recordings at {' and '.join(causes)}; "
-                f"a command on a single recording uses the longest, {max(seconds):.0f} of {sum(seconds):.0f} s"
+                f"a command on a single recording uses the longest, {max(seconds):.0f} of "
+                f"{sum(seconds):.0f} s"
             )
 
 
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
-    """Findings of the longest recording, and contradictions in the longest one of each other file."""
+    """Findings of the longest recording, and contradictions in the longest of each other file."""
     findings = [
         ("", finding) for finding in checks_of_recording(longest) if finding.check in REMARKS
     ]
@@ -245,7 +258,8 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
             if low > MIN_GAIN_FACTOR * high_of_longest or low_of_longest > MIN_GAIN_FACTOR * high:
                 factor = math.sqrt(low * high / (low_of_longest * high_of_longest))
                 unlike.append(
-                    f"{name}: in '{recording.id}' its gain in turns is {factor:.2g} times that in '{longest.id}'; "
+                    f"{name}: in '{recording.id}' its gain in turns is {factor:.2g} times that in "
+                    f"'{longest.id}'; "
                     "if it is another car, create a data set for each"
                 )
     worded = [
@@ -259,7 +273,9 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
 
 
 def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
-    """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over yaw_rate/vx beside understeer."""
+    """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over
+    yaw_rate/vx beside understeer.
+    """
     gains: dict[str, list[float]] = {}
     if not {"vx", "yaw_rate"} <= set(recording.channels):
         return {}
@@ -392,7 +408,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 
 
 def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
-    """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
+    """A channel's entry; with a factor where it is in another unit than by the header, which its
+    source holds against the entry.
+    """
     unit = proposal.unit
     factor = proposal.factor
     si = CHANNELS[proposal.channel].unit
@@ -417,7 +435,9 @@ def _rows_written_twice(log: Log) -> list[int]:
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
-    """Whether a column lacks samples that neither lines bridge nor pauses cut out; a recording with such gaps cannot be resampled."""
+    """Whether a column lacks samples that neither lines bridge nor pauses cut out; a recording with
+    such gaps cannot be resampled.
+    """
     signal = next(signal for signal in log.columns if signal.name == column)
     measured_rows = np.flatnonzero(np.isfinite(signal.values))
     if log.source in TABLES:
@@ -434,7 +454,9 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
-    """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without any, 0 in a row with one."""
+    """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without
+    any, 0 in a row with one.
+    """
     values = next(signal.values for signal in log.columns if signal.name == column)
     seconds = (
         log.seconds
@@ -506,7 +528,9 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
 
 
 def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:
-    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of the valid samples of a column with times of its own."""
+    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of the valid samples of a
+    column with times of its own.
+    """
     assert column.stamps is not None
     stamps = column.stamps[np.isfinite(column.values)]
     gaps = np.diff(stamps)
@@ -514,7 +538,9 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 
 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
-    """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
+    """The transform that bridges impossible samples, as far to either side as the slowest signal
+    was interpolated, if there are any.
+    """
     channels = [
         (CHANNELS[name], samples)
         for recording in recordings
@@ -549,7 +575,8 @@ def _transforms(
 ) -> list[dict[str, Any]]:
     """Transforms that make the channels that estimators want.
 
-    A reference that is late is put on the others' clock; a measured channel is not, since an estimator in the car would get it late, too.
+    A reference that is late is put on the others' clock; a measured channel is not, since an
+    estimator in the car would get it late, too.
     """
     references = {name: delay.delay for name, delay in late.items() if CHANNELS[name].is_reference}
     transforms: list[dict[str, Any]] = [

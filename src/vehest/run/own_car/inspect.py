@@ -1,4 +1,6 @@
-"""Inspects logs that no data set describes yet: files -> surveys -> evidence on one clock -> proposals of channels, units and signs."""
+"""Inspects logs that no data set describes yet: files -> surveys -> evidence on one clock ->
+proposals of channels, units and signs.
+"""
 
 from __future__ import annotations
 
@@ -53,13 +55,20 @@ LAYOUT = {
 }
 """Options of a table's layout with their defaults."""
 VEHICLE = {
-    "wheelbase": "wheelbase [m], if known (for the self-calibrating filter, the steering ratio and the data_sheet baseline)",
+    "wheelbase": (
+        "wheelbase [m], if known (for the self-calibrating filter, the steering ratio and the "
+        "data_sheet baseline)"
+    ),
     "mass": "mass [kg], if known (with the wheelbase, for single-track filters)",
-    "steering_ratio": "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)",
+    "steering_ratio": (
+        "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)"
+    ),
 }
 """Values of the car that no log holds, as questions."""
 IMU_PLACE = "imu_to_rear_axle"
-"""Another one, asked in any case: the distance of the inertial unit from the rear axle, negative behind it [m]."""
+"""Another one, asked in any case: the distance of the inertial unit from the rear axle, negative
+behind it [m].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +154,15 @@ def inspect(
             proposal for proposal in proposals.channels if proposal.column not in columns_of_log
         ]
         notes = [
-            f"'{proposal.column}' ({proposal.channel}) is left out: it is missing or empty in '{log.file}'"
+            f"'{proposal.column}' ({proposal.channel}) is left out: it is missing or empty in "
+            f"'{log.file}'"
             for proposal in missing
         ]
         remaining = [proposal for proposal in proposals.channels if proposal not in missing]
         if missing and not remaining:
             raise DataError(
-                f"'{log.file}' has none of the columns that are channels in '{longest.file}'; use files with the same columns"
+                f"'{log.file}' has none of the columns that are channels in '{longest.file}'; use "
+                "files with the same columns"
             )
         proposals = proposals.keeping(remaining, notes)
         for column in longest.columns:
@@ -159,9 +170,13 @@ def inspect(
                 column.name in {proposal.column for proposal in remaining}
                 and columns_of_log[column.name].unit != column.unit
             ):
-                difference = f"has '{column.name}' in '{columns_of_log[column.name].unit}', '{longest.file}' in '{column.unit}'"
+                difference = (
+                    f"has '{column.name}' in '{columns_of_log[column.name].unit}', "
+                    f"'{longest.file}' in '{column.unit}'"
+                )
                 raise DataError(
-                    f"'{log.file}' {difference}; use the same unit in both, or create a data set for each"
+                    f"'{log.file}' {difference}; use the same unit in both, or create a data set "
+                    "for each"
                 )
         proposals = possible(
             proposals, {name: column.values for name, column in columns_of_log.items()}
@@ -170,7 +185,8 @@ def inspect(
         names = counted([column.name for column in longest.columns])
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(
-            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}; "
+            f"'{longest.file}': no column is recognised as a channel, by name or by motion, of "
+            f"{names}{unread}; "
             "name the columns of speed, yaw rate and lateral acceleration accordingly, with units"
         )
     computed = [
@@ -186,7 +202,8 @@ def inspect(
         and plain_unit(column.unit) is None
     ]
     computed += [
-        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and motion it is {assigned_units[column.name]}"
+        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
+        f"motion it is {assigned_units[column.name]}"
         for column in foreign
     ]
     shadowed = (
@@ -242,7 +259,8 @@ def _longest(logs: Sequence[Log]) -> Log:
     }
     if len(formats) > 1:
         raise ConfigurationError(
-            f"the files are of several formats ({', '.join(sorted(formats))}); create a data set for each"
+            f"the files are of several formats ({', '.join(sorted(formats))}); create a data set "
+            "for each"
         )
     longest = max(
         logs,
@@ -296,7 +314,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
             if steps.max(initial=0.0) > MAX_BRIDGED_SECONDS:
                 start = stamps[np.argmax(steps)]
                 yield (
-                    f"'{log.file.name}' has a gap of {steps.max():.3g} s at {start:.4g} s after its start, "
+                    f"'{log.file.name}' has a gap of {steps.max():.3g} s at {start:.4g} s after "
+                    "its start, "
                     "which is interpolated linearly; split the file there"
                 )
                 break
@@ -308,7 +327,8 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     if other_folders:
         listed = ", ".join(map(str, (folder, *other_folders)))
         raise ConfigurationError(
-            f"the files are in several folders ({listed}); put them into one, or create a data set for each folder"
+            f"the files are in several folders ({listed}); put them into one, or create a data set "
+            "for each folder"
         )
     names = sorted({file.name for file in files})
     for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
@@ -320,7 +340,8 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
     both_ways = (names, [name[::-1] for name in names])
-    start, end = (os.path.commonprefix(words).rstrip("0123456789") for words in both_ways)  # noqa: RUF071 (of characters)
+    prefixes = map(os.path.commonprefix, both_ways)
+    start, end = (prefix.rstrip("0123456789") for prefix in prefixes)
     pattern = (
         f"{glob.escape(start)}*{glob.escape(end[::-1])}"
         if len(names) > 1
@@ -332,7 +353,8 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     unlisted_matches = [Path(name).stem for name in matching(unlisted, pattern)]
     if unlisted_matches and source not in TABLES:
         raise ConfigurationError(
-            f"'{folder}' contains other files of that name ('{unlisted_matches[0]}'); use a folder with the files of the data set only"
+            f"'{folder}' contains other files of that name ('{unlisted_matches[0]}'); use a folder "
+            "with the files of the data set only"
         )
     return {"path": path, "files": pattern} | (
         {"exclude": unlisted_matches} if unlisted_matches else {}
@@ -342,7 +364,8 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
 def _evidence(
     log: Log, differences: Collection[str]
 ) -> tuple[list[tuple[str, str, FloatArray, str]], float | None]:
-    """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz]; without times rows as they are.
+    """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz];
+    without times rows as they are.
 
     Of a long drive the minutes in which columns change most are taken.
     """
@@ -367,7 +390,9 @@ def _evidence(
 
 
 def _differences(log: Log) -> dict[str, str]:
-    """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
+    """Columns that are the difference of another from row to row -> that one, a velocity by its
+    name; no acceleration was measured.
+    """
     signals = [column for column in log.columns if column.stamps is None]
     middle = (
         log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MAX_COMPARED_ROWS) // 2, 0)
@@ -440,7 +465,8 @@ def _busiest(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
     starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
         changes = [
-            [np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts]
+            np.nanstd(values[: len(starts) * minute].reshape(-1, minute), axis=1)
+            / np.nanstd(values)
             for values in columns
         ]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)

@@ -32,7 +32,9 @@ KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 class Question:
     """A question about logs or their car."""
 
-    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, ``imu_to_rear_axle``, ``kind``, a column, or a value of the vehicle
+    # ``left_right``, ``rate``, ``time``, ``radius``, ``imu_to_rear_axle``, ``kind``, a column, or a
+    # value of the vehicle
+    key: str
     text: str  # for people
     proposed: str  # answer that Enter takes; empty where nothing is proposed
     candidates: tuple[str, ...] = ()  # other answers
@@ -125,7 +127,8 @@ def ask(
             if question.candidates and question.proposed == LEAVE_OUT
         )
         raise ConfigurationError(
-            f"no channel is supported by two pieces of evidence; confirm those that are right: {takes}"
+            "no channel is supported by two pieces of evidence; confirm those that are right: "
+            f"{takes}"
         )
     return examined, tuple(left)
 
@@ -219,7 +222,8 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
             if sys.stdin is not None and sys.stdin.isatty():
                 raise
             raise ConfigurationError(
-                "no terminal for questions; add --yes to accept the proposals, or --answer KEY=ANSWER"
+                "no terminal for questions; add --yes to accept the proposals, or --answer "
+                "KEY=ANSWER"
             ) from None
         try:
             return _answered(examined, question, answer)
@@ -272,7 +276,9 @@ def _with_time_unit(log: Log, unit: str) -> Log:
 
 
 def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple[Proposal, ...]:
-    """A column as declared; where another column had its channel, that one gets the former channel of this one if the unit allows."""
+    """A column as declared; where another column had its channel, that one gets the former channel
+    of this one if the unit allows.
+    """
     former = next((proposal for proposal in channels if proposal.column == column), None)
     if former is None:  # another answer has given its channel away
         return channels

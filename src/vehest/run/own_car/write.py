@@ -1,4 +1,6 @@
-"""Writes data set, split and pipeline of a new car: Draft -> plan -> YAML with comments -> files, all or none."""
+"""Writes data set, split and pipeline of a new car: Draft -> plan -> YAML with comments -> files,
+all or none.
+"""
 
 from __future__ import annotations
 
@@ -65,35 +67,51 @@ ADDED = Trial(1, "added by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
     "kind": "real | simulated, as which tables and reports list the recordings",
-    "vehicle": "the car's name, the same in all its data sets: a model's bands are doubled on a car of another name",
-    "car": "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) and "
-    "steering_ratio, if known; every command uses them",
+    "vehicle": (
+        "the car's name, the same in all its data sets: a model's bands are doubled on a car of "
+        "another name"
+    ),
+    "car": (
+        "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) "
+        "and steering_ratio, if known; every command uses them"
+    ),
     "time": "unit: s, ms, us, ns, d (days) or clock; null: no time column",
     "clock": "strict | interpolate (across gaps and jitter) | uniform",
     "bridge": "longest gap that is interpolated linearly [s]",
-    "channels": "sign: -1 for a column whose positive direction is opposite to ISO 8855 (x forward, y left)",
-    "pose": "the reference is derived from positions and yaw (z up); add yaw_offset, lever_x and lever_y if the markers are offset",
-    "reference_point": "{x: …, y: …} ahead of and to the left of the centre of gravity [m], if known",
+    "channels": (
+        "sign: -1 for a column whose positive direction is opposite to ISO 8855 (x forward, y left)"
+    ),
+    "pose": "the reference is derived from positions and yaw (z up); add yaw_offset, lever_x and "
+    "lever_y if the markers are offset",
+    "reference_point": (
+        "{x: …, y: …} ahead of and to the left of the centre of gravity [m], if known"
+    ),
     "imu_point": "likewise for the inertial sensor",
     "accept": "checks whose errors do not stop the ingest",
 }
-SPLIT_HEAD = """of each recording, the first 50 % for training, the next 20 % for validation, the last 30 % for testing. Neighbouring
-samples are nearly equal, so that randomly drawn ones would reveal the answer. To test on the last lap, write tests: {test: last lap}.
-With a few minutes only, cross-validate: report: folds in the pipeline, and here, instead of the last three keys,
-folds: {number: 5, of: seconds, gap_seconds: 2}."""
-UNDIVIDED_HEAD = """whole recordings, because they are too short to be divided: half of them for training, a fifth for
-validation and three tenths for testing."""
-PIPELINE_HEAD = """every family that the channels allow, fast and promising ones first, with small budgets. Run it by
+SPLIT_HEAD = """of each recording, the first 50 % for training, the next 20 % for validation,
+the last 30 % for testing. Neighbouring samples are nearly equal, so that randomly drawn ones
+would reveal the answer. To test on the last lap, write tests: {test: last lap}. With a few
+minutes only, cross-validate: report: folds in the pipeline, and here, instead of the last three
+keys, folds: {number: 5, of: seconds, gap_seconds: 2}."""
+UNDIVIDED_HEAD = """whole recordings, because they are too short to be divided: half of them for
+training, a fifth for validation and three tenths for testing."""
+PIPELINE_HEAD = """every family that the channels allow, fast and promising ones first, with
+small budgets. Run it by
   vehest run {name} --minutes 15
-The same command continues where it stopped; finished trainings are not repeated. Lines may be deleted, and budgets raised (the papers'
-comparisons use training.max_epochs=1000). The parts show how many minutes of reference are needed."""
-ASSUMED = """The car's parameters are derived from wheelbase L and mass m: centre of gravity in the middle and at the height 0.2·L,
-yaw inertia m·(L/2)², cornering stiffness of an axle 10/rad times its load. Replace them by yours where known."""
+The same command continues where it stopped; finished trainings are not repeated. Lines may be
+deleted, and budgets raised (the papers' comparisons use training.max_epochs=1000). The parts show
+how many minutes of reference are needed."""
+ASSUMED = """The car's parameters are derived from wheelbase L and mass m: centre of
+gravity in the middle and at the height 0.2·L, yaw inertia m·(L/2)², cornering stiffness of an
+axle 10/rad times its load. Replace them by yours where known."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Overrides of each sweep of a pipeline with its description, estimators that are tried, and others with what each lacks."""
+    """Overrides of each sweep of a pipeline with its description, estimators that are tried, and
+    others with what each lacks.
+    """
 
     sweeps: list[tuple[list[str], str]] = field(default_factory=list)
     estimators: list[str] = field(default_factory=list)
@@ -101,12 +119,17 @@ class Plan:
 
 
 def registered(word: str) -> str:
-    """The name of an estimator that is given by its name or as ``package.module:Class``; raises `ConfigurationError` where it is none."""
+    """The name of an estimator that is given by its name or as ``package.module:Class``; raises
+    `ConfigurationError` where it is none.
+    """
     name = next(
         (point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word
     )
     if name not in estimator_names():
-        declared = f'[project.entry-points."{ENTRY_POINTS}"], NAME = "{word if ":" in word else "package.module:Class"}"'
+        declared = (
+            f'[project.entry-points."{ENTRY_POINTS}"], NAME = '
+            f'"{word if ":" in word else "package.module:Class"}"'
+        )
         problem = f"no installed package declares the estimator '{word}'"
         raise ConfigurationError(
             f"{problem}; its pyproject.toml needs, under {declared}; then install it with pip"
@@ -118,7 +141,10 @@ def registered(word: str) -> str:
 
 def _without_settings_file(name: str) -> str:
     """What an estimator of another package lacks that has no file in conf/estimator."""
-    return f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting"
+    return (
+        f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a "
+        "line a setting"
+    )
 
 
 def write(
@@ -128,7 +154,8 @@ def write(
     *,
     dry_run: bool = False,
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none; the data set alone if nothing can be trained.
+    """Write data set, split and pipeline, all or none; the data set alone if nothing can be
+    trained.
 
     Parameters
     ----------
@@ -233,7 +260,9 @@ def _is_too_short(drafted: Draft) -> bool:
 
 
 def _split_text(drafted: Draft) -> str:
-    """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
+    """Blocks of each recording, whole recordings where they are short; short ones beside long ones
+    are for training.
+    """
     name = drafted.examined.name
     ids = _long_enough(drafted)
     cut = _divisible(drafted)
@@ -350,7 +379,8 @@ def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
         value, spread = drafted.ratio
         if spread <= MAX_RATIO_UNCERTAINTY * abs(value):
             lines.append(
-                f"steering ratio {value:.3g} ± {spread:.2g}, estimated from slow corners and the wheelbase"
+                f"steering ratio {value:.3g} ± {spread:.2g}, estimated from slow corners and the "
+                "wheelbase"
             )
     lines += [f"{name}: {late.evidence}" for name, late in drafted.late.items()]
     lines += [f"note: {note}" for note in drafted.notes]
@@ -371,7 +401,9 @@ def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 
 
 def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
-    """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
+    """Sweeps over the families that recordings and known values of the car allow; an empty plan
+    where they allow none.
+    """
     contents = drafted.contents
     vehicle = drafted.examined.vehicle
     plan = Plan()
@@ -462,7 +494,7 @@ def _lack(
     samples: int,
     seconds: float,
 ) -> tuple[str, tuple[str, ...]]:
-    """What an estimator lacks, empty if nothing, and the settings with which it lacks no channel."""
+    """What an estimator lacks, empty if nothing, and settings with which it lacks no channel."""
     if name not in choices("estimator"):
         config: Config = {"estimator": {"name": name}, "training": {}}
         reason = usability(name, config, contents).to_give or _without_settings_file(name)
@@ -479,7 +511,8 @@ def _lack(
     min_seconds = samples / (usable.rate_hz or math.inf)
     short = (
         [
-            f"at least {min_seconds:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"
+            f"at least {min_seconds:.3g} s in each range for validation (the shortest has "
+            f"{seconds:.3g} s)"
         ]
         if min_seconds > seconds
         else []
@@ -493,7 +526,9 @@ def _lack(
 def _pipeline_of(
     name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
 ) -> dict[str, Any]:
-    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes of reference."""
+    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes
+    of reference.
+    """
     parts: dict[str, Any] = {
         "all": {
             "title": "all recordings",
@@ -537,23 +572,31 @@ def _limits(drafted: Draft) -> list[str]:
     derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
     missing = [name for name in SCORED if name not in drafted.channels | derived]
     if not missing and _is_too_short(drafted):
-        lengths = f"{drafted.seconds:.0f} s in {len(drafted.durations)} recording{'s' if len(drafted.durations) > 1 else ''}"
+        lengths = (
+            f"{drafted.seconds:.0f} s in {len(drafted.durations)} "
+            f"recording{'s' if len(drafted.durations) > 1 else ''}"
+        )
         return [
-            f"{lengths} are too short for training, validation and a test: record two minutes or more with bends, or three drives or more, "
+            f"{lengths} are too short for training, validation and a test: record two minutes or "
+            "more with bends, or three drives or more, "
             f"with the reference; until then {_without_reference(drafted)}"
         ]
     if not missing and not _divisible(drafted):
         return [
-            f"the recordings are short, so that the split uses whole recordings ({len(_long_enough(drafted))}, {drafted.seconds:.0f} s in all)"
+            "the recordings are short, so that the split uses whole recordings "
+            f"({len(_long_enough(drafted))}, {drafted.seconds:.0f} s in all)"
         ]
     if not missing:
-        text = f"{drafted.seconds:.0f} s in all, a third of it for testing, are hardly enough to rank estimators; record some minutes more"
+        text = (
+            f"{drafted.seconds:.0f} s in all, a third of it for testing, are hardly enough to rank "
+            "estimators; record some minutes more"
+        )
         return [text] if drafted.seconds < MIN_RANKING_SECONDS else []
     if "vy_ref" not in missing:
         return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
     return [
-        "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
-        + _without_reference(drafted)
+        "these recordings have no reference of lateral velocity or sideslip: nothing can be "
+        "trained or ranked on them; " + _without_reference(drafted)
     ]
 
 
@@ -573,7 +616,8 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
     examined = drafted.examined
     name = examined.name
     head = [
-        f"Recordings of {name}: channels of the columns, with their evidence. `vehest data check {name}` checks them."
+        f"Recordings of {name}: channels of the columns, with their evidence. `vehest data check "
+        f"{name}` checks them."
     ]
     head += [
         f"Open question: {question.text} Assumed: {question.proposed or 'no answer'}."
@@ -583,7 +627,8 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
         if not CHANNELS[channel].is_reference:
             head += [
                 f"{channel}: {late.evidence}.",
-                "An estimator in the car would receive it with this delay; if only the log has it, add to transforms:",
+                "An estimator in the car would receive it with this delay; if only the log has it, "
+                "add to transforms:",
                 f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{channel}]}}",
             ]
     comments = dict(DATASET_COMMENTS)
@@ -623,7 +668,8 @@ def _yaml(
     for line in lines:
         if "${" in line:
             raise ConfigurationError(
-                f"'{printable(line.strip()[:60])}' contains '${{', which configurations read as a reference; rename it"
+                f"'{printable(line.strip()[:60])}' contains '${{', which configurations read as a "
+                "reference; rename it"
             )
     printable_comments = {key: printable(comment) for key, comment in (comments or {}).items()}
     behind = [

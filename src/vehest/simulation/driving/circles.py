@@ -36,7 +36,7 @@ class SteadyCircle(Manoeuvre):
     """
 
     name: ClassVar[str] = "skidpad"
-    radius: Range = (35.0, 60.0)  # [m]; the standard wants at least 30 m
+    radius: Range = (35.0, 60.0)  # [m]; the standard requires at least 30 m
     severity: Range = (0.7, 0.95)  # share of the grip at which it ends
     ay_rate: float = (
         0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase

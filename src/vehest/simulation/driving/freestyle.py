@@ -33,7 +33,7 @@ class Freestyle(Manoeuvre):
 
     name: ClassVar[str] = "freestyle"
     duration: Range = (20.0, 40.0)  # of the recording [s]
-    speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest wanted speed [m/s]
+    speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest target speed [m/s]
     current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
     sideslip: tuple[float, float] = (
         0.15,

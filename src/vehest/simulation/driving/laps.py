@@ -55,7 +55,7 @@ class Laps(Manoeuvre):
     flat: bool = False  # leaves out the course's bank and grade
     half_width: float = 5.0  # of the road, beyond which the car has left it [m]
     corrections: Range = 0.0  # of the driver's hands, see `Hands` [m/s²]
-    traffic: float = 0.0  # stretches per lap, on average, behind a slower car
+    traffic: float = 0.0  # segments per lap, on average, behind a slower car
     traffic_speed: tuple[float, float] = (8.0, 30.0)  # of those, drawn for each [m/s]
 
     limits: ClassVar = {

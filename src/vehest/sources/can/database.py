@@ -6,7 +6,6 @@ wanted signals with their multiplexers
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import DataError, printable
+from vehest.data.errors import DataError, printable, suggestion
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
@@ -202,11 +201,8 @@ def _only_place(
             f"'{file}': signal '{name}' stands in several messages; write one of {names}"
         )
     if not places:
-        lower = {name.lower(): name for name in list(places_of)[:COMPARED]}
-        near = ", ".join(
-            lower[close] for close in difflib.get_close_matches(name.lower(), lower, n=3)
-        )
-        raise DataError(f"'{file}' has no signal '{name}'{f' (near it: {near})' if near else ''}")
+        meant = printable(suggestion(name, list(places_of)[:COMPARED]))
+        raise DataError(f"'{file}' has no signal '{name}'{meant}")
     return places[0]
 
 

@@ -6,7 +6,6 @@ file -> groups and channels -> conversions checked -> raw samples -> physical va
 
 from __future__ import annotations
 
-import difflib
 import io
 import math
 from collections import Counter
@@ -22,7 +21,7 @@ from asammdf.blocks import v2_v3_constants as v3
 from asammdf.blocks import v4_constants as v4
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, printable
+from vehest.data.errors import DataError, printable, suggestion
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 from vehest.sources.not_measured import marks_not_measured
@@ -251,9 +250,15 @@ def _place_of(
 ) -> tuple[int, int]:
     candidates = places.get(name, [])
     if not candidates:
+        signals = [signal for signal in list(places)[:COMPARED] if len(signal) < 200]
+        meant = printable(suggestion(name, signals))
+        if not meant and any(signal.startswith(BUS_FRAMES) for signal in places):
+            meant = (
+                "; it holds undecoded frames of a bus: decode them with their description, for "
+                "example by asammdf's extract_bus_logging"
+            )
         raise DataError(
-            f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in "
-            "conf/dataset"
+            f"'{file}' has no signal '{name}'{meant or '; correct the map in conf/dataset'}"
         )
     matching = [
         place
@@ -274,21 +279,6 @@ def _place_of(
             f"'{file}': signal '{name}' stands {len(matching)} times, in group {groups}; {advice}"
         )
     return matching[0]
-
-
-def _near(places: Mapping[str, object], name: str) -> str:
-    names = {name: name.lower() for name in list(places)[:COMPARED] if len(name) < 200}
-    close = difflib.get_close_matches(name.lower(), list(names.values()), n=3, cutoff=0.6)
-    if close:
-        return "near it: " + ", ".join(
-            _short_name(name) for name, lower in names.items() if lower in close
-        )
-    if any(name.startswith(BUS_FRAMES) for name in names):
-        return (
-            "it holds undecoded frames of a bus: decode them with their description, for "
-            "example by asammdf's extract_bus_logging"
-        )
-    return f"it has {len(places)} signals"
 
 
 def _group_of(

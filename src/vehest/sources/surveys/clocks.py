@@ -17,7 +17,8 @@ from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
 NAMED = re.compile(
-    r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
+    r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|"
+    r"epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
 COUNTER = re.compile(
     r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( "
@@ -72,7 +73,7 @@ def find_clock(
     step = 0.0
     repaired = {}
     for name, raw in columns.items():
-        written = units.get(name, "").replace(" ", "").lower()
+        written = units.get(name, "").replace(" ", "").strip("[]()").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS

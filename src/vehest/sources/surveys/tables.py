@@ -41,6 +41,7 @@ from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_na
 from vehest.sources.surveys.log import Log, RawColumn
 from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_columns_of_signals
 from vehest.sources.tables import (
+    ROW_OF_NUMBERS,
     TextLayout,
     is_parquet,
     names_of,
@@ -77,7 +78,9 @@ DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
     "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
-    "a separator of thousands": "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$",
+    "a separator of thousands": (
+        "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$"
+    ),
 }
 """Kinds of texts that are numbers for people: the pattern of each."""
 ABBREVIATED = {
@@ -133,9 +136,11 @@ def survey_table(file: Path) -> Log:
             values = read_numbers(file, table, names)
     else:
         shape = shape_of(file)
-        cells, repeated = _without_names(_table(file, shape), shape.names)
-        values, clocks, marks, skipped = _columns(file, shape, cells)
-        marks |= set(shape.names) - {""} if repeated else set()
+        table, skipped = _table(file, shape)
+        cells, repeated, marks = _without_texts(table, shape.names)
+        values, clocks, odd_marks, unread = _columns(file, shape, cells)
+        marks |= odd_marks
+        skipped += unread
         units = dict(shape.units)
         always = ("delimiter", "decimal")
         usual = asdict(TextLayout())
@@ -364,23 +369,30 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
         return "latin-1", head.decode("latin-1")
 
 
-def _without_names(table: pa.Table, names: Sequence[str]) -> tuple[pa.Table, tuple[int, ...]]:
-    """Cells without rows that repeat the names, as joined files do, and their numbers, from 1."""
-    texts = [
-        (column, name)
-        for column, name in zip(table.columns, names, strict=False)
-        if name and pa.types.is_string(column.type)
-    ][:2]
-    if len(texts) < 2:
-        return table, ()
-    is_name = [
-        np.asarray(compute.fill_null(compute.equal(column, name), False).cast(pa.int8())) > 0
-        for column, name in texts
-    ]
-    repeated = is_name[0] & is_name[1]
-    if not repeated.any():
-        return table, ()
-    return table.filter(pa.array(~repeated)), tuple((np.flatnonzero(repeated) + 1).tolist())
+def _without_texts(
+    table: pa.Table, names: Sequence[str]
+) -> tuple[pa.Table, tuple[int, ...], set[str]]:
+    """Cells without rows that repeat the names, as joined files do, or that begin with text below
+    the numbers, as statistics do; their numbers, from 1, and their texts.
+    """
+    named = zip(table.columns, names, strict=False)
+    texts = [(column, name) for column, name in named if name and pa.types.is_string(column.type)]
+    if not texts:
+        return table, (), set()
+    column, name = texts[0]
+    is_text = np.asarray(compute.equal(column, name).fill_null(False))
+    is_row = compute.match_substring_regex(column, ROW_OF_NUMBERS, ignore_case=True)
+    below = np.flatnonzero(is_row.fill_null(True)).max(initial=-1) + 1
+    if name == names[0] and 0 < below >= (1.0 - MAX_ODD_SHARE) * table.num_rows:
+        is_text[below:] = True
+    removed = table.filter(pa.array(is_text))
+    cells = {
+        cell
+        for column in removed.columns
+        for cell in column.cast(pa.string()).to_pylist()
+        if not re.search(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
+    }
+    return table.filter(pa.array(~is_text)), tuple((np.flatnonzero(is_text) + 1).tolist()), cells
 
 
 def _columns(
@@ -435,9 +447,9 @@ def _kind_of_text(column: pa.ChunkedArray) -> str:
     return "text"
 
 
-def _table(file: Path, shape: Shape) -> pa.Table:
+def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
     """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as
-    they stand.
+    they stand; lines that are none of its rows.
     """
     inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
     text = pc.ConvertOptions(
@@ -447,8 +459,11 @@ def _table(file: Path, shape: Shape) -> pa.Table:
     opened = partial(table_stream, file)
     problem = None
     for convert in (inferred, text):
+        lines: list[str] = []
         try:
-            return parse_table(opened, with_names(file, shape.layout), convert)
+            layout = with_names(file, shape.layout)
+            table = parse_table(opened, layout, convert, lines_of_text=lines)
+            return table, [f"line '{printable(line.strip()[:60])}'" for line in lines]
         except DAMAGE as error:
             problem = printable(first_line(error))
     why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"

@@ -23,8 +23,8 @@ from vehest.trust.record import TRUST, read_trust
 MAX_INPUTS = 16
 DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
 RECKONED = (
-    "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and "
-    "drifts the longer it gets."
+    "No positions were recorded: the course is integrated from speed, reference and yaw rate, and "
+    "drifts with time."
 )
 
 

@@ -68,7 +68,7 @@ def _against_best(ranking: Ranking, name: Name) -> str:
     if name == ranking.order[0]:
         return BEST
     pair = ranking.pairs.get((ranking.order[0], name))
-    if pair is None or pair.verdict == "not told apart":
+    if pair is None or pair.verdict == "no significant difference":
         return MISSING if pair is None else NOT_SIGNIFICANT
     return f"+{fixed(-pair.difference, 3)} [{fixed(-pair.high, 3)}, {fixed(-pair.low, 3)}]"
 
@@ -111,26 +111,27 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: s
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{best_sentence(ranking, titles)} {basis_sentence(ranking, test_text)}"
     return (
-        f"{best_sentence(ranking, titles)}{_baselines_sentence(ranking)} "
+        f"{best_sentence(ranking, titles)} {_baselines_sentence(ranking, titles)} "
         f"{basis_sentence(ranking, test_text)}"
     )
 
 
-def _baselines_sentence(ranking: Ranking) -> str:
-    """Whether the best beats the baselines significantly, after a space; empty where it is one."""
+def _baselines_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
+    """Whether the best, which is named, is significantly better than the baselines."""
     best = ranking.order[0]
+    title = titles[best]
     if best[0] in BASELINES:
-        return " It is a baseline."
+        return f"{title} is a baseline."
     missing = [BASELINE_TITLES[name] for name in ranking.missing_baselines]
     compared = [name for name in BASELINES if name not in ranking.missing_baselines]
     beaten = [BASELINE_TITLES[name] for name in compared if ranking.beats(best, name)]
     level = [BASELINE_TITLES[name] for name in compared if not ranking.beats(best, name)]
     sentences = [
-        f" It is significantly better than {listed(beaten)}." if beaten else "",
-        f" It is not significantly better than {listed(level)}." if level else "",
-        f" It was not compared with {listed(missing)}." if missing else "",
+        f"{title} is significantly better than {listed(beaten)}." if beaten else "",
+        f"{title} is not significantly better than {listed(level)}." if level else "",
+        f"{title} was not compared with {listed(missing)}." if missing else "",
     ]
-    return "".join(sentences)
+    return " ".join(filter(None, sentences))
 
 
 def basis_sentence(ranking: Ranking, test_text: str) -> str:
@@ -141,6 +142,6 @@ def basis_sentence(ranking: Ranking, test_text: str) -> str:
     return (
         f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
         f"{ranking.block_seconds:.3g} s and over seeds, "
-        "corrected by Holm. Effective number of blocks, by the squared error of the best: "
-        f"{ranking.effective_blocks:.0f}."
+        "corrected for several comparisons (Holm). The squared error of the best estimator is "
+        f"spread as over {ranking.effective_blocks:.0f} equal blocks."
     )

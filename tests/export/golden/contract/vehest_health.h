@@ -1,4 +1,4 @@
-/* vehest_health.h: whether the channels are as they were where the model learnt.
+/* vehest_health.h: whether the channels are as they were in the training.
  */
 #ifndef VEHEST_HEALTH_H
 #define VEHEST_HEALTH_H
