@@ -260,10 +260,6 @@ def _page(studies: Sequence[Study], results: Path) -> str:
             ],
         ),
         "",
-        "Where no claim of a paper is assessed yet, the answer rests on the report of its study, "
-        "which was made with",
-        "earlier code and shorter trainings.",
-        "",
         "## How to read the tables",
         "",
         *_table(("column or name", "meaning"), LEGEND, n_text=2),
