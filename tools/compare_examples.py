@@ -18,7 +18,7 @@ import yaml
 
 from vehest.run.table_records import record_tables
 
-VERSION = "1"
+VERSION = "2"
 """Raised when the numbers of its tables move."""
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 RESULT = Path(__file__).parents[1] / "results" / "examples" / "leaderboard.csv"
@@ -27,13 +27,13 @@ CLASSES = {
     "sliding_mode": "SlidingMode",
     "window_transformer": "WindowTransformer",
 }
-CAR = {  # CommonRoad's vehicle 2, a BMW 320i; stiffness of an axle: 1.0489 · 20.89/rad · its load
-    "mass": 1093.3,
-    "yaw_inertia": 1791.6,
-    "cg_to_front_axle": 1.1562,
-    "cg_to_rear_axle": 1.4227,
-    "cornering_stiffness_front": 129650.0,
-    "cornering_stiffness_rear": 105360.0,
+CAR = {  # of conf/dataset/sim_quickstart.yaml; stiffness of an axle: |p_ky1| times its load at rest
+    "mass": 982.0,
+    "yaw_inertia": 1605.4,
+    "cg_to_front_axle": 1.33,
+    "cg_to_rear_axle": 1.07,
+    "cornering_stiffness_front": 70000.0,
+    "cornering_stiffness_rear": 104100.0,
 }
 PIPELINE = {
     "study": "examples",
@@ -43,7 +43,7 @@ PIPELINE = {
     "split": "quickstart",
     "sweeps": [
         ["estimator=zero,static_map,kinematic"],
-        ["estimator=data_sheet", "estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"],
+        ["estimator=data_sheet", "estimator.wheelbase=2.4", "estimator.cg_to_rear_axle=1.07"],
         ["estimator=sliding_mode"],
         ["estimator=window_transformer", "seed=range(3)"],
         [
