@@ -51,7 +51,7 @@ def log(elsewhere, capsys):
     return Log(elsewhere, capsys)
 
 
-def test_segment_of(position):
+def segment_of_test(position):
     return yaml.safe_load(Path(FILES[position]).read_text(encoding="utf-8"))
 
 
@@ -63,19 +63,19 @@ def test_enter_accepts_proposals_and_values_of_the_car_are_used(log):
         "vehest run my_car",
     ):
         assert words in output
-    assert test_segment_of(0)["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
-    assert test_segment_of(0)["kind"] == "simulated"
-    assert test_segment_of(0)["car"] == {
+    assert segment_of_test(0)["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
+    assert segment_of_test(0)["kind"] == "simulated"
+    assert segment_of_test(0)["car"] == {
         "wheelbase": 2.7,
         "mass": 1500.0,
         "steering_ratio": 15.0,
         "imu_to_rear_axle": -0.3,
     }
-    assert [entry["name"] for entry in test_segment_of(0)["transforms"]] == [
+    assert [entry["name"] for entry in segment_of_test(0)["transforms"]] == [
         "velocity_from_sideslip",
         "steering_ratio",
     ]
-    sweeps = [" ".join(sweep) for sweep in test_segment_of(2)["parts"]["all"]["sweeps"]]
+    sweeps = [" ".join(sweep) for sweep in segment_of_test(2)["parts"]["all"]["sweeps"]]
     assert sweeps[:2] == [
         "estimator=zero,static_map,kinematic",
         "estimator=data_sheet estimator.wheelbase=2.7",
@@ -88,11 +88,11 @@ def test_enter_accepts_proposals_and_values_of_the_car_are_used(log):
 def test_values_of_the_car_are_in_the_data_set_and_the_printed_command_needs_none(log):
     log.write("lap.csv", usual(drive()).drop(columns="Beta"))
     out, _ = log.new("lap.csv", "--yes", "--wheelbase", "0.33", "--mass", "5.1", "--json")
-    assert test_segment_of(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
-    assert test_segment_of(0)["vehicle"] == "unknown"
+    assert segment_of_test(0)["car"] == {"wheelbase": 0.33, "mass": 5.1}
+    assert segment_of_test(0)["vehicle"] == "unknown"
     assert not [command for command in json.loads(out)["next"] if "wheelbase" in command]
     log.new("lap.csv", "--yes", "--force")
-    assert "car" not in test_segment_of(0)
+    assert "car" not in segment_of_test(0)
 
 
 def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, data_root):
@@ -101,10 +101,10 @@ def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, 
     out, _ = log.new(file, "--yes", "--wheelbase", "2.941")
     assert "'steer' is left out: the steering ratio estimated from slow corners is 19.8" in out
     assert "state your car's by --steering-ratio to add it" in out
-    assert "steering_ratio" not in str(test_segment_of(0).get("transforms", ""))
+    assert "steering_ratio" not in str(segment_of_test(0).get("transforms", ""))
     log.new(file, "--yes", "--wheelbase", "2.941", "--steering-ratio", "16.3", "--force")
-    assert {"name": "steering_ratio", "ratio": 16.3} in test_segment_of(0)["transforms"]
-    assert test_segment_of(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
+    assert {"name": "steering_ratio", "ratio": 16.3} in segment_of_test(0)["transforms"]
+    assert segment_of_test(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
 
 
 def test_invalid_answers_are_requested_again(log):
@@ -121,7 +121,7 @@ def test_invalid_answers_are_requested_again(log):
             "'toy' is neither real nor simulated",
         )
     )
-    signs = {name: entry.get("sign", 1) for name, entry in test_segment_of(0)["channels"].items()}
+    signs = {name: entry.get("sign", 1) for name, entry in segment_of_test(0)["channels"].items()}
     assert signs == {"vx": 1, "ax": 1} | dict.fromkeys(
         ("yaw_rate", "ay", "handwheel", "sideslip_ref"), -1
     )
@@ -130,10 +130,10 @@ def test_invalid_answers_are_requested_again(log):
 def test_a_column_can_be_declared_otherwise_or_left_out(log):
     log.write("two.csv", usual(drive()).assign(Speed2=3.6 * drive()["vx"] + 0.01))
     log.typed("two.csv", answers=["vx_ref km/h", *[""] * 7])
-    first = test_segment_of(0)["channels"]
+    first = segment_of_test(0)["channels"]
     assert {first["vx"]["column"], first["vx_ref"]["column"]} == {"Speed", "Speed2"}
     log.typed("two.csv", "--force", answers=["-", *[""] * 7])
-    assert len(test_segment_of(0)["channels"]) == len(first) - 1
+    assert len(segment_of_test(0)["channels"]) == len(first) - 1
 
 
 def test_yes_asks_nothing_and_lists_open_questions(log):
@@ -142,7 +142,7 @@ def test_yes_asks_nothing_and_lists_open_questions(log):
     assert "answered as proposed:\n  left_right: yes (is column 'Gyro' positive in a left" in out
     assert "  imu_to_rear_axle: unknown (how far ahead of the rear axle" in out
     assert "  kind: real (do the logs come from a real car" in out
-    assert "car" not in test_segment_of(0), "a place that is not known is not written"
+    assert "car" not in segment_of_test(0), "a place that is not known is not written"
     assert all(f"wrote {file}: " in out for file in FILES)
     assert "Open question: is column 'Gyro' positive in a left" in Path(FILES[0]).read_text(
         encoding="utf-8"
@@ -156,7 +156,7 @@ def test_yes_asks_nothing_and_lists_open_questions(log):
     )
     assert (Path(FILES[1]).read_text(), Path(FILES[0]).exists()) == ("mine", False)
     log.new("lap.csv", "--yes", "--force")
-    assert test_segment_of(1)["dataset"] == "my_car"
+    assert segment_of_test(1)["dataset"] == "my_car"
     log.write("bare.csv", usual(drive()).drop(columns="Beta"))
     log.new("bare.csv", "--yes", "--force")
     assert [Path(file).exists() for file in FILES] == [True, False, False], (
@@ -185,8 +185,8 @@ def test_json_says_all_of_it_to_a_script(log):
     answers = ("left_right=no", "imu_to_rear_axle=-0.3", "kind=simulated")
     answers = [word for answer in answers for word in ("--answer", answer)]
     assert json.loads(log.new("lap.csv", "--json", *answers)[0])["open"] == []
-    assert test_segment_of(0)["kind"] == "simulated"
-    assert test_segment_of(0)["car"] == {"imu_to_rear_axle": -0.3}
+    assert segment_of_test(0)["kind"] == "simulated"
+    assert segment_of_test(0)["car"] == {"imu_to_rear_axle": -0.3}
     before = [Path(file).read_text() for file in FILES]
     out, err = log.new("lap.csv", "--json", "--dry-run", "--answer", "gear=3", code=2)
     assert err == f"error: {json.loads(out)['stopped']}\n", "a stop gives what was found"
@@ -279,9 +279,9 @@ def test_short_recordings_stay_undivided_and_too_few_are_refused_with_a_remedy(l
     files = [f"{name}.csv" for name in names]
     assert "whole recordings (10, 80 s in all)" in log.new(*files, "--yes")[0]
     parts = [
-        test_segment_of(1)["train"],
-        test_segment_of(1)["validation"],
-        test_segment_of(1)["tests"]["test"],
+        segment_of_test(1)["train"],
+        segment_of_test(1)["validation"],
+        segment_of_test(1)["tests"]["test"],
     ]
     assert [len(spans) for spans in parts] == [5, 2, 3]
     out, _ = log.new(*files, "--yes", "--force", "--steering-ratio", "15")
@@ -300,8 +300,8 @@ def test_slow_log_and_slightly_wrong_clock_are_accepted_by_run(log):
     table = usual(drive(240.0, rate_hz=10.0))
     log.write("slow.csv", table)
     log.new("slow.csv", "--yes", "--steering-ratio", "15")
-    assert test_segment_of(2)["evaluation"]["rate_hz"] == 10
-    words = [word for sweep in test_segment_of(2)["parts"]["all"]["sweeps"] for word in sweep]
+    assert segment_of_test(2)["evaluation"]["rate_hz"] == 10
+    words = [word for sweep in segment_of_test(2)["parts"]["all"]["sweeps"] for word in sweep]
     assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (
         True,
         False,
@@ -311,18 +311,18 @@ def test_slow_log_and_slightly_wrong_clock_are_accepted_by_run(log):
         usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"),
     )
     log.new("off.csv", "--yes", "--force")
-    assert test_segment_of(0)["clock"] == "interpolate"
+    assert segment_of_test(0)["clock"] == "interpolate"
 
 
 def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothing(log):
     for name, rows in (("long", 2500), ("short", 400), ("piece", 100)):
         log.write(f"{name}.csv", usual(drive()).iloc[:rows])
     log.new("long.csv", "short.csv", "piece.csv", "--yes")
-    assert test_segment_of(1)["train"] == [
+    assert segment_of_test(1)["train"] == [
         {"recording": "long", "start": "0 %", "stop": "50 %"},
         {"recording": "short"},
     ]
-    assert test_segment_of(1)["tests"] == {
+    assert segment_of_test(1)["tests"] == {
         "test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]
     }
     assert log("run", "my_car", "--dry-run")[0] == 0
@@ -338,6 +338,6 @@ def test_estimators_of_the_user_are_compared_too(log, monkeypatch):
     install_examples(log.folder / "installed", monkeypatch)
     try:
         log.new(*arguments)
-        assert ["estimator=sliding_mode"] in test_segment_of(2)["parts"]["all"]["sweeps"]
+        assert ["estimator=sliding_mode"] in segment_of_test(2)["parts"]["all"]["sweeps"]
     finally:
         forget_examples()

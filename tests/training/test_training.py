@@ -51,7 +51,7 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
 def validation_loss_of(member):
     """Mean squared error of the lateral velocity on the validation recordings [m²/s²]."""
     windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
-    return np.mean((member._predict(windows.series, windows.starts) - windows.targets) ** 2)
+    return np.mean((member.predict(windows.series, windows.starts) - windows.targets) ** 2)
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
@@ -212,7 +212,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
 def test_member_that_diverges_in_its_first_epoch_has_no_model(monkeypatch):
     _plant(monkeypatch, 0, 0.0, epoch=1)
     with pytest.raises(
-        DataError, match=r"member 0 is nan after epoch 4; lower training\.learning_rate"
+        DataError, match=r"training 0 is nan after epoch 4; lower training\.learning_rate"
     ):
         _fit("ksnn", {}, [0, 1], SupervisedSettings(max_epochs=6))
 

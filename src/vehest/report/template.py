@@ -23,8 +23,7 @@ def fill_template(path: Path, values: Mapping[str, Any], blocks: Iterable[Block]
     values
         Name -> number or text; a name that the template has and they lack is an error.
     blocks
-        Tables and figures by their names; the place of one that is not there is empty,
-        and false in ``{% if table("name") %}``.
+        Tables and figures by their names; one that is not there leaves its place empty.
 
     Returns
     -------
@@ -39,11 +38,7 @@ def fill_template(path: Path, values: Mapping[str, Any], blocks: Iterable[Block]
             placed[f"{type(block).__name__} {block.name}"] = block
 
     def place(kind: type[Table] | type[Figure]) -> Any:
-        def mark(name: str) -> str:
-            key = f"{kind.__name__} {name}"
-            return f"{_MARK}{key}{_MARK}" if key in placed else ""
-
-        return mark
+        return lambda name: f"{_MARK}{kind.__name__} {name}{_MARK}"
 
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
@@ -54,6 +49,6 @@ def fill_template(path: Path, values: Mapping[str, Any], blocks: Iterable[Block]
     for position, piece in enumerate(rendered.split(_MARK)):
         if position % 2 == 0:
             filled += [piece.strip()] if piece.strip() else []
-        else:
+        elif piece in placed:
             filled.append(placed[piece])
     return filled

@@ -421,6 +421,7 @@ def _values(
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),
+        "limited_titles": ["Limited set"] if LIMITED in subjects.parts else [],
         "difference_of_tyres": fixed(tables.difference_of_tyres(subjects.runs), 1),
         "command": as_code(artefacts.command),
         "scoring": methods.scoring(artefacts.parts[FULL]),
