@@ -75,12 +75,13 @@ OVERVIEWS = {
     ),
     "cnn_ukf": (
         "cnn_ukf",
-        "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
+        "Squared errors of β [deg²] with 95 % intervals over 1,000 manoeuvres: over all samples, over "
+        "those from 4 m/s² on, and until |β| first exceeds 12°; **simulated** cars",
         {
-            "part": "trained on",
             "candidate": "method",
-            "ours_mse": "MSE",
-            "ours_mse_nonlinear": "MSE_nl",
+            "mse": "MSE",
+            "mse_nl": "MSE_nl",
+            "within": "MSE up to 12°",
             "n_seeds": "seeds",
         },
     ),
