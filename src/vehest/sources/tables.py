@@ -8,8 +8,9 @@ from __future__ import annotations
 import codecs
 import csv
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -207,6 +208,7 @@ def column_parts(
                 layout = with_names(file, layout)
                 options = _options(layout, _conversion(selected, layout), [])
                 stream = opened.enter_context(table_stream(file))
+                opened.enter_context(bytes_that_are_no_text())
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
             at = 0
@@ -247,7 +249,7 @@ def parse_table(
     Lines of text between or below the rows are left out, and appended to ``lines_of_text``.
     """
     texts = [] if lines_of_text is None else lines_of_text
-    with opened() as stream:
+    with opened() as stream, bytes_that_are_no_text():
         return pc.read_csv(stream, **_options(layout, convert, texts, threads=threads))
 
 
@@ -277,6 +279,24 @@ def _options(
         "parse_options": pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=handle),
         "convert_options": convert,
     }
+
+
+@contextmanager
+def bytes_that_are_no_text() -> Iterator[None]:
+    """Within it, a row of damaged bytes is pyarrow's error alone: before that, pyarrow fails to
+    decode the row for the handler, which Python would print with a traceback.
+    """
+    hook = sys.unraisablehook
+
+    def without_decoding(problem: sys.UnraisableHookArgs) -> None:
+        if not isinstance(problem.exc_value, UnicodeDecodeError):
+            hook(problem)
+
+    sys.unraisablehook = without_decoding
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
 
 
 def _conversion(selected: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
