@@ -274,8 +274,7 @@ def _page(studies: Sequence[Study], results: Path) -> str:
             [study.provisional_counts() for study in studies],
         ),
         "",
-        "*Provisional*: the training of a candidate was not shown to suffice, or its networks were "
-        "trained too shortly.",
+        "*Provisional*: the training of a candidate was not checked or is insufficient (see below).",
         f"*Not assessed*: {NOT_PUBLISHED}, or not of this candidate.",
         "",
         "Data that decided the claims; simulated drives stand in for recordings that are not "

@@ -208,7 +208,7 @@ def column_parts(
                 layout = with_names(file, layout)
                 options = _options(layout, _conversion(selected, layout), [])
                 stream = opened.enter_context(table_stream(file))
-                opened.enter_context(bytes_that_are_no_text())
+                opened.enter_context(decoding_failures_ignored())
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
             at = 0
@@ -249,7 +249,7 @@ def parse_table(
     Lines of text between or below the rows are left out, and appended to ``lines_of_text``.
     """
     texts = [] if lines_of_text is None else lines_of_text
-    with opened() as stream, bytes_that_are_no_text():
+    with opened() as stream, decoding_failures_ignored():
         return pc.read_csv(stream, **_options(layout, convert, texts, threads=threads))
 
 
@@ -282,7 +282,7 @@ def _options(
 
 
 @contextmanager
-def bytes_that_are_no_text() -> Iterator[None]:
+def decoding_failures_ignored() -> Iterator[None]:
     """Within it, a row of damaged bytes is pyarrow's error alone: before that, pyarrow fails to
     decode the row for the handler, which Python would print with a traceback.
     """

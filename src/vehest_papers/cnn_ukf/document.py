@@ -80,6 +80,7 @@ OVERVIEW_CANDIDATES = (
     paper.MODEL,
     paper.SMOOTH,
     paper.FREE,
+    paper.STATIC_MAP,
     paper.ZERO,
 )
 FILTERS = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
