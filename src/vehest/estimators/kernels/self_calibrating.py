@@ -46,9 +46,8 @@ SHARED = STATES + 50
 ROWS = STATES + 58  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
-MAX_ERROR_OF_PLACE = (
-    1.0  # of |e|, in deviations of its prior, above which b stays: a slide is not the unit's place
-)
+MAX_ERROR_OF_PLACE = 1.0
+"""Of |e|, in deviations of its prior, above which b stays: a slide is not the unit's place."""
 
 
 class State(NamedTuple):
