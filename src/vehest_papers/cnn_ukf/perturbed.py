@@ -23,7 +23,7 @@ from vehest.estimators.filtering.dugoff_filter import PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.report.document import Figure
-from vehest.report.style import DOUBLE_COLUMN, new_figure
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import finite_cost, optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
@@ -194,7 +194,10 @@ def figure_14(results: Perturbed, data: str) -> Figure:
                 )
             axes.set_xticks(
                 range(len(COMBINATIONS)),
-                [f"{100 * front:+.0f}\n{100 * rear:+.0f}" for front, rear in COMBINATIONS],
+                [
+                    f"{fixed(100 * front, 0)}\n{fixed(100 * rear, 0)}"
+                    for front, rear in COMBINATIONS
+                ],
             )
             axes.set_xlabel("front (above) and rear stiffness off by [%]")
             axes.set_ylabel(label)

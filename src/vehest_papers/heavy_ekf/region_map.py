@@ -75,7 +75,7 @@ def _drawn(cells: Sequence[Cell], of_cells: Changes) -> MatplotlibFigure:
             axes.grid(visible=False)
             axes.tick_params(length=0)
             axes.spines[:].set_visible(False)
-        labels = [f"{100 * mismatch:+.0f}" for mismatch in MISMATCHES]
+        labels = [fixed(100 * mismatch, 0) for mismatch in MISMATCHES]
         panels[0].set_yticks(range(len(MISMATCHES)), labels)
         panels[0].set_ylabel("error of the assumed stiffness [%]")
         patches = [Patch(facecolor=colour, label=name) for name, colour in COLOURS.items()]
