@@ -423,7 +423,7 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
         )
         measured = np.zeros((2, 4 * (steps + 1)))
         measured[0, 4 * k + 5] = 1.0 / n.noise_speed
-        measured[1, 4 * k + 4] = 1.0 / kernel.ROLLING
+        measured[1, 4 * k + 4] = 1.0 / kernel.ROLLING_DEVIATION
         rows.append(measured)
         values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
     stacked = np.vstack(rows)
