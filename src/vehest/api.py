@@ -231,7 +231,8 @@ def score(
     if isinstance(estimate, PlainEstimate):
         if len(drives) != 1:
             raise ConfigurationError(
-                f"an estimate is scored against the recording that it was made of, not {len(drives)}"
+                "an estimate is scored against the recording that it was made of, not "
+                f"{len(drives)}"
             )
         return metrics.accuracy([metrics.score_whole(estimate, drives[0])])
     parts = []

@@ -77,13 +77,11 @@ class Estimate(TimeSeries):
     estimator: str  # name of the estimator
     rate_hz: float  # rate of the estimate [Hz]
     start_time: float  # time of the first sample [s]
-    channels: Mapping[
-        str, FloatArray
-    ]  # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    channels: Mapping[str, FloatArray]
     mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
-    covariance: FloatArray | None = (
-        None  # of the errors of some of the quantities, (T, n, n), where the method has one
-    )
+    # of the errors of some of the quantities, (T, n, n), where the method has one
+    covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:

@@ -14,7 +14,8 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified separately
+# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified
+# separately
 CONDITION = 1e8
 
 

@@ -118,14 +118,12 @@ class Drive:
     """
 
     rate_hz: float  # [Hz]
-    inputs: dict[
-        str, FloatArray
-    ]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    inputs: dict[str, FloatArray]
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
-    starts_at_reference: bool = (
-        False  # whether estimators start from the reference at the first sample
-    )
+    # whether estimators start from the reference at the first sample
+    starts_at_reference: bool = False
     min_sideslip_speed: float = 0.0  # speed from which on sideslip is scored [m/s]
 
     @property
@@ -276,9 +274,8 @@ def _robust_deviation(samples: FloatArray) -> float:
 class Noise(NamedTuple):
     """A disturbance in two parts."""
 
-    density: (
-        float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
-    )
+    # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    density: float
     deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
     time_constant: float  # of the slow part [s]
 
@@ -541,9 +538,8 @@ def _model_of(
     transition: dict[tuple[int, int], FloatArray | float] = {}
     noises = list[float]()
     priors = list[float]()
-    measured: list[
-        tuple[dict[int, FloatArray | float], float]
-    ] = []  # combinations of states, and the variance of each
+    # combinations of states, and the variance of each
+    measured: list[tuple[dict[int, FloatArray | float], float]] = []
 
     def state(decay: float, noise: float, prior: float) -> int:
         """Add x⁺ = decay x + w; returns its index."""

@@ -97,7 +97,10 @@ class StateDependentNoise(nn.Module):
         self.reset()
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
-        """Start from a covariance, (n, n); see `ConstantNoise.begin`. L sees states in units, (k,)."""
+        """Start from a covariance, (n, n), see `ConstantNoise.begin`.
+
+        The network receives states in ``state_unit``, (k,).
+        """
         self.constant.begin(covariance, pace)
         with torch.no_grad():
             self.unit.copy_(self.constant.unit / SCALE**0.5)

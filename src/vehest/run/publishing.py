@@ -36,9 +36,8 @@ class Publication:
     """A study whose report goes to results/<study>."""
 
     study: str
-    absent: Mapping[
-        str, str
-    ]  # name of a part or data set that the study went on without -> the same for people
+    # name of a part or data set that the study went on without -> the same for people
+    absent: Mapping[str, str]
     keys: Keys  # `vehest.run.published.keys_of_study`
     n_not_trained: int = 0  # trainings that the report names as missing
 

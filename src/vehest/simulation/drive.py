@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,20 +45,16 @@ class Flags:
     spun: bool  # the car slid beyond the validity of its equations of rolling
     left_road: bool = False  # it was further beside its line than the manoeuvre's half_width
     stood: bool = False  # it stands at the end
-    completed: (
-        bool  # the manoeuvre came to its own end, and was not cut off because it took too long
-    )
-    gave_up_at: float | None = (
-        None  # when the driver began to stop because of a spin or beside the road [s]; none if never
-    )
-    largest_lateral_error: float | None = (
-        None  # distance from the line [m]; none where there is no line
-    )
+    # the manoeuvre came to its own end, and was not cut off because it took too long
+    completed: bool
+    # when the driver began to stop because of a spin or beside the road [s]; none if never
+    gave_up_at: float | None = None
+    # distance from the line [m]; none where there is no line
+    largest_lateral_error: float | None = None
     largest_sideslip: float  # above 1 m/s, either sign [rad]
     largest_ay: float  # either sign [m/s²]
-    stability_share: float | None = (
-        None  # of the recorded time in which stability control intervened; none where it is off
-    )
+    # of the recorded time in which stability control intervened; none where it is off
+    stability_share: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +62,8 @@ class Trip:
     """True motion and outcome of a drive."""
 
     motion: Motion  # true motion, first sample after the settling time
-    lateral_error: (
-        FloatArray  # the car's place left of its line [m], (T,); NaN where there is no line
-    )
+    # the car's place left of its line [m], (T,); NaN where there is no line
+    lateral_error: FloatArray
     flags: Flags  # how it went
     drawn: dict[str, Any]  # values that the seed drew
 
@@ -243,7 +238,8 @@ class _Ride:
         observation = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
         decision = self._controller.command(time, observation)
         if self._stint is not None:
-            decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
+            friction = decision.friction * self._stint.friction_at(time)
+            decision = replace(decision, friction=friction)
         self.decision = decision
         self._judge(time, decision)
         if self._is_over(time, decision):
@@ -352,7 +348,8 @@ def steps_per_tick(rate_hz: float, step: float, rate_name: str) -> int:
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(
-            f"the {rate_name} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a whole number of steps must "
-            f"lie between two samples (with 0.001 s: 10, 20, 25, 40, 50, 100, 125, 200, 250, 500 or 1000 Hz)"
+            f"the {rate_name} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a "
+            "whole number of steps must lie between two samples (with 0.001 s: 10, 20, 25, 40, "
+            "50, 100, 125, 200, 250, 500 or 1000 Hz)"
         )
     return n_steps

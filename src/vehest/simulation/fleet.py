@@ -37,12 +37,14 @@ class Variation:
 
     parameters: tuple[str, ...]  # the library's names, ``tire.p_dy1`` for one of a group
     factor: Scales  # lowest and highest scale, drawn uniformly for every drive
-    log: bool = False  # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
+    # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
+    log: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 < self.factor[0] <= self.factor[1]:
             raise ConfigurationError(
-                f"vary: a factor is a pair [lowest, highest] of positive scales, not {list(self.factor)}"
+                "vary: a factor is a pair [lowest, highest] of positive scales, not "
+                f"{list(self.factor)}"
             )
 
     def drawn(self, generator: np.random.Generator) -> float:
@@ -116,10 +118,10 @@ class SensorVariation:
     error.
     """
 
-    factors: Mapping[
-        str, tuple[float, float]
-    ]  # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
-    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it
+    # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
+    factors: Mapping[str, tuple[float, float]]
+    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the
+    # sensors have it
     roll_share: tuple[float, float] | None = None
 
     @classmethod
@@ -130,7 +132,8 @@ class SensorVariation:
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
             raise ConfigurationError(
-                f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}"
+                f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of "
+                f"scales, not {entries}"
             )
         factors = {
             str(kind): _range(value) for kind, value in entries.items() if kind != "roll_share"

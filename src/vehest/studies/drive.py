@@ -359,7 +359,7 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
 
 
 def data_of_parts(parts: Mapping[str, PartArtefacts]) -> dict[str, pd.DataFrame]:
-    """Ranges, method and notes of all parts, for the CSV files ``ranges``, ``method``, ``notes``."""
+    """Ranges, method and notes of all parts, for the CSV files of these names."""
     lines = {name: method_lines(part) for name, part in parts.items()}
     notes = {name: warnings_of(part) for name, part in parts.items()}
     ranges = [ranges_of(part).assign(part=name) for name, part in parts.items()]

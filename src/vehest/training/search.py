@@ -118,8 +118,8 @@ def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> 
     best = table[np.argmin(table[:, -1])]
     if best[-1] >= UNUSABLE_COST:
         raise DataError(
-            f"none of the {evaluations} sets of values that were tried gives a finite estimate of the "
-            "training recordings; check the estimator's settings and the recordings' units"
+            f"none of the {evaluations} sets of values that were tried gives a finite estimate of "
+            "the training recordings; check the estimator's settings and the recordings' units"
         )
     n = len(best) // 2
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
@@ -180,7 +180,8 @@ def optuna_search(
         import optuna
     except ImportError:
         raise MissingError(
-            "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set method=nelder_mead in its settings"
+            "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set "
+            "method=nelder_mead in its settings"
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     rows: list[FloatArray] = []

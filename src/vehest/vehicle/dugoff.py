@@ -3,11 +3,11 @@
 State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed,
 road-wheel angle, longitudinal acceleration.
 
-    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz                             (Eq. 2)
-    α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u)
-    F = C tan α f(λ),   λ = μ F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0)
-    f = λ (2 - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10)
-    F_zF = m (g l_R - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
+    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz
+    (Eq. 2) α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u) F = C tan α f(λ),   λ = μ
+    F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0) f = λ (2
+    - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10) F_zF = m (g l_R
+    - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
 
 Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is
 infinite at α = 0 and its gradient is not a number, though F is as smooth as C tan α there; λ is
@@ -55,9 +55,8 @@ class LoadedCar:
     yaw_inertia: float = 3498.0  # about the vertical axis through the centre of gravity [kg m²]
     cg_to_front_axle: float = 1.47  # distance from the centre of gravity [m]
     cg_to_rear_axle: float = 1.41  # the same [m]
-    cg_height: float = (
-        0.52  # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
-    )
+    # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
+    cg_height: float = 0.52
 
     def __post_init__(self) -> None:
         check_parameters(self)

@@ -102,8 +102,8 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
     def cost(powers: FloatArray) -> float:
         scaled = [
-            measurement._replace(
-                variance=scaled_variance(measurement.variance - floor, powers, floor)
+            replace(
+                measurement, variance=scaled_variance(measurement.variance - floor, powers, floor)
             )
             for measurement in pseudo
         ]

@@ -47,9 +47,8 @@ class Scheme:
     part: PartArtefacts  # what was compared
     training_test: str  # test set of the training car
     other_test: str  # test set of the car that is early-stopped on
-    labels: Mapping[str, NDArray[np.int64]] = field(
-        default_factory=dict
-    )  # test set -> block of each segment; empty: by the errors of this part alone
+    # test set -> block of each segment; empty: by the errors of this part alone
+    labels: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     @cached_property
     def runs(self) -> pd.DataFrame:

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -61,11 +62,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 MAX_SAMPLES_TOGETHER = 200_000  # samples that are filtered at a time
 
 
-class PseudoMeasurement(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PseudoMeasurement:
     """Sideslip angles that a network adds to T samples."""
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
-    variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
+    variance: FloatArray  # of the angle as the filter's measurement, (T,) [rad²]
     # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
     # filter's
     process: FloatArray | None = None

@@ -344,6 +344,14 @@ class _Batch(NamedTuple):
             **{name: part[:, first:end] for name, part in parts.items() if part is not None},
         )
 
+    def scaled(self, input_factors: Tensor, output_factors: Tensor) -> _Batch:
+        """The batch with channels times factors, (B, C), and outputs times factors, (B, O)."""
+        return self._replace(
+            inputs=self.inputs * input_factors.unsqueeze(1),
+            targets=self.targets * output_factors.unsqueeze(1),
+            starts=self.starts * output_factors,
+        )
+
 
 class _Drives:
     """Recordings one after another as tensors, (N, …), from which sequences are cut."""
@@ -477,11 +485,7 @@ def _phase(
             return batch
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
         inputs, outputs = (torch.where(turned, sign, 1.0) for sign in signs)
-        return batch._replace(
-            inputs=batch.inputs * inputs.unsqueeze(1),
-            targets=batch.targets * outputs.unsqueeze(1),
-            starts=batch.starts * outputs,
-        )
+        return batch.scaled(inputs, outputs)
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):

@@ -56,12 +56,10 @@ class Car:
     steering_rate: float  # largest steering velocity of the road wheels [rad/s]
     largest_steer: float  # of the road wheels [rad]
     lateral_acceleration: tuple[float, ...]  # (M,), from 0 to the grip [m/s²]
-    excess_steer: tuple[
-        float, ...
-    ]  # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
-    rear_slip: tuple[
-        float, ...
-    ]  # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
+    excess_steer: tuple[float, ...]
+    # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    rear_slip: tuple[float, ...]
 
     def steer_for(
         self, curvature: float, lateral_acceleration: float, friction: float = 1.0
@@ -127,7 +125,8 @@ def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car
     unknown = sorted(set(driver_values) - set(_DRIVER_VALUES))
     if unknown:
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_DRIVER_VALUES)}"
+            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: "
+            f"{', '.join(_DRIVER_VALUES)}"
         )
     front_share = parameters.b / (parameters.a + parameters.b)
     driven_axle = min(
@@ -195,7 +194,8 @@ def _measure(
     grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
         raise ConfigurationError(
-            f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow"
+            f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: "
+            "it does not follow"
         )
     ramp_values = (
         ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,

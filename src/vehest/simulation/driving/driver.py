@@ -43,15 +43,17 @@ class Driver:
 
     preview_time: float = 0.7  # how far ahead the driver looks for lateral errors [s]
     steering_lag: float = 0.1  # time constant from the wanted to the actual steering angle [s]
-    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the one of
-    # steering.
+    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far
+    # ahead as this lag and the one of steering.
     response: float = 3.5e-3
     yaw_damping: float = 0.16  # steering angle per error of the yaw rate [s]
     countersteer: float = 0.7  # steering angle per sideslip beyond that of the turn
-    slide: float = 0.035  # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    slide: float = 0.035
     speed_gain: float = 1.5  # wanted acceleration per speed error [1/s]
     braking_share: float = 0.75  # share of the grip that is used for braking straight ahead
-    saturation: float = 1.1  # share of the grip up to which the driver asks for more lateral acceleration when off the line
+    # share of the grip up to which the driver asks for more lateral acceleration when off the line
+    saturation: float = 1.1
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ class DrivingStyle:
         high = self.grip_fraction + abs(self.grip_ripple)
         if not (low > 0.0 and high <= 1.0 + 1e-9):
             raise ConfigurationError(
-                f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1"
+                f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at "
+                "most 1"
             )
 
 
@@ -128,15 +131,15 @@ class Observation(NamedTuple):
         return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
 
 
-class Command(NamedTuple):
+@dataclass(frozen=True)
+class Command:
     """The driver's command, and the road at the car."""
 
     steering_velocity: float  # of the road wheels [rad/s]
-    acceleration: float  # wanted [m/s²]
+    acceleration: float  # requested [m/s²]
     progress: float = 0.0  # distance along the way [m]
-    lateral_error: float = (
-        math.nan
-    )  # the car's place left of its line [m]; NaN where there is no line
+    # the car's place left of its line [m]; NaN where there is no line
+    lateral_error: float = math.nan
     friction: float = 1.0  # scale of the tyres' friction at the car
     bank: float = 0.0  # of the road, positive with its left side higher [rad]
     grade: float = 0.0  # of the road, positive downhill [rad]
@@ -322,12 +325,15 @@ class Follower:
         self._speed_at = speed_at
         self._per_metre = 1.0 / float(plan.distance[1])
         self._last_cell = len(plan.distance) - 2
-        self._x, self._y, self._heading, self._curvature, self._speed, self._acceleration, self._friction, self._bank, self._grade = (
-            values.tolist()
-            for values in (
-                plan.x, plan.y, plan.heading, plan.curvature, plan.speed, plan.acceleration, plan.friction, plan.bank, plan.grade
-            )
-        )  # fmt: skip
+        self._x = plan.x.tolist()
+        self._y = plan.y.tolist()
+        self._heading = plan.heading.tolist()
+        self._curvature = plan.curvature.tolist()
+        self._speed = plan.speed.tolist()
+        self._acceleration = plan.acceleration.tolist()
+        self._friction = plan.friction.tolist()
+        self._bank = plan.bank.tolist()
+        self._grade = plan.grade.tolist()
 
     @property
     def start(self) -> tuple[float, float, float, float]:
@@ -443,7 +449,7 @@ class Follower:
 
 
 def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: float) -> float:
-    """Steering velocity of the road wheels towards a wanted angle, within the car's limits [rad/s]."""
+    """Steering velocity [rad/s] of the road wheels to ``target_steer``, within the car's limits."""
     target_steer = max(-car.largest_steer, min(car.largest_steer, target_steer))
     return max(
         -car.steering_rate, min(car.steering_rate, (target_steer - steer) / driver.steering_lag)

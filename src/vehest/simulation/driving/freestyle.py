@@ -35,10 +35,11 @@ class Freestyle(Manoeuvre):
     duration: Range = (20.0, 40.0)  # of the recording [s]
     speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest target speed [m/s]
     current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
+    # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
     sideslip: tuple[float, float] = (
         0.15,
         0.35,
-    )  # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
+    )
     brakes: float = 0.02  # share of the decisions that are a full braking
     kicks: float = 0.03  # share of the decisions that are a burst with the largest current
     straights: float = 0.15  # share of the steering decisions that are straight ahead
@@ -57,7 +58,8 @@ class Freestyle(Manoeuvre):
         super().__post_init__()
         if self.brakes + self.kicks > 1.0:
             raise ConfigurationError(
-                f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}"
+                f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and "
+                f"{self.kicks}"
             )
 
     @property
@@ -65,7 +67,9 @@ class Freestyle(Manoeuvre):
         """The longest that a recording may be drawn to be [s]."""
         return as_range(self.duration)[1]
 
-    def controller(self, car: PlanarCar, surface: Surface, seed: int) -> FreestyleDriver:  # type: ignore[override]
+    def controller(  # type: ignore[override]
+        self, car: PlanarCar, surface: Surface, seed: int
+    ) -> FreestyleDriver:
         """The driver of this seed."""
         return FreestyleDriver(self, car, OpenArea(surface, seed), Draws(seed))
 

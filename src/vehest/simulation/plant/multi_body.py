@@ -86,7 +86,8 @@ class PlantState:
     values: FloatArray  # the library's states, (29,)
     regime: Regime  # which equations hold
     spun: bool = False  # whether the car has been in a spin since its start
-    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag
+    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars
+    # whose forces lag
     lateral_ratio: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     x = _state(X, "Position on the ground [m].")
@@ -187,8 +188,9 @@ class MultiBodyPlant:
         )
         if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
             raise SimulationError(
-                f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at {_describe(values)}; lower "
-                f"the grip that is asked of it or the centre of gravity (h_s), or stiffen roll (K_tsf, K_tsr)"
+                f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at "
+                f"{_describe(values)}; lower the grip that is asked of it or the centre of gravity "
+                "(h_s), or stiffen roll (K_tsf, K_tsr)"
             )
         return PlantState(values, Regime(regime), state.spun or slid, lateral_ratio)
 
@@ -260,7 +262,7 @@ class MultiBodyPlant:
 
 
 def _writable(values: ArrayLike) -> FloatArray:
-    """The values as a contiguous, writable array: any other kind would be compiled for once more."""
+    """The values as a contiguous, writable array; another layout would be compiled separately."""
     return np.require(values, dtype=np.float64, requirements=["C", "W"])
 
 
@@ -273,6 +275,6 @@ def road_gravity(bank: float, grade: float) -> tuple[float, float]:
 
 def _describe(values: FloatArray) -> str:
     return (
-        f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} rad/s, "
-        f"roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"
+        f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} "
+        f"rad/s, roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"
     )

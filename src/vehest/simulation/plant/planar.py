@@ -57,7 +57,7 @@ PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+def _per_slip(slip, stiffness, shape):
     """sin(C atan(B s))/s."""
     return (
         math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
@@ -65,7 +65,7 @@ def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _derivative(state, target_steer, target_current, scale, p, forces):  # type: ignore[no-untyped-def]
+def _derivative(state, target_steer, target_current, scale, p, forces):
     """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its
     load.
     """
@@ -169,7 +169,7 @@ def _derivative(state, target_steer, target_current, scale, p, forces):  # type:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _advance(state, target_steer, target_current, scale, p, step, n_steps):  # type: ignore[no-untyped-def]
+def _advance(state, target_steer, target_current, scale, p, step, n_steps):
     """The state (22,) after n_steps steps of a Runge-Kutta method of fourth order with constant
     inputs.
     """
@@ -225,8 +225,9 @@ class PlanarPlant:
         after: FloatArray = _advance(state, *map(float, inputs), self._values, self.step, n_steps)
         if not np.isfinite(after).all():
             raise SimulationError(
-                f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = {state[VX]:.3g} m/s, "
-                f"vy = {state[VY]:.3g} m/s, yaw rate = {state[YAW_RATE]:.3g} rad/s; use a smaller step than {self.step:g} s"
+                f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = "
+                f"{state[VX]:.3g} m/s, vy = {state[VY]:.3g} m/s, yaw rate = {state[YAW_RATE]:.3g} "
+                f"rad/s; use a smaller step than {self.step:g} s"
             )
         return after
 
