@@ -9,7 +9,7 @@ from typing import Any, ClassVar, TypeVar
 from vehest.data.errors import ConfigurationError
 
 # of a setting, in SI units: far beyond what any of them means, far below what overflows
-LARGEST = 1e12
+MAX_SETTING = 1e12
 UNSET: Any = None  # default of a number that has to be given, or else follows from others
 MAX_WIDTH = 4096  # of a layer, a window or an ensemble: more would take all memory
 
@@ -38,8 +38,8 @@ class Declaration:
         """What is wrong with a value, as text that follows its name; empty if it is valid."""
         if value is None:
             return ""
-        if isinstance(value, int | float) and not abs(value) <= LARGEST:
-            return f"must be a number of at most {LARGEST:g}, not {value}"
+        if isinstance(value, int | float) and not abs(value) <= MAX_SETTING:
+            return f"must be a number of at most {MAX_SETTING:g}, not {value}"
         if self.positive and not value > 0:
             return f"must be positive, not {value}"
         low = self.least if self.least is not None else self.above

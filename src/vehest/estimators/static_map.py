@@ -16,7 +16,7 @@ from vehest.estimators.recursive import Recursive
 
 # of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified
 # separately
-CONDITION = 1e8
+MAX_CONDITION_NUMBER = 1e8
 
 
 class StaticMap(Recursive):
@@ -49,7 +49,7 @@ class StaticMap(Recursive):
             vy = vy - self.values[name] * columns[name]
         design = np.stack([columns[name] for name in self.unknown], axis=1)
         scale = np.sqrt(np.mean(np.square(design), axis=0))
-        if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
+        if not (scale > 0).all() or np.linalg.cond(design / scale) > MAX_CONDITION_NUMBER:
             raise DataError(
                 "the training recordings do not determine a static map: the car hardly turns, or "
                 "always at the same speed"

@@ -91,7 +91,7 @@ BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white
 SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
 MIN_SAMPLES = 20
 MIN_WHITE_SHARE = 0.01  # of an axle's slow error, so that no measurement is exact
-CHUNK = 20_000  # samples that are held at once
+SAMPLES_TOGETHER = 20_000  # samples that are held at once
 UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
 MIN_POSITIVE = 1e-9
 
@@ -512,8 +512,8 @@ def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatAr
     """Standard deviation of v along a drive [m/s], (T,)."""
     model, prior = _model_of(drive, inputs, levels)
     deviation = np.empty(len(drive.vy_ref))
-    for begin in range(0, len(deviation), CHUNK):
-        part = slice(begin, begin + CHUNK)
+    for begin in range(0, len(deviation), SAMPLES_TOGETHER):
+        part = slice(begin, begin + SAMPLES_TOGETHER)
         part_model = model._replace(
             transition=model.transition[part], observation=model.observation[part]
         )

@@ -49,7 +49,7 @@ from vehest.filters.unscented_loops import (
 )
 from vehest.filters.unscented_steps import room
 
-MARGIN = 1e-6
+MIN_EIGENVALUE_SHARE = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
 Array = NDArray[Any]
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -188,7 +188,7 @@ def _setting(
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
     return Setting(
-        (np.array(rule, dtype), lower, dtype(MARGIN), repair),
+        (np.array(rule, dtype), lower, dtype(MIN_EIGENVALUE_SHARE), repair),
         gate is not None,
         dtype(limit),
         patience,

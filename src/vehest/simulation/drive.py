@@ -142,7 +142,23 @@ def recording_of(
     sensors: SensorLevels,
     seed: int,
 ) -> Recording:
-    """The recording of a trip; its provenance is ``about``, then seed, sensors and flags."""
+    """The recording of a trip.
+
+    Parameters
+    ----------
+    id, vehicle : str
+        Of the recording.
+    trip : Trip
+        True motion and outcome.
+    channels : dict
+        Measured channels [SI], (T,) each, as `measure` returns them.
+    about : dict
+        First entries of the provenance: plant, manoeuvre, surface. Seed, sensors and flags follow.
+    sensors : SensorLevels
+        Levels of errors by which the channels were measured.
+    seed : int
+        Of the drive.
+    """
     provenance = {
         **about,
         "seed": seed,
@@ -172,8 +188,36 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion; raises `ConfigurationError` or,
-    where it rolls over, `SimulationError`.
+    """Drive a car through a manoeuvre.
+
+    Parameters
+    ----------
+    plant : MultiBodyPlant
+        The car.
+    manoeuvre : Manoeuvre
+        Makes the driver for the car, the surface and the seed.
+    seed : int
+        Of the driver and of patches on the surface.
+    rate_hz : float
+        Rate of the recorded motion [Hz]; its samples lie on steps of the plant.
+    surface : Surface
+        Friction of the road.
+    stability_control : bool
+        Whether the car has one that brakes single wheels.
+    stint : Stint or None
+        Loss of grip over the drive, unknown to the driver.
+
+    Returns
+    -------
+    Trip
+        True motion from the end of the settling time on, and outcome.
+
+    Raises
+    ------
+    ConfigurationError
+        A rate does not fit the plant's step, or the car cannot do the manoeuvre.
+    SimulationError
+        The car rolled over, or a state is not finite.
     """
     per_command = steps_per_tick(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = steps_per_tick(rate_hz, plant.step, "sampling")
@@ -342,8 +386,21 @@ class _Ride:
 
 
 def steps_per_tick(rate_hz: float, step: float, rate_name: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate; raises `ConfigurationError` where they
-    are not whole; ``what`` names the rate.
+    """Number of the plant's steps between two ticks of a rate.
+
+    Parameters
+    ----------
+    rate_hz : float
+        The rate [Hz].
+    step : float
+        Of the plant [s].
+    rate_name : str
+        Name of the rate in the error.
+
+    Raises
+    ------
+    ConfigurationError
+        The number is not whole.
     """
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:

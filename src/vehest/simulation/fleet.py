@@ -68,8 +68,12 @@ def variations_from_config(entries: Any) -> tuple[Variation, ...]:
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
-    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing
-    varies; raises `ConfigurationError`.
+    """The vehicle with parameters scaled as the seed draws them; the same one if nothing varies.
+
+    Raises
+    ------
+    ConfigurationError
+        A variation names no parameter of the plant, or one that is no number.
     """
     if not variations:
         return vehicle
@@ -93,8 +97,12 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
-    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no
-    parameter of the plant.
+    """`varied` for a car of the planar plant.
+
+    Raises
+    ------
+    ConfigurationError
+        A variation names no parameter of the plant.
     """
     return scaled_car(
         car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()}

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from vehest.data.errors import ConfigurationError
 
 # evaluated at once where no gradient is wanted: each is laid out by itself in memory
-MOST_WINDOWS = 1024
+MAX_WINDOWS_TOGETHER = 1024
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
@@ -162,7 +162,7 @@ def predict_members(
         predictions: Tensor = compiled_members(parameters, prepared, starts)
         return predictions
     offsets = torch.arange(n_window, device=starts.device)
-    pieces = [starts] if torch.is_grad_enabled() else starts.split(MOST_WINDOWS, dim=1)
+    pieces = [starts] if torch.is_grad_enabled() else starts.split(MAX_WINDOWS_TOGETHER, dim=1)
     return torch.cat(
         [
             _plain(network, parameters, prepared[piece.unsqueeze(-1) + offsets], seeds)

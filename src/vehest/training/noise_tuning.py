@@ -20,7 +20,7 @@ from vehest.training.search import (
     optuna_search,
 )
 
-LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
+MIN_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class IdentificationSettings(NoiseTuningSettings):
         "level far beyond the yaw rate's own changes a filter follows the gyroscope whatever its "
         "model says",
         unit="rad/s",
-        above=LEAST_PROCESS_YAW_RATE,
+        above=MIN_PROCESS_YAW_RATE,
     )
     error: Literal["samples", "recordings"] = setting(
         "samples",

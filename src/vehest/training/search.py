@@ -18,7 +18,7 @@ from vehest.data.errors import DataError, MissingError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
-FIRST_STEP = 0.05
+INITIAL_STEP_SHARE = 0.05
 UNUSABLE_COST = 1e6  # instead of a cost that is not finite: a search goes on elsewhere
 MAX_GRID = 1000  # starts along a parameter
 Cost = Callable[[FloatArray], float]
@@ -131,7 +131,7 @@ def _simplex(start: FloatArray, box: Box) -> FloatArray:
     """
     vertices = np.tile(start, (len(start) + 1, 1))
     for k, (low, high) in enumerate(box):
-        step = FIRST_STEP * (high - low)
+        step = INITIAL_STEP_SHARE * (high - low)
         vertices[k + 1, k] += step if start[k] + step <= high else -step
     return vertices
 

@@ -30,10 +30,10 @@ from vehest.vehicle.parameters import check_parameters
 
 TRACK_STATES = ("vy", "yaw_rate")
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
-LARGEST_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
-LEAST_SHARE = 0.2  # of the friction that sliding leaves
-LEAST_LOAD = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
-LEAST_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
+MAX_FORCE_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
+MIN_FRICTION_SHARE = 0.2  # of the friction that sliding leaves
+MIN_LOAD_SHARE = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
+MIN_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
 
 Tyres = Literal["plain", "smooth"]
 
@@ -70,9 +70,9 @@ class LoadedCar:
         front, rear = (
             GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle)
         )
-        return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (
+        return self.mass * (front - transfer).clamp(min=MIN_LOAD_SHARE * front), self.mass * (
             rear + transfer
-        ).clamp(min=LEAST_LOAD * rear)
+        ).clamp(min=MIN_LOAD_SHARE * rear)
 
 
 BMW_545I = LoadedCar()  # BMW 545i of Bertipaglia et al. 2024
@@ -96,11 +96,11 @@ class DugoffAxle(NamedTuple):
         slide = tangent.abs()
         half = (
             self.friction
-            * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE)
+            * (1.0 - self.reduction * vx * slide).clamp(min=MIN_FRICTION_SHARE)
             * load
             / (2.0 * self.cornering_stiffness)
         )
-        ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
+        ratio = half / torch.maximum(slide, half.detach() / MAX_FORCE_RATIO[tyres])
         force_share = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
         force: Tensor = self.cornering_stiffness * tangent * force_share
         return force
@@ -132,7 +132,7 @@ class DugoffTrack:
         course_front = (states[..., 0] + self.car.cg_to_front_axle * states[..., 1]) / vx
         course_rear = (states[..., 0] - self.car.cg_to_rear_axle * states[..., 1]) / vx
         turned = torch.tan(steer)
-        front = (turned - course_front) / (1.0 + turned * course_front).clamp(min=LEAST_COSINE)
+        front = (turned - course_front) / (1.0 + turned * course_front).clamp(min=MIN_COSINE)
         of_front = self.front.force(front, load_front, vx, self.tyres) * torch.cos(steer)
         return of_front, self.rear.force(-course_rear, load_rear, vx, self.tyres)
 

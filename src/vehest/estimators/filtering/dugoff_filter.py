@@ -52,11 +52,11 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedC
 Inputs = Literal["full", "imu"]
 Curve = Literal["plain", "smooth"]
 
-WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
+WHEEL_FORCES = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
 """Lateral force of an axle -> channels of its wheels."""
 INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")
 CHANNELS: dict[str, tuple[str, ...]] = {
-    "full": (*INERTIAL, *(wheel for pair in WHEELS.values() for wheel in pair)),
+    "full": (*INERTIAL, *(wheel for pair in WHEEL_FORCES.values() for wheel in pair)),
     "imu": INERTIAL,
 }
 MAX_SAMPLES_TOGETHER = 200_000  # samples that are filtered at a time
@@ -151,7 +151,7 @@ class DugoffFilter(SigmaPointEstimator):
             [
                 levels["ay"],
                 levels["yaw_rate"],
-                *(force_factor * levels.get(name, 1.0) for name in WHEELS),
+                *(force_factor * levels.get(name, 1.0) for name in WHEEL_FORCES),
             ]
             for force_factor in (factor, 1.0)
         ]

@@ -10,12 +10,12 @@ from vehest.constants import GRAVITY
 from vehest.estimators.filtering.dugoff_filter import DugoffFilter
 from vehest.estimators.filtering.track_filter import KAPPA, UNKNOWN_MOTION
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import MARGIN
+from vehest.filters.unscented_scan import MIN_EIGENVALUE_SHARE
 from vehest.vehicle.dugoff import (
-    LARGEST_RATIO,
-    LEAST_COSINE,
-    LEAST_LOAD,
-    LEAST_SHARE,
+    MAX_FORCE_RATIO,
+    MIN_COSINE,
+    MIN_FRICTION_SHARE,
+    MIN_LOAD_SHARE,
     TRACK_STATES,
 )
 
@@ -33,7 +33,7 @@ def track_c_values(estimator: DugoffFilter) -> dict[str, Any]:
         "rule": symmetric_rule(len(TRACK_STATES), KAPPA),
         "lower": None,
         "repair": True,
-        "margin": MARGIN,
+        "margin": MIN_EIGENVALUE_SHARE,
         "forces": has_forces,
         "smooth": estimator.curve == "smooth",
         "car": car,
@@ -49,8 +49,8 @@ def track_c_values(estimator: DugoffFilter) -> dict[str, Any]:
         "rear": estimator.axle_tyres[3:],
         "nonlinear_from": estimator.nonlinear_from,
         "linear_below": estimator.linear_below,
-        "largest": LARGEST_RATIO[estimator.curve],
-        "least_share": LEAST_SHARE,
-        "least_load": LEAST_LOAD,
-        "least_cosine": LEAST_COSINE,
+        "largest": MAX_FORCE_RATIO[estimator.curve],
+        "least_share": MIN_FRICTION_SHARE,
+        "least_load": MIN_LOAD_SHARE,
+        "least_cosine": MIN_COSINE,
     }

@@ -37,7 +37,7 @@ from vehest.training.sequences import (
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
 """Channels and outputs that change sign in a mirror, left for right; the others stay."""
-CHUNK = 10_000  # samples that are estimated at a time
+SAMPLES_TOGETHER = 10_000  # samples that are estimated at a time
 
 TRIAL = Trial(
     11,
@@ -301,8 +301,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         ]
         pieces = []
         with torch.no_grad():
-            for first in range(0, len(samples), CHUNK):
-                values, state = self.network(inputs[:, first : first + CHUNK], state)
+            for first in range(0, len(samples), SAMPLES_TOGETHER):
+                values, state = self.network(inputs[:, first : first + SAMPLES_TOGETHER], state)
                 pieces.append(values[0].numpy())
         return dict(zip(self.outputs, np.concatenate(pieces, dtype=float).T, strict=True)), state
 

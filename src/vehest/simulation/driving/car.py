@@ -26,7 +26,7 @@ USEFUL_SHARE = 0.985
 # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins;
 # assumed
 UNSTEADY = 0.5
-MARGIN = 0.85
+MAX_GRIP_SHARE = 0.85
 """Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver
 counts as all of the grip; assumed.
 """
@@ -66,8 +66,15 @@ class Car:
     ) -> float:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
-        Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly
-        depends on it. Curvature [1/m] and lateral acceleration [m/s²] are positive to the left.
+        Parameters
+        ----------
+        curvature : float
+            Of the path [1/m], positive to the left.
+        lateral_acceleration : float
+            In the turn [m/s²], positive to the left.
+        friction : float
+            Scale of the tyres' friction. It scales forces and slip angles alike, because a tyre's
+            cornering stiffness hardly depends on it.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -75,14 +82,24 @@ class Car:
     def sideslip_for(
         self, curvature: float, lateral_acceleration: float, friction: float = 1.0
     ) -> float:
-        """Sideslip [rad] in the same turn."""
+        """Sideslip [rad] at the centre of gravity in the turn of `steer_for`."""
         slip = self._at(self.rear_slip, lateral_acceleration, friction)
         return (self.wheelbase * self.front_share) * curvature - math.copysign(
             friction * slip, lateral_acceleration
         )
 
     def resistance(self, speed: float, yaw_rate: float, steer: float, sideslip: float) -> float:
-        """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn."""
+        """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn.
+
+        Parameters
+        ----------
+        speed : float
+            Over the ground [m/s].
+        yaw_rate : float
+            Positive to the left [rad/s].
+        steer, sideslip : float
+            Road-wheel angle and sideslip, positive to the left [rad].
+        """
         return self.drag * speed**2 + yaw_rate * speed * (
             self.front_share * math.sin(steer) - math.sin(sideslip)
         )
@@ -191,7 +208,7 @@ def _measure(
     )
     end = int(astray[0]) if len(astray) else len(steady) - 1
     limit = int(np.argmax(steady >= USEFUL_SHARE * steady[: end + 1].max()))
-    grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
+    grip = (MAX_GRIP_SHARE if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
         raise ConfigurationError(
             f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: "

@@ -150,8 +150,18 @@ class Command:
 def draw_style(
     seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float
 ) -> DrivingStyle:
-    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the
-    circle.
+    """The style that belongs to a seed.
+
+    Parameters
+    ----------
+    seed : int
+        Of the drive.
+    grip_range : tuple
+        Lowest and highest mean share of the grip; the style's is drawn uniformly between them.
+    ripple : float
+        Amplitude of the share's variation along the drive.
+    line_offset : float
+        Amplitude of the line's lateral offset [m].
     """
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
@@ -171,10 +181,29 @@ def plan_laps(
     friction: FloatArray,
     highest_speed: FloatArray | float,
 ) -> Plan:
-    """Line and speed profile over one whole lap or more, within the car's limits.
+    """Line and speed profile over laps, within the car's limits.
 
-    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one
-    value or one for each of the n_laps·(N - 1) + 1 samples.
+    Parameters
+    ----------
+    course : Course
+        Centre line of a closed course at N samples, of which the last repeats the first.
+    car : Car
+        Limits of the car.
+    driver : Driver
+        Share of the grip for braking.
+    style : DrivingStyle
+        Share of the grip and lateral offset of the line, both varying along the drive.
+    n_laps : int
+        Number of laps, 1 or more.
+    friction : array, shape (N,)
+        Scale of the tyres' friction on the course's samples.
+    highest_speed : array or float
+        Limit set by the driver [m/s], for each of the n_laps·(N - 1) + 1 samples or all.
+
+    Returns
+    -------
+    Plan
+        Of n_laps·(N - 1) + 1 samples.
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
@@ -449,7 +478,17 @@ class Follower:
 
 
 def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: float) -> float:
-    """Steering velocity [rad/s] of the road wheels to ``target_steer``, within the car's limits."""
+    """Steering velocity of the road wheels towards an angle, within the car's limits [rad/s].
+
+    Parameters
+    ----------
+    car : Car
+        Largest steering angle and velocity.
+    driver : Driver
+        Time constant of the steering.
+    target_steer, steer : float
+        Requested and present road-wheel angle [rad].
+    """
     target_steer = max(-car.largest_steer, min(car.largest_steer, target_steer))
     return max(
         -car.steering_rate, min(car.steering_rate, (target_steer - steer) / driver.steering_lag)

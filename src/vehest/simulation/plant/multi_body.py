@@ -161,8 +161,16 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or
-        standing.
+        """The state in equilibrium, rolling straight ahead or standing.
+
+        Parameters
+        ----------
+        x, y : float
+            Place of the centre of gravity [m].
+        yaw : float
+            Heading, positive to the left [rad].
+        vx : float
+            Forward speed [m/s].
         """
         values = self._at_rest.copy()
         values[[X, Y, YAW, VX]] = x, y, yaw, vx
@@ -172,8 +180,25 @@ class MultiBodyPlant:
     def advance(
         self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0
     ) -> PlantState:
-        """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the
-        car rolls over or diverges.
+        """The state after some steps.
+
+        Parameters
+        ----------
+        state : PlantState
+            Before the first step.
+        inputs : array, shape (5,)
+            Constant over the steps: steering velocity of the road wheels [rad/s], longitudinal
+            acceleration [m/s²], yaw moment of a stability control [N m], gravity along and across
+            the car [m/s²].
+        n_steps : int
+            Number of the plant's steps.
+        friction : float
+            Scale of the tyres' friction, constant over the steps.
+
+        Raises
+        ------
+        SimulationError
+            The car rolls over or diverges.
         """
         inputs = _writable(inputs)
         values, regime, slid, lateral_ratio = compiled.advance(
@@ -197,10 +222,22 @@ class MultiBodyPlant:
     def evaluate(
         self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for
-        motion.WHEELS [N].
+        """Derivatives of states, and tyre forces.
 
-        ``inputs`` are (T, 5); ``friction`` scales friction, (T,) or one for all.
+        Parameters
+        ----------
+        states : sequence of PlantState
+            T states.
+        inputs : array, shape (T, 5)
+            As in `advance`.
+        friction : array, shape (T,), or float
+            Scale of the tyres' friction.
+
+        Returns
+        -------
+        tuple
+            Derivatives (T, 29); forces along, across and up, (T, 3, 4) [N], in the order of
+            `motion.WHEELS`.
         """
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)

@@ -54,8 +54,20 @@ class StabilityControl:
         yaw_rate: float,
         friction: float = 1.0,
     ) -> StabilityState:
-        """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as
-        far as the control knows it.
+        """The state one interval later.
+
+        Parameters
+        ----------
+        before : StabilityState
+            The last state.
+        interval : float
+            Time since then [s].
+        steer : float
+            Road-wheel angle [rad].
+        vx, yaw_rate : float
+            Measured speed [m/s] and yaw rate [rad/s].
+        friction : float
+            Scale of the tyres' friction that the control assumes.
         """
         if vx < self.slowest:
             return StabilityState(reference=yaw_rate)

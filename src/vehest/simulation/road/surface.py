@@ -54,10 +54,16 @@ class Surface:
     def along(
         self, distance: FloatArray, drive_seed: int, length: float | None = None
     ) -> FloatArray:
-        """Scale at each distance along the way, (N,) [m], zero or positive, uniform.
+        """Scale of the tyres' friction along the way, (N,).
 
-        The drive's seed draws the patches if the surface has none of its own; after a lap's
-        ``length`` [m] the same come again, by default never.
+        Parameters
+        ----------
+        distance : array, shape (N,)
+            Distances at which to evaluate it [m], zero or positive, uniform.
+        drive_seed : int
+            Draws the patches if the surface has no seed.
+        length : float or None
+            Of a lap, after which the same patches come again [m]; None: never.
         """
         if self.patches is None:
             return np.full(distance.shape, self.friction)
