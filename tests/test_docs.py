@@ -90,7 +90,7 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
 
 def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(make_reference, "RESULTS", tmp_path)
-    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page(
+    assert make_reference.PART.sub(make_reference.generated_part, page("docs/results.md")) == page(
         "docs/results.md"
     )
 
@@ -418,7 +418,7 @@ def test_stated_filter_is_the_resampling_filter():
     text = " ".join(page("docs/data.md").split())
     assert f"β = {Resample.kaiser_beta:g}, {Resample.zero_crossings} zero crossings" in text
     assert f"is at {Resample.cutoff:g} of the slower Nyquist frequency" in text
-    frequencies, response = signal.freqz(Resample(20.0)._taps(1, 5), worN=1 << 14, fs=100.0)
+    frequencies, response = signal.freqz(Resample(20.0).taps(1, 5), worN=1 << 14, fs=100.0)
     decibels = 20.0 * np.log10(np.abs(response) + 1e-12)
     assert (
         "flat within 0.1 dB up to 7.5 Hz, -3 dB at 8.3 Hz, and at least 71 dB down from 10 Hz on"

@@ -86,11 +86,11 @@ def complete(n_pairs, ratio=2.0):
 def test_pairs_without_all_trainings_and_seeds_of_some_pairs_are_left_out():
     fvus = complete(3)
     errors = pd.concat([errors_of(fvus), errors_of(complete(2)).assign(seed=1)])
-    complete_rows = pairs._complete(errors)
-    assert set(complete_rows["pair"]) == {"pair 01", "pair 02", "pair 03"}
-    assert set(complete_rows["seed"]) == {0}
+    rows_of_complete_pairs = pairs.complete_pairs(errors)
+    assert set(rows_of_complete_pairs["pair"]) == {"pair 01", "pair 02", "pair 03"}
+    assert set(rows_of_complete_pairs["seed"]) == {0}
     del fvus["pair 03", "stop", paper.GRU]
-    assert set(pairs._complete(errors_of(fvus))["pair"]) == {"pair 01", "pair 02"}
+    assert set(pairs.complete_pairs(errors_of(fvus))["pair"]) == {"pair 01", "pair 02"}
 
 
 def test_ratio_over_pairs_equals_the_planted_ratio_with_power_from_the_spread():

@@ -572,8 +572,8 @@ def test_a_drive_is_scored_until_it_slides_and_sliding_drives_are_counted():
         }
         return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
 
-    assert document._number_beyond(driven(3.0, 43.0, 11.9, 180.0), 0.21) == 2
-    assert document._number_beyond(driven(3.0), 0.21) == 0
+    assert document.number_beyond(driven(3.0, 43.0, 11.9, 180.0), 0.21) == 2
+    assert document.number_beyond(driven(3.0), 0.21) == 0
 
 
 def test_network_outputs_are_compared_with_the_reference_of_the_same_time(part, runs, monkeypatch):
