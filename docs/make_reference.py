@@ -110,10 +110,12 @@ def pages() -> dict[Path, str]:
     found = {
         file: file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").rglob("*.md"))
     }
-    return {file: PART.sub(_made, text) for file, text in found.items() if PART.search(text)}
+    return {
+        file: PART.sub(generated_part, text) for file, text in found.items() if PART.search(text)
+    }
 
 
-def _made(part: re.Match[str]) -> str:
+def generated_part(part: re.Match[str]) -> str:
     """A part anew; as it is where the results that it shows are not here."""
     paragraphs = list(PARTS[part[1]](*part[2].split()))
     return f"{part[1]}{part[2]} -->\n" + "\n\n".join(paragraphs) if paragraphs else part[0]

@@ -36,14 +36,17 @@ def picture(driver, top, width, path):
 
 
 def main(report, site, out):
-    """Write ``report_*`` (its beginning), ``traces_*`` (traces, course, filter) and ``site_*`` at both widths, light and dark."""
+    """Write ``report_*`` (its beginning), ``traces_*`` (traces, course, filter) and ``site_*`` at
+    both widths, light and dark.
+    """
     out.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as driver:
         for width in LOOKS:
             for scheme in SCHEMES:
                 opened(driver, report.resolve(), width=width, scheme=scheme)
                 for name, selector in {"report": "h1", "traces": "figure.live"}.items():
-                    script = f"return document.querySelector('{selector}').getBoundingClientRect().top + scrollY"
+                    element = f"document.querySelector('{selector}')"
+                    script = f"return {element}.getBoundingClientRect().top + scrollY"
                     picture(
                         driver,
                         driver.execute_script(script),

@@ -1,4 +1,7 @@
-"""README and the guides show commands on docs/examples/lap.csv with their output; here they run in an empty folder as printed."""
+"""README and the guides show commands on docs/examples/lap.csv with their output.
+
+Here they run in an empty folder as printed.
+"""
 
 import re
 import shlex
@@ -14,7 +17,7 @@ pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).resolve().parents[1]
 LOG = ROOT / "docs" / "examples" / "lap.csv"
-SHOWN = re.compile(
+COMMAND_WITH_OUTPUT = re.compile(
     r"^```sh\n(?P<commands>.*?)^```$(?:\n\n[^`#|]*?)?\n\n?```(?:text|output)\n(?P<output>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -31,9 +34,9 @@ CASES = [
 ]
 
 
-def shown(page, start):
+def example(page, start):
     """The command of a page that begins so, and the lines of its output."""
-    for match in SHOWN.finditer((ROOT / page).read_text(encoding="utf-8")):
+    for match in COMMAND_WITH_OUTPUT.finditer((ROOT / page).read_text(encoding="utf-8")):
         command = match["commands"].splitlines()[-1]
         if command.startswith(start):
             return command, match["output"].splitlines()
@@ -58,8 +61,8 @@ def run(command, capsys):
 
 
 @pytest.mark.parametrize(("page", "start"), CASES)
-def test_shown_output_is_what_the_command_prints(page, start, folder, capsys):
-    command, lines = shown(page, start)
+def test_stated_output_is_printed_by_the_command(page, start, folder, capsys):
+    command, lines = example(page, start)
     if "vehest new" not in command:
         run(NEEDS, capsys)
     printed = run(command, capsys)

@@ -1,4 +1,6 @@
-"""Numbers of every estimator family, source and stage on small recordings, and what is recorded of them; `make golden` records anew."""
+"""Numbers of every estimator family, source and stage on small recordings, and what is recorded of
+them; `make golden` records anew.
+"""
 
 import contextlib
 import csv
@@ -66,28 +68,28 @@ class Subject:
 
 def subjects():
     """All of them, by name."""
-    found = {
+    all_subjects = {
         name: _estimator(name)
         for name in estimator_names()
         if estimator_class(name).__module__.startswith("vehest.")
     }
     for name, make in SOURCES.items():
         tolerance = SIMULATED if name == "simulated" else FIXED
-        told = source_class({"source": name})
-        found[f"source {name}"] = Subject(
-            {f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make)
+        source = source_class({"source": name})
+        all_subjects[f"source {name}"] = Subject(
+            {f"{source.__name__}.version": source.version}, tolerance, partial(in_folder, make)
         )
     for stage, numbers in STAGES.items():
         name = stage.__name__.removeprefix("vehest.run.")
         tolerance = FIXED
-        what = f"{name} in vehest.run.versions"
+        version_name = f"{name} in vehest.run.versions"
         if stage is not downsample:
-            what = f"{what}, unless numbers of {MODEL} moved too,"
+            version_name = f"{version_name}, unless numbers of {MODEL} moved too,"
             tolerance = LEARNT
-        found[f"stage {name}"] = Subject(
-            {what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
+        all_subjects[f"stage {name}"] = Subject(
+            {version_name: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
         )
-    return found
+    return all_subjects
 
 
 def this_machine():
@@ -101,7 +103,10 @@ def this_machine():
 
 
 def moved(name, recorded, now, tolerance):
-    """What to do about numbers that are not those recorded; empty where they are. Digests are compared where there is no tolerance."""
+    """What to do about numbers that are not those recorded.
+
+    Empty where they are. Digests are compared where there is no tolerance.
+    """
     if recorded["versions"] != now["versions"]:
         return f"a version of {name} was raised: record its numbers with `make golden`"
     if tolerance is None:
@@ -118,13 +123,16 @@ def moved(name, recorded, now, tolerance):
         ]
     if not parts:
         return ""
-    own, *training = now["versions"]
-    what = (
-        own
+    version, *training = now["versions"]
+    version_to_raise = (
+        version
         if not training or "weights" not in parts
-        else f"{own}, or {training[0]} if all that it trains moved,"
+        else f"{version}, or {training[0]} if all that it trains moved,"
     )
-    return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
+    return (
+        f"{' and '.join(parts)} of {name} moved: "
+        f"raise {version_to_raise} if that is meant, then run `make golden`"
+    )
 
 
 def digest_of(arrays, digits=DIGITS):
@@ -217,14 +225,16 @@ def _can(folder):
 
     write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
-    told = {
+    can_options = {
         "files": "drive.*",
         "dbc": str(folder / "car.dbc"),
         "rate_hz": 100,
         "channels": channels,
     }
     return _channels(
-        open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive")
+        open_source({"name": "mine", "source": "can", "path": str(folder), **can_options}).read(
+            "drive"
+        )
     )
 
 
@@ -284,13 +294,13 @@ def _downsampled(folder):
     return _channels(recording)
 
 
-def _made(pattern):
+def _artefact_file(pattern):
     (file,) = (Path(_study().name) / "outputs").glob(pattern)
     return file
 
 
 def _metrics(chosen):
-    with _made("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
+    with _artefact_file("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
     metrics = {}
     for row in rows:
@@ -302,9 +312,11 @@ def _metrics(chosen):
 
 @cache
 def _study():
-    """A folder with a small study: one model, calibrated, evaluated without faults and under one."""
-    made = tempfile.TemporaryDirectory()
-    folder = Path(made.name)
+    """A folder with a small study: one model, calibrated, evaluated without faults and
+    under one.
+    """
+    study_folder = tempfile.TemporaryDirectory()
+    folder = Path(study_folder.name)
     Place(folder, None)
     with (
         contextlib.chdir(folder),
@@ -313,7 +325,7 @@ def _study():
     ):
         for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
             run(*words)
-    return made
+    return study_folder
 
 
 def _leaves(path, content):
@@ -330,7 +342,9 @@ def _leaves(path, content):
 STAGES = {
     downsample: _downsampled,
     calibrate: lambda _: dict(
-        _leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))
+        _leaves(
+            "", yaml.safe_load(_artefact_file("calibrate/*/trust.yaml").read_text(encoding="utf-8"))
+        )
     ),
     evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
     evaluate_faults: lambda _: _metrics(is_fault),
@@ -340,11 +354,13 @@ STAGES = {
 def main():
     """Record the numbers of this machine."""
     former = json.loads(FILE.read_text(encoding="utf-8"))["subjects"] if FILE.is_file() else {}
-    made = {}
+    records = {}
     for name, subject in subjects().items():
-        made[name] = subject.record()
-        print(f"{name}: {'as before' if made[name] == former.get(name) else 'recorded'}")
-    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(record)}" for name, record in made.items())
+        records[name] = subject.record()
+        print(f"{name}: {'as before' if records[name] == former.get(name) else 'recorded'}")
+    lines = ",\n".join(
+        f"{json.dumps(name)}: {json.dumps(record)}" for name, record in records.items()
+    )
     FILE.write_text(
         f'{{"machine": {json.dumps(this_machine())},\n"subjects": {{\n{lines}\n}}}}\n',
         encoding="utf-8",

@@ -1,4 +1,6 @@
-"""claims.yaml, blocks.csv and training.csv: read as they are, or refused in one line that names the fault."""
+"""claims.yaml, blocks.csv and training.csv: read as they are, or refused in one line that names the
+fault.
+"""
 
 from pathlib import Path
 
@@ -107,7 +109,7 @@ def test_a_paper_is_read(tmp_path):
         ),
     ],
 )
-def test_a_fault_is_one_line_with_file_claim_and_key(tmp_path, changes, message):
+def test_a_faulty_claim_is_refused_in_a_line_with_file_claim_and_key(tmp_path, changes, message):
     entry = {key: value for key, value in (ORDER | changes).items() if value is not None}
     with pytest.raises(DataError) as caught:
         read_paper(written(tmp_path, entry))

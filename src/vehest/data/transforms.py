@@ -118,7 +118,7 @@ class Resample:
                 f"{length} samples",
             )
             names = _without_gaps(recording, tuple(recording.channels))
-            taps = self._taps(up, down)
+            taps = self.taps(up, down)
             n_out = -(-len(recording) * up // down)
             channels = {name: _resampled(recording[name], up, down, taps, n_out) for name in names}
         return replace(recording, rate_hz=self.rate_hz, channels=channels)
@@ -132,7 +132,8 @@ class Resample:
         down = ratio.denominator
         return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
 
-    def _taps(self, up: int, down: int) -> FloatArray:
+    def taps(self, up: int, down: int) -> FloatArray:
+        """Coefficients of the anti-aliasing filter at ``up`` times the rate of the recording."""
         slower = max(up, down)
         half = self.zero_crossings * slower
         taps, window = windowed_sinc(half, self.cutoff / slower, self.kaiser_beta)
