@@ -16,6 +16,8 @@ SHOWN = (
     "docs/estimators.html",
     "docs/estimators/ksnn.html",
     "results/ferrari_drive/report.html",
+    "results/scorecard.html",
+    "results/scorecard/heavy_ekf.html",
 )
 
 

@@ -64,7 +64,7 @@ def test_counts_of_the_front_page_are_those_of_the_csv(files, rows):
     assert [row[0] for row in table] == [*VERDICTS, "all claims"]
     for verdict, *numbers in table:
         has_verdict = claims["verdict"].eq(verdict) | (verdict == "all claims")
-        for paper, number in zip([*PAPERS, "all"], numbers, strict=True):
+        for paper, number in zip(["all", *PAPERS], numbers, strict=True):
             chosen = has_verdict & (claims["paper"].eq(paper) | (paper == "all"))
             n_provisional = (chosen & is_provisional).sum()
             text = f"{chosen.sum()} ({n_provisional})" if n_provisional else f"{chosen.sum()}"
@@ -75,7 +75,7 @@ def test_counts_of_the_front_page_are_those_of_the_csv(files, rows):
     is_undecided = claims["verdict"].isin(["no significant difference", "inconclusive"])
     has_power = pd.to_numeric(claims["power"]) >= 0.8
     sizeable = claims["verdict"].eq("no significant difference") & has_power & ~is_provisional
-    summary = " ".join(section(page, "In two minutes").split())
+    summary = " ".join(section(page, "Summary").split())
     for sentence in (
         f"{is_assessed.sum()} of {len(claims)} claims so far. {counts['not assessed']} wait",
         f"{counts['not testable']} need data that are not public",
@@ -99,7 +99,7 @@ def test_rates_of_the_front_page_are_those_of_the_simulated_studies(files):
     several = rates[rates["seeds"] == 3]
     wrong = several.loc[several["truth"] == "no effect", "wrong"]
     met = several.loc[several["truth"] == "the paper's effect", "met"]
-    summary = " ".join(section(files["scorecard.md"], "In two minutes").split())
+    summary = " ".join(section(files["scorecard.md"], "Summary").split())
     assert f"{wrong.min():.0f} to {wrong.max():.0f} % of the verdicts found one" in summary
     assert f"found in {met.min():.0f} to {met.max():.0f} % of the studies" in summary
     table = cells(section(files["scorecard.md"], "How often these verdicts are right"))
@@ -207,7 +207,7 @@ def test_a_study_with_errors_is_judged_and_a_stale_page_is_noticed(tmp_path, cap
     claims = section(page, "Claims").split("### Direction only")[1].split("###")[0]
     row = next(line for line in claims.splitlines() if "than GRU on the tyre used for" in line)
     assert "*provisional: insufficient*" in row
-    assert re.search(r"\| 0\.829 \| 0\.[45]\d+ \[0\.\d+, 0\.\d+\]; by block 0\.", row)
+    assert re.search(r"\| 0\.829 \| 0\.[45]\d+ \[0\.\d+, 0\.\d+\]<br>by block 0\.", row)
     method = next(line for line in page.splitlines() if line.startswith("| NNTF\\_UH | NNTF"))
     assert "100 + 100 / 1000 + 1000, insufficient | 3 |" in method
     table = next(line for line in page.splitlines() if line.startswith("| NNTF\\_UH | `mse_"))

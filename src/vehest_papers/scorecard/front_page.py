@@ -9,7 +9,7 @@ from pathlib import Path
 from vehest.data.text_files import number_in, read_rows
 from vehest.report.style import MISSING
 from vehest_papers.kit.block_rows import MAX_IMPROVEMENT
-from vehest_papers.kit.verdicts import TARGET_POWER, VERDICTS
+from vehest_papers.kit.verdicts import ALPHA, TARGET_POWER, VERDICTS
 from vehest_papers.scorecard.judged import DATA_KINDS, Study
 from vehest_papers.scorecard.markdown import (
     counted,
@@ -22,6 +22,7 @@ from vehest_papers.scorecard.markdown import (
 )
 
 TEMPLATE = Path(__file__).with_name("front_page.md.j2")
+MET = ("reproduced", "direction only")
 UNDECIDED = ("no significant difference", "inconclusive")
 NO_EFFECT = "no effect"
 EFFECT = "the paper's effect"
@@ -36,18 +37,25 @@ def front_page(studies: Sequence[Study], results: Path) -> str:
     for study in studies:
         counts += study.counts(study.claims_of_paper)
         data += study.counts_of_data()
-    claims = [(study, claim) for study in studies for claim in study.claims_of_paper]
-    effects_not_found = [
-        claim
-        for study, claim in claims
-        if study.claims[claim.id].verdict == "no significant difference"
-        and study.claims[claim.id].power >= TARGET_POWER
-        and not study.is_provisional(claim)
+    claims = [
+        (study.claims[claim.id], study.paper.parts.get(claim.part), study.is_provisional(claim))
+        for study in studies
+        for claim in study.claims_of_paper
     ]
-    real = [
-        (study, claim)
-        for study, claim in claims
-        if claim in study.assessed_claims and study.paper.parts[claim.part] == "real"
+    undecided = [
+        is_provisional for judgement, _, is_provisional in claims if judgement.verdict in UNDECIDED
+    ]
+    met_on_real = [
+        is_provisional
+        for judgement, kind, is_provisional in claims
+        if judgement.verdict in MET and kind == "real"
+    ]
+    effects_not_found = [
+        judgement
+        for judgement, _, is_provisional in claims
+        if judgement.verdict == "no significant difference"
+        and judgement.power >= TARGET_POWER
+        and not is_provisional
     ]
     rates = _planted_truth(results / "scorecard" / "planted_truth.csv")
     values = {
@@ -56,24 +64,13 @@ def front_page(studies: Sequence[Study], results: Path) -> str:
         "n_provisional": sum(len(study.provisional_claims) for study in studies),
         "n_table_values": sum(len(study.rows) for study in studies),
         "counts": {verdict: counts[verdict] for verdict in VERDICTS},
-        "n_undecided": sum(counts[verdict] for verdict in UNDECIDED),
-        "n_undecided_provisional": sum(
-            study.counts(study.provisional_claims)[verdict]
-            for study in studies
-            for verdict in UNDECIDED
-        ),
+        "n_undecided": len(undecided),
+        "n_undecided_provisional": sum(undecided),
         "n_effects_not_found": len(effects_not_found),
         "target_power": round(100 * TARGET_POWER),
         "data": {kind: data[kind] for kind in DATA_KINDS},
-        "n_real_met": sum(
-            study.claims[claim.id].verdict in ("reproduced", "direction only")
-            for study, claim in real
-        ),
-        "n_real_met_provisional": sum(
-            study.claims[claim.id].verdict in ("reproduced", "direction only")
-            and study.is_provisional(claim)
-            for study, claim in real
-        ),
+        "n_met_on_real": len(met_on_real),
+        "n_met_on_real_provisional": sum(met_on_real),
         "papers": [
             {
                 "title": study.title,
@@ -90,13 +87,14 @@ def front_page(studies: Sequence[Study], results: Path) -> str:
         "basis": _basis(studies),
         "max_improvement": round(100 * MAX_IMPROVEMENT),
         "rates": rates,
+        "nominal": round(100 * ALPHA),
         "planted": _planted_table(rates),
     }
     return filled(TEMPLATE, values)
 
 
 def _verdicts(studies: Sequence[Study]) -> str:
-    """Number of claims by verdict and paper, with their sums; in brackets provisional ones."""
+    """Number of claims by verdict and paper, their sums first; in brackets provisional ones."""
     numbers = [
         (study.counts(study.claims_of_paper), study.counts(study.provisional_claims))
         for study in studies
@@ -121,12 +119,12 @@ def _basis(studies: Sequence[Study]) -> str:
 
 def _with_sum(pairs: Sequence[tuple[int, int]]) -> list[str]:
     sums = (sum(first for first, _ in pairs), sum(second for _, second in pairs))
-    return [counted(*pair) for pair in [*pairs, sums]]
+    return [counted(*pair) for pair in [sums, *pairs]]
 
 
 def _table_of_papers(heading: str, studies: Sequence[Study], rows: Iterable[Sequence[str]]) -> str:
     links = [f"[{study.title}](scorecard/{study.paper.paper}.md)" for study in studies]
-    return table((heading, *links, "all"), rows, n_text=1)
+    return table((heading, "all", *links), rows, n_text=1)
 
 
 def _counted_names(names: Sequence[str]) -> str:
@@ -146,9 +144,11 @@ def _planted_truth(path: Path) -> dict[str, object]:
         rates["covered"] = min(covered, rates.get("covered", 100.0))
     several = [rates for (_, seeds), rates in designs.items() if int(seeds) > 1]
     single = [rates for (_, seeds), rates in designs.items() if int(seeds) == 1]
+    [n_seeds] = {seeds for _, seeds in designs if int(seeds) > 1}
     [ratio] = {number_in(row, "ratio", path) for row in rows if row["truth"] == EFFECT}
     return {
         "designs": designs,
+        "seeds": n_seeds,
         "studies": rows[0]["studies"],
         "reduction": round(100 * (1 - ratio)),
         "wrong": _range(rates[f"wrong, {NO_EFFECT}"] for rates in several),

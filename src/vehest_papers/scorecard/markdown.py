@@ -81,13 +81,17 @@ def report_link(study: Study, results: Path, root: str) -> str:
 def evidence(study: Study, n_claims: int | None = None) -> str:
     """Table of the (first) claims that the recommendation rests on."""
     claims = {claim.id: claim for claim in study.paper.claims}
+    n_seeds = study.n_seeds()
     rows = []
     for name in list(study.paper.rests_on)[:n_claims]:
         claim = claims[name]
         judgement = study.claims[name]
+        verdict = in_italics(judgement.verdict, study.is_provisional(claim))
+        if any(n_seeds.get(candidate) == 1 for candidate in claim.names):
+            verdict += ", trained once"
         rows.append(
             (
-                in_italics(judgement.verdict, study.is_provisional(claim)),
+                verdict,
                 sentence_of(claim),
                 ratio_published(claim),
                 ratio_ours(claim, judgement),
@@ -135,7 +139,7 @@ def ratio_ours(claim: Claim, judgement: Judgement) -> str:
         return figures_in_words(judgement, unit_of(claim), escaped)
     words = figure_in_words(judgement.size)
     if judgement.order is not None:
-        words += f"; by block {figure_in_words(judgement.order)}"
+        words += f"<br>by block {figure_in_words(judgement.order)}"
     return words
 
 
