@@ -61,9 +61,9 @@ def test_counts_of_the_front_page_are_those_of_the_csv(files, rows):
     is_provisional = is_assessed & ~claims["training"].isin(["sufficient", "not applicable"])
     page = files["scorecard.md"]
     table = cells(section(page, "Verdicts"))
-    assert [row[0] for row in table] == [*VERDICTS, "all claims"]
+    assert [row[0] for row in table] == [*VERDICTS, "all"]
     for verdict, *numbers in table:
-        has_verdict = claims["verdict"].eq(verdict) | (verdict == "all claims")
+        has_verdict = claims["verdict"].eq(verdict) | (verdict == "all")
         for paper, number in zip(["all", *PAPERS], numbers, strict=True):
             chosen = has_verdict & (claims["paper"].eq(paper) | (paper == "all"))
             n_provisional = (chosen & is_provisional).sum()

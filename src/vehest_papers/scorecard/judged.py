@@ -43,6 +43,11 @@ class Study:
         return TITLES[self.paper.paper]
 
     @property
+    def page(self) -> str:
+        """File of the paper's page, below results/."""
+        return f"scorecard/{self.paper.paper}.md"
+
+    @property
     def claims_of_paper(self) -> list[Claim]:
         """Claims without the comparisons that we added."""
         return [claim for claim in self.paper.claims if not claim.is_added]
@@ -65,10 +70,6 @@ class Study:
     def counts(self, claims: Iterable[Claim]) -> Counter[str]:
         """Verdict -> number of claims."""
         return Counter(self.claims[claim.id].verdict for claim in claims)
-
-    def counts_of_data(self) -> Counter[str]:
-        """Real, simulated or computed -> number of assessed claims."""
-        return Counter(self.paper.parts[claim.part] for claim in self.assessed_claims)
 
     def candidates(self, claims: Iterable[Claim], state: TrainingState) -> list[str]:
         """Candidates of some claims whose training has a state, in the paper's order."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from vehest.report.style import MISSING, significant
+from vehest.report.style import significant
 from vehest.report.template import fill_template
 from vehest_papers.kit.block_rows import TrainingState
 from vehest_papers.kit.claim_files import Claim
@@ -141,10 +141,3 @@ def ratio_ours(claim: Claim, judgement: Judgement) -> str:
     if judgement.order is not None:
         words += f"<br>by block {figure_in_words(judgement.order)}"
     return words
-
-
-def counted(n_claims: int, n_provisional: int) -> str:
-    """Number of claims with, in brackets, how many of them are provisional."""
-    if not n_claims:
-        return MISSING
-    return f"{n_claims} ({n_provisional})" if n_provisional else str(n_claims)
