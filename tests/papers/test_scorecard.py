@@ -19,7 +19,7 @@ from vehest_papers.scorecard.markdown import recommendation
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
-MAX_FRONT_PAGE_WORDS = 1800  # with the figures of its tables; about 1,500 words of text
+MAX_FRONT_PAGE_WORDS = 1600  # numbers are not counted
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,8 @@ def test_rates_of_the_front_page_are_those_of_the_simulated_studies(files):
 
 def test_the_front_page_is_short_and_every_claim_is_on_one_page(files, rows):
     text = re.sub(r"\]\([^)]*\)|\||:?--:?", " ", files["scorecard.md"])
-    assert len(text.split()) <= MAX_FRONT_PAGE_WORDS
+    n_words = sum(any(map(str.isalpha, word)) for word in text.split())
+    assert n_words <= MAX_FRONT_PAGE_WORDS
     for paper in PAPERS:
         page = files[f"scorecard/{paper}.md"]
         of_paper = rows[rows["paper"] == paper]

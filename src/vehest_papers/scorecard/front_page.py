@@ -121,7 +121,7 @@ def _planted_truth(path: Path) -> dict[str, object]:
         "half of it: found": by_truth["half of it"]["met"],
         "size in interval, at least": rates.groupby(["design", "seeds"])["size_covered"].min(),
     }
-    wrong, found, *_ = columns.values()
+    wrong, detected, *_ = columns.values()
     n_seeds = int(rates["seeds"].max())
     rows = [
         (design, str(seeds), *(f"{values[design, seeds]:.1f}" for values in columns.values()))
@@ -133,7 +133,7 @@ def _planted_truth(path: Path) -> dict[str, object]:
         "reduction": round(100 * (1 - effect["ratio"].max())),
         "wrong": _range(wrong.xs(n_seeds, level="seeds")),
         "wrong_single": _range(wrong.xs(1, level="seeds")),
-        "found": _range(found.xs(n_seeds, level="seeds")),
+        "detected": _range(detected.xs(n_seeds, level="seeds")),
         "planted": table(("blocks", "seeds", *columns), rows, n_text=1),
     }
 
