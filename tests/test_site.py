@@ -18,6 +18,8 @@ CHECKED_PAGES = (
     "docs/estimators.html",
     "docs/estimators/ksnn.html",
     "results/ferrari_drive/report.html",
+    "results/scorecard.html",
+    "results/scorecard/heavy_ekf.html",
 )
 
 

@@ -128,6 +128,13 @@ def test_ids_are_unique_and_tables_name_declared_candidates(tmp_path):
         read_paper(written(tmp_path, tables=[table]))
 
 
+def test_a_recommendation_rests_on_claims_of_the_file(tmp_path):
+    rests_on = {"a_below_b": ["reproduced"]}
+    assert read_paper(written(tmp_path, ORDER, rests_on=rests_on)).rests_on == rests_on
+    with pytest.raises(DataError, match="rests_on: no claim has the id 'a_above_b'"):
+        read_paper(written(tmp_path, ORDER, rests_on={"a_above_b": []}))
+
+
 def test_the_papers_that_come_with_vehest_are_read():
     for path in sorted(Path(vehest_papers.__file__).parent.glob("*/claims.yaml")):
         paper = read_paper(path)
