@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import clock_tolerance
 from vehest.data.time_series import TimeSeries
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Mode = Literal["causal", "offline"]
 
@@ -47,7 +50,9 @@ IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "
 """Columns of written tables in degrees -> the quantity [rad] that each repeats for people."""
 
 COLUMN_UNITS: dict[str, str] = {"time": "s", **QUANTITIES, **dict.fromkeys(IN_DEGREES, "deg")}
-"""Columns of written tables, with units."""
+"""Columns of written tables, with units; entries of a covariance have theirs by `column_units`."""
+
+COVARIANCE = "covariance"  # column of entry (i, j): covariance_i_j
 
 
 def time_cell(seconds: float) -> str:
@@ -123,6 +128,25 @@ class Estimate(TimeSeries):
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
 
+    def to_pandas(self) -> pd.DataFrame:
+        """The table that `write_estimate_table` writes as Parquet, on an index ``time`` [s].
+
+        Its columns are the quantities in SI units, entries of the covariance, if there is one, and
+        the sideslip angle and its band also in degrees.
+
+        Returns
+        -------
+        DataFrame
+            ``attrs["units"]`` maps each column, and ``time``, to its unit.
+        """
+        import pandas as pd
+
+        [columns] = estimate_columns([self])
+        frame = pd.DataFrame(with_degrees(columns)).set_index("time")
+        units = column_units(self)
+        frame.attrs["units"] = {name: units[name] for name in ("time", *frame.columns)}
+        return frame
+
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
         """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
         NaN outside the estimate.
@@ -158,3 +182,37 @@ class Estimate(TimeSeries):
             np.int64
         )
         return np.where((index >= 0) & (index < len(self)), index, -1)
+
+
+def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
+    """Time, quantities and entries of the covariance of each part of an estimate, on one clock."""
+    done = 0
+    start = None
+    for part in parts:
+        start = part.start_time if start is None else start
+        columns = {
+            "time": start + np.arange(done, done + len(part)) / part.rate_hz,
+            **part.channels,
+        }
+        done += len(part)
+        if part.covariance is not None:
+            columns |= {
+                f"{COVARIANCE}_{i}_{j}": part.covariance[:, i, j]
+                for i, j in np.ndindex(part.covariance.shape[1:])
+            }
+        yield columns
+
+
+def with_degrees(columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Columns of an estimate, followed by the angles among them in degrees."""
+    angles = {name: angle for name, angle in IN_DEGREES.items() if angle in columns}
+    return {**columns, **{name: np.degrees(columns[angle]) for name, angle in angles.items()}}
+
+
+def column_units(estimate: Estimate) -> dict[str, str]:
+    """Units of the columns of an estimate's table, entries of its covariance included."""
+    units = [QUANTITIES[name] for name in estimate.covariance_of]
+    of_covariance = {
+        f"{COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
+    }
+    return COLUMN_UNITS | of_covariance
