@@ -198,7 +198,7 @@ def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp
         (FAST, np.arange(2001) % 2, {"conversion": gear}, text),
         (FAST, np.array([b"on"] * 2001), {"encoding": "utf-8"}, text),
         (FAST, np.zeros(2001, dtype=[("v", "(3,)<f8")]), {}, "holds an array or structure"),
-        (stamps, np.ones(2002), {}, where + "time repeats 1 times, first at sample 50 (0.49 s)"),
+        (stamps, np.ones(2002), {}, where + "time repeats 1 time, first at sample 50 (0.49 s)"),
     ):
         assert said in refused(one(tmp_path / "a.mf4", t, samples, **more))
 
