@@ -10,7 +10,7 @@ from PIL import Image
 
 from chromium import browser, opened
 
-LOOKS = {1280: 1.0, 390: 2.0}  # width [px] -> pixels of the picture for one of the page
+PIXEL_RATIOS = {1280: 1, 390: 2}  # width [px] -> pixels of the picture for one of the page
 MARGIN = 16  # px above the first element
 HEIGHTS = {1280: 1150, 390: 1500}
 SCHEMES = ("light", "dark")
@@ -24,7 +24,7 @@ def picture(driver, top, width, path):
         "y": max(top - MARGIN, 0),
         "width": width,
         "height": HEIGHTS[width],
-        "scale": LOOKS[width],
+        "scale": 1.0,
     }
     shot = driver.execute_cdp_cmd(
         "Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip}
@@ -39,9 +39,10 @@ def main(report, site, out):
     """Write ``report_*`` (its beginning), ``traces_*`` (traces, course, filter) and ``site_*`` at both widths, light and dark."""
     out.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as driver:
-        for width in LOOKS:
+        for width, pixel_ratio in PIXEL_RATIOS.items():
             for scheme in SCHEMES:
-                opened(driver, report.resolve(), width=width, scheme=scheme)
+                look = {"width": width, "scheme": scheme, "pixel_ratio": pixel_ratio}
+                opened(driver, report.resolve(), **look)
                 for name, selector in {"report": "h1", "traces": "figure.live"}.items():
                     script = f"return document.querySelector('{selector}').getBoundingClientRect().top + scrollY"
                     picture(
@@ -51,7 +52,7 @@ def main(report, site, out):
                         out / f"{name}_{width}_{scheme}.png",
                     )
                 for name, page in SITE.items():
-                    opened(driver, (site / page).resolve(), width=width, scheme=scheme)
+                    opened(driver, (site / page).resolve(), **look)
                     picture(driver, 0, width, out / f"{name}_{width}_{scheme}.png")
 
 
