@@ -18,12 +18,14 @@ SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"
 
 
 def picture(driver, top, width, path):
-    """A part of the page that is open, from ``top`` down, in 256 colours."""
+    """A part of the page that is open, from ``top`` down, at most to its end, in 256 colours."""
+    y = max(top - MARGIN, 0)
+    page_height = driver.execute_script("return document.documentElement.scrollHeight")
     clip = {
         "x": 0,
-        "y": max(top - MARGIN, 0),
+        "y": y,
         "width": width,
-        "height": HEIGHTS[width],
+        "height": min(HEIGHTS[width], page_height - y),
         "scale": 1.0,
     }
     shot = driver.execute_cdp_cmd(
