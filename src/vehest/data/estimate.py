@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,6 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import clock_tolerance
 from vehest.data.time_series import TimeSeries
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Mode = Literal["causal", "offline"]
 
@@ -128,24 +125,12 @@ class Estimate(TimeSeries):
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
 
-    def to_pandas(self) -> pd.DataFrame:
-        """The table that `write_estimate_table` writes as Parquet, on an index ``time`` [s].
-
-        Its columns are the quantities in SI units, entries of the covariance, if there is one, and
-        the sideslip angle and its band also in degrees.
-
-        Returns
-        -------
-        DataFrame
-            ``attrs["units"]`` maps each column, and ``time``, to its unit.
-        """
-        import pandas as pd
-
+    def _table(self) -> dict[str, FloatArray]:
         [columns] = estimate_columns([self])
-        frame = pd.DataFrame(with_degrees(columns)).set_index("time")
-        units = column_units(self)
-        frame.attrs["units"] = {name: units[name] for name in ("time", *frame.columns)}
-        return frame
+        return with_degrees(columns)
+
+    def _table_units(self) -> dict[str, str]:
+        return column_units(self)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
         """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
