@@ -50,13 +50,13 @@ def browser(profile):
         started.quit()
 
 
-def opened(driver, path, *, width=1280, scheme="light"):
+def opened(driver, path, *, width=1280, scheme="light", pixel_ratio=1):
     """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all
     that it draws by itself is drawn.
     """
     from selenium.webdriver.support.ui import WebDriverWait
 
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    size = {"width": width, "height": 900, "deviceScaleFactor": pixel_ratio, "mobile": width < 600}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     driver.execute_cdp_cmd(
         "Emulation.setEmulatedMedia",

@@ -95,7 +95,7 @@ def test_a_clean_drive_is_noted_to_follow_the_kinematics_and_a_bias_is_the_accel
 def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
     findings = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
     assert (findings.level, findings.check, findings.channel) == ("error", "impossible", "ay")
-    assert "1 samples" in findings.message
+    assert "1 sample outside" in findings.message
     assert "500 m/s² at t = 22.34 s" in findings.message
     findings = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
     assert (findings[0].level, findings[0].check, findings[0].channel) == (

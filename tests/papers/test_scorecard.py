@@ -1,4 +1,6 @@
-"""The scorecard: what committed claims and errors give, and what a small study with a planted truth shows."""
+"""The scorecard: what committed claims and errors give, and what a small study with a planted truth
+shows.
+"""
 
 import csv
 import re
@@ -43,7 +45,7 @@ def cells(text):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_the_published_scorecard_is_what_its_inputs_give(files):
+def test_the_published_scorecard_follows_from_its_inputs(files):
     for name, text in files.items():
         assert (RESULTS / name).read_text(encoding="utf-8") == text, "run make scorecard"
 
@@ -223,7 +225,9 @@ def test_a_study_with_errors_is_judged_and_a_stale_page_is_noticed(tmp_path, cap
 
 
 def test_simulated_studies_have_the_truth_that_is_planted():
-    """A hundred studies each: without effect few differences, with a large one most are reproduced."""
+    """A hundred studies each: without effect few differences, with a large one most are
+    reproduced.
+    """
     traces = planted_truth.read_traces(RESULTS / "scorecard" / "error_traces.csv")
     design = planted_truth.DESIGNS[2]
     none = planted_truth.rates(traces, design, 3, "no effect", 100)
@@ -247,7 +251,7 @@ def test_published_rates_are_nominal_with_three_seeds():
 
 
 @pytest.mark.slow
-def test_published_rates_are_made_of_the_committed_errors():
+def test_published_rates_follow_from_the_committed_errors():
     traces = planted_truth.read_traces(RESULTS / "scorecard" / "error_traces.csv")
     with open(RESULTS / "scorecard" / "planted_truth.csv", encoding="utf-8") as stream:
         published = {

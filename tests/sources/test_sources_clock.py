@@ -115,9 +115,9 @@ EVEN = np.arange(1000) / 100.0
     [
         (
             EVEN[[0, 1, 1, 2]],
-            "time repeats 1 times, first at sample 2 (0.01 s); repair, remove or sort the rows",
+            "time repeats 1 time, first at sample 2 (0.01 s); repair, remove or sort the rows",
         ),
-        (EVEN[[0, 2, 1, 3]], "time goes backwards 1 times, first at sample 2"),
+        (EVEN[[0, 2, 1, 3]], "time goes backwards 1 time, first at sample 2"),
         (EVEN[:1], "fewer than two"),
         (
             np.append(EVEN, 1e9),
@@ -195,9 +195,9 @@ def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples_and_withstan
     [
         (
             np.delete(EVEN, np.s_[300:350]),
-            "1 gaps, the longest of 0.51 s after 2.99 s (interval 0.01 s)",
+            "1 gap, the longest of 0.51 s after 2.99 s (interval 0.01 s)",
         ),
-        (np.delete(EVEN, 500), "1 gaps, the longest of 0.02 s after 4.99 s"),
+        (np.delete(EVEN, 500), "1 gap, the longest of 0.02 s after 4.99 s"),
         (
             EVEN + np.where(np.arange(1000) % 2, 5e-4, 0.0),
             "intervals deviate by up to 9.5 % from the median of 0.0105 s",
@@ -217,7 +217,7 @@ def test_gaps_jitter_and_drift_are_found_with_their_size(stamps, found):
         (np.zeros(300), "inf Hz, not at 100 Hz"),
         (
             np.concatenate([EVEN[:150], EVEN[140:290]]),
-            "time goes backwards 1 times, first at sample 150",
+            "time goes backwards 1 time, first at sample 150",
         ),
         (
             np.cumsum(np.linspace(0.996, 1.004, 3000)) / 100,

@@ -204,7 +204,7 @@ def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp
             stamps,
             np.ones(2002),
             {},
-            signal_text + "time repeats 1 times, first at sample 50 (0.49 s)",
+            signal_text + "time repeats 1 time, first at sample 50 (0.49 s)",
         ),
     ):
         assert message in refused(one(tmp_path / "a.mf4", t, samples, **more))

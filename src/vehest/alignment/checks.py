@@ -27,7 +27,7 @@ from vehest.alignment.signs import (
 from vehest.alignment.standstill import BoolArray, standstill
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import STANDSTILL_SPEED
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, number_of
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
@@ -140,7 +140,7 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             else "check the column and its unit"
         )
         message = (
-            f"{len(outside)} samples outside the possible range "
+            f"{number_of(len(outside), 'sample')} outside the possible range "
             f"({channel.low:.4g} to {channel.high:.4g} {channel.unit}), the largest "
             f"{samples[worst]:.6g} {channel.unit} at t = {recording.time[worst]:.12g} s; "
             f"{'the simulated car spun here' if spun else remedy}"

@@ -111,11 +111,12 @@ class Additions:
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
-    """The verdict on each test set as lines of plain text."""
+    """The verdict on each test set as lines of plain text, a line a sentence."""
     part = artefacts.first
     return [
-        plain_text(" ".join(recommendation_of(part, test_set).describe()))
+        plain_text(sentence)
         for test_set in part.split.tests
+        for sentence in recommendation_of(part, test_set).describe()
     ]
 
 
