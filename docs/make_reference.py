@@ -294,14 +294,9 @@ def _as_yaml(value: Any) -> str:
 
 
 def _sections(described: type) -> dict[str, str]:
-    """A docstring's first paragraph, under the empty name, and arguments or fields by name: from the docstring or the comment of each."""
+    """A docstring's first paragraph, under the empty name, and the comments of fields by name."""
     text = inspect.getdoc(described) or ""
     sections = {"": " ".join(text.split("\n\n")[0].split())}
-    if "Args:" in text:
-        for entry in re.split(r"\n    (?=\w)", text.split("Args:")[1].split("\n\n")[0]):
-            names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
-            if names:
-                sections |= dict.fromkeys(names.split(", "), meaning)
     for name, meaning in field_comments(described).items():
         sections.setdefault(name, f"{meaning.removesuffix('.')}.".replace("``", "`"))
     return sections

@@ -147,9 +147,9 @@ class SelfCalibrating(SelfCalibratingSettings):
         values = {name: float(getattr(self.settings, name)) for name in NUMERIC}
         values |= {
             "dt": 1.0 / self.rate_hz,
-            "network_rear": TYPICAL_REAR * self.wheelbase,
-            "is_moved": float(self.point != "imu"),
             "point": self.rear if self.point == "cg" else 0.0,
+            "is_moved": float(self.point != "imu"),
+            "network_rear": TYPICAL_REAR * self.wheelbase,
             "yaw_rate_max": self._width,
             "without_ax": float(not self.measured_ax),
         }

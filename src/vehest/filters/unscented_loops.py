@@ -147,14 +147,14 @@ def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
 
 FORWARD = (points_of, moments_of, gate_of, update_of)
 BACKWARD = (points_of, update_adjoint, points_adjoint, moments_adjoint)
-Forward: Any = namedtuple(
+Forward = namedtuple(
     "Forward",
     ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"),
 )
 """What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given;
 numba warns of a plain tuple of these.
 """
-Backward: Any = namedtuple(
+Backward = namedtuple(
     "Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car")
 )
 """What `backward` calls, likewise: `BACKWARD` and the model's adjoints."""

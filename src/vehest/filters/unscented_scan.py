@@ -588,7 +588,8 @@ def _forward_by(
         for at, entry in zip(functions, at_states, strict=True)
         for part in (entry, at and at.car)
     ]
-    return partial(loop, Forward(*steps, *entries, model.car), *noises)
+    called: list[Any] = [*steps, *entries, model.car]
+    return partial(loop, Forward(*called), *noises)
 
 
 def _backward_by(
@@ -597,18 +598,17 @@ def _backward_by(
     """The adjoint's loop with a model, and the gradients as it takes them."""
     parameter_gradients = model.learnt(gradients)
     if not model.is_compiled or config.DISABLE_JIT:
-        return partial(
-            getattr(backward, "py_func", backward),
-            Backward(*BACKWARD, *model.entries[2:], model.car),
-        ), parameter_gradients
+        uncompiled: list[Any] = [*BACKWARD, *model.entries[2:], model.car]
+        loop = getattr(backward, "py_func", backward)
+        return partial(loop, Backward(*uncompiled)), parameter_gradients
     points = tape.moved[0]
     inputs = u[0]
-    called = [
+    models = [
         by_address(entry, points, inputs, model.car, upstream, points, parameter_gradients, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
-    steps = steps_by_address(BACKWARD, points.dtype)
-    return partial(backward, Backward(*steps, *called, model.car)), parameter_gradients
+    called: list[Any] = [*steps_by_address(BACKWARD, points.dtype), *models, model.car]
+    return partial(backward, Backward(*called)), parameter_gradients
 
 
 def _sequences_last(values: Array) -> Array:

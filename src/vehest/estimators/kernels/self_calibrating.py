@@ -330,18 +330,29 @@ def _judge(values, moments, weights, lags, sample, yaw_rate, n, g_1, g_slow, mov
 def scan(n, grips, start, prior, spread, decay, theta, state, samples, estimates, parameters):
     """Go through samples; changes ``state`` in place.
 
-    Args:
-        n: numbers of the estimator, a named tuple.
-        grips: grip limits of the bank, (J,) [m/s²].
-        start: logarithms of the bank's weights at the start, (J,).
-        prior, spread: mean and standard deviation of the states at the start, (8,).
-        decay: factors by which they return to it in a sample, (8,).
-        theta: weights of the network, (P, 8 + 6 Q).
-        state: a `State`.
-        samples: yaw_rate, vx, ay, ax, (T, 4).
-        estimates: output, vy and its variance, (T, 2).
-        parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the
-            last sample alone.
+    Parameters
+    ----------
+    n
+        Numbers of the estimator, a named tuple.
+    grips
+        Grip limits of the bank, (J,) [m/s²].
+    start
+        Logarithms of the bank's weights at the start, (J,).
+    prior, spread
+        Mean and standard deviation of the states at the start, (8,).
+    decay
+        Factors by which they return to it in a sample, (8,).
+    theta
+        Weights of the network, (P, 8 + 6 Q).
+    state
+        A `State`, changed in place.
+    samples
+        Columns yaw_rate [rad/s], vx [m/s], ay, ax [m/s²], (T, 4).
+    estimates
+        Output: vy at the reference point and its variance, (T, 2).
+    parameters
+        Output: mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample
+        alone.
     """
     g = -math.expm1(-n.dt / n.axle_lag)
     g_1 = -math.expm1(-n.dt / n.residual_time)

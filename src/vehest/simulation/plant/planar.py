@@ -9,8 +9,9 @@ Tyres: magic formula without curvature of the combined slip, F = μ F_z sin(C at
 slip (Pacejka, Tire and Vehicle Dynamics, 2012, Sections 4.2 and 4.3, with the same slip stiffness
 in both directions). Slips are divided by V = max(|V_x|, |ω|R, MIN_SLIP_SPEED): at a spinning,
 locked or standing wheel they stay finite. They follow their steady values over a relaxation length
-σ, ds/dt = V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding tyre's
-carcass bends no further; a share of the difference acts at once, as a carcass's damping does.
+σ, ds/dt = V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding
+tyre's carcass bends no further; a share of the difference acts at once, as a carcass's damping
+does.
 
 Motor: J dω/dt = K I - b0 sign(ω) - b1 ω - R ΣF_x on the mean speed of the wheels, the powertrain of
 Eq. 2 of Węgrzynowski et al. 2024.
