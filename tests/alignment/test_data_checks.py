@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from broadband_drive import changed
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
@@ -31,16 +32,6 @@ def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
     }
     references = {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
     return Recording("lap", "car", rate, 10.0, {**channels, **references})
-
-
-def changed(recording, **changes):
-    return replace(
-        recording,
-        channels={
-            **recording.channels,
-            **{name: change(recording[name]) for name, change in changes.items()},
-        },
-    )
 
 
 def with_standstill(recording, start, stop, **resting):
