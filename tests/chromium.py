@@ -51,9 +51,7 @@ def browser(profile):
 
 
 def opened(driver, path, *, width=1280, scheme="light"):
-    """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all
-    that it draws by itself is drawn.
-    """
+    """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all that it draws by itself is drawn."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}

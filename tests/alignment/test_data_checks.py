@@ -84,17 +84,13 @@ def test_a_clean_drive_is_noted_to_follow_the_kinematics_and_a_bias_is_the_accel
 
 
 def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
-    findings = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
-    assert (findings.level, findings.check, findings.channel) == ("error", "impossible", "ay")
-    assert "1 samples" in findings.message
-    assert "500 m/s² at t = 22.34 s" in findings.message
-    findings = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
-    assert (findings[0].level, findings[0].check, findings[0].channel) == (
-        "error",
-        "impossible",
-        "yaw_rate",
-    )
-    assert "if the column is in degrees, set its unit" in findings[0].message
+    found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
+    assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
+    assert "1 samples" in found.message
+    assert "500 m/s² at t = 22.34 s" in found.message
+    found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
+    assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
+    assert "if the column is in degrees, set its unit" in found[0].message
 
 
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations():

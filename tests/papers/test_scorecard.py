@@ -22,7 +22,7 @@ def files():
     return scorecard.scorecard_files(RESULTS)
 
 
-def test_the_published_scorecard_follows_from_its_inputs(files):
+def test_the_published_scorecard_is_what_its_inputs_give(files):
     for name, text in files.items():
         assert (RESULTS / name).read_text(encoding="utf-8") == text, "run make scorecard"
 

@@ -195,19 +195,14 @@ def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp
     gear = {"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"D", "default": b"?"}
     stamps = np.concatenate([FAST[:50], FAST[49:]])
     text = "signal 'v' of group 0 'Only' holds text; numbers are needed"
-    signal_text = "signal 'v' of group 0 'Only': "
-    for t, samples, more, message in (
+    where = "signal 'v' of group 0 'Only': "
+    for t, samples, more, said in (
         (FAST, np.arange(2001) % 2, {"conversion": gear}, text),
         (FAST, np.array([b"on"] * 2001), {"encoding": "utf-8"}, text),
         (FAST, np.zeros(2001, dtype=[("v", "(3,)<f8")]), {}, "holds an array or structure"),
-        (
-            stamps,
-            np.ones(2002),
-            {},
-            signal_text + "time repeats 1 times, first at sample 50 (0.49 s)",
-        ),
+        (stamps, np.ones(2002), {}, where + "time repeats 1 times, first at sample 50 (0.49 s)"),
     ):
-        assert message in refused(one(tmp_path / "a.mf4", t, samples, **more))
+        assert said in refused(one(tmp_path / "a.mf4", t, samples, **more))
 
 
 @pytest.mark.parametrize("version", ["2.14", "3.30"])

@@ -186,29 +186,29 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
     )
 
 
-def test_bands_agree_row_by_row_and_are_finite_where_estimates_are():
+def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are():
     packed = bands_of().packed()
-    piece = piece_of(np.random.default_rng(7), 50)
+    own = piece_of(np.random.default_rng(7), 50)
     together = np.empty((50, 2))
-    single_row = np.empty((1, 2))
-    band_rows(piece.rows, piece.vy, piece.variance, packed.columns, packed.numbers, together)
+    one = np.empty((1, 2))
+    band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
     for k in range(50):
         band_rows(
-            piece.rows[k : k + 1],
-            piece.vy[k : k + 1],
-            piece.variance[k : k + 1],
+            own.rows[k : k + 1],
+            own.vy[k : k + 1],
+            own.variance[k : k + 1],
             packed.columns,
             packed.numbers,
-            single_row,
+            one,
         )
-        assert np.array_equal(single_row[0], together[k])
+        assert np.array_equal(one[0], together[k])
     bands = bands_of()
-    piece = piece_of(np.random.default_rng(8), 20)
-    rows = piece.rows.copy()
-    vy = piece.vy.copy()
+    own = piece_of(np.random.default_rng(8), 20)
+    rows = own.rows.copy()
+    vy = own.vy.copy()
     rows[:10] = np.nan
     vy[15] = np.nan
-    half = bands.half_widths(rows, vy, piece.variance)
+    half = bands.half_widths(rows, vy, own.variance)
     assert np.isfinite(half).all(axis=1).tolist() == [k != 15 for k in range(20)]
     assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
 
@@ -235,7 +235,7 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewher
     )  # 20 s at 20 Hz, a turn each 2.5 s
     labels, kind = block_labels([yaw_rate] * 10, [400] * 10, 20.0)
     assert kind == "range"
-    assert [block_of[0] for block_of in labels] == list(range(10))
+    assert [own[0] for own in labels] == list(range(10))
     labels, kind = block_labels([yaw_rate, None], [400, 50], 20.0)
     assert kind == "turn"
     assert (
@@ -248,7 +248,7 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewher
     assert np.flatnonzero(np.diff(labels)).tolist() == [49, 99]
 
 
-def test_bands_record_their_calibration_and_need_a_reference():
+def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
     bands = bands_of()
     assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (
         ("my car",),
@@ -269,23 +269,19 @@ def test_bands_record_their_calibration_and_need_a_reference():
 def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
     rng = np.random.default_rng(10)
     n = 100
-    piece = piece_of(rng, n)
-    measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, piece.rows.T, strict=True)))
+    own = piece_of(rng, n)
+    measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, own.rows.T, strict=True)))
     estimate = Estimate(
-        "lap",
-        "some",
-        20.0,
-        0.0,
-        {"vy": piece.vy, "sideslip": np.arctan2(piece.vy, piece.rows[:, 1])},
+        "lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])}
     )
     ahead = replace(bands_of(), horizon_steps=1)
-    banded = with_bands(estimate, measured, ahead)
-    expected = ahead.half_widths(piece.rows[:-1], piece.vy[1:], piece.variance[1:])
+    found = with_bands(estimate, measured, ahead)
+    expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])
     np.testing.assert_allclose(
-        np.stack([banded["band_vy"], banded["band_sideslip"]], 1)[1:], expected, rtol=1e-13
+        np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13
     )
     rows, _, variance = band_inputs(estimate, measured, CHANNELS, 0)
-    assert np.array_equal(rows, piece.rows)
+    assert np.array_equal(rows, own.rows)
     assert np.isnan(variance).all()
 
 
