@@ -72,6 +72,7 @@ def _readers_forked():
 
 @pytest.fixture(autouse=True)
 def _processes_end_with_their_test():
+    """End the processes that a test started and left running."""
     yield
     processes.end_all()
 
@@ -127,6 +128,7 @@ def die_after(reports):
     left = iter(range(reports - 1))
 
     def die(progress):
+        """Interrupt once the calls are used up."""
         if next(left, None) is None:
             raise KeyboardInterrupt
 

@@ -18,6 +18,7 @@ NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 
 def dugoff_track(tyres="plain"):
+    """Single track with the tyres and the car of `dugoff_drive`."""
     return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0)
 
 

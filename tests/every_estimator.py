@@ -64,6 +64,7 @@ def fitted(name, dtype="float64", **config):
 
 
 def _fit(name, dtype, config):
+    """An estimator of a family, fitted with as few epochs as possible."""
     estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:

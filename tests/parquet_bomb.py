@@ -9,6 +9,7 @@ STRUCT_OF_A_DATA_PAGE = 0x2C
 
 
 def varint(number):
+    """A number in the variable length of Thrift."""
     content = bytearray()
     while number >= 0x80:
         content.append(number & 0x7F | 0x80)

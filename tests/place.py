@@ -42,6 +42,7 @@ def write_csv(path, seed, seconds=30.0):
 
 @cache
 def _table(seed, seconds):
+    """Table of a drive, in the units of its data set."""
     drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
     table = pd.DataFrame(
         {
@@ -101,6 +102,7 @@ SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
 
 
 def write_yaml(file, content):
+    """Write a file of configuration and the folders above it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
 

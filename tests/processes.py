@@ -51,6 +51,7 @@ def wait_for(event, process=None, output=None):
 
 
 def is_alive(pid):
+    """Whether a process has not ended."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
@@ -116,6 +117,7 @@ class ForkedReader:
         return self._code
 
     def kill(self):
+        """End the process at once."""
         if self._code is None:
             os.kill(self.pid, signal.SIGKILL)
 

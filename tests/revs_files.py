@@ -113,6 +113,7 @@ class Drive:
     start_time: float = 0.0
 
     def rows(self):
+        """Number of rows of the CSV file."""
         return round(self.seconds * CSV_RATE_HZ)
 
 

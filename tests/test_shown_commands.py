@@ -17,7 +17,7 @@ pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).resolve().parents[1]
 LOG = ROOT / "docs" / "examples" / "lap.csv"
-COMMAND_WITH_OUTPUT = re.compile(
+SHOWN = re.compile(
     r"^```sh\n(?P<commands>.*?)^```$(?:\n\n[^`#|]*?)?\n\n?```(?:text|output)\n(?P<output>.*?)^```$",
     re.MULTILINE | re.DOTALL,
 )
@@ -38,7 +38,7 @@ CASES = [
 
 def example(page, start):
     """The command of a page that begins so, and the lines of its output."""
-    for match in COMMAND_WITH_OUTPUT.finditer((ROOT / page).read_text(encoding="utf-8")):
+    for match in SHOWN.finditer((ROOT / page).read_text(encoding="utf-8")):
         command = match["commands"].splitlines()[-1]
         if command.startswith(start):
             return command, match["output"].splitlines()

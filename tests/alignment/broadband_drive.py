@@ -2,6 +2,7 @@
 low-passed to the last digit.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -112,3 +113,9 @@ def _waves(seed):
 def without(recording, *names):
     """The same drive without some channels."""
     return recording.select([name for name in recording.channels if name not in names])
+
+
+def changed(recording, **changes):
+    """The same drive with some channels changed: channel -> function of its samples."""
+    channels = {name: change(recording[name]) for name, change in changes.items()}
+    return replace(recording, channels={**recording.channels, **channels})

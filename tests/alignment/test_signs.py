@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from broadband_drive import broadband_drive, without
+from broadband_drive import broadband_drive, changed, without
 from scipy import signal
 
 from vehest.alignment.band_pass import butterworth_band, without_phase
@@ -15,16 +15,6 @@ from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
 
 REFERENCES = ("vy_ref", "sideslip_ref", "yaw_rate_ref", "vx_ref")
-
-
-def changed(recording, **changes):
-    return replace(
-        recording,
-        channels={
-            **recording.channels,
-            **{name: change(recording[name]) for name, change in changes.items()},
-        },
-    )
 
 
 def turned(recording, *names):

@@ -35,10 +35,12 @@ def install(folder):
 
 
 def _file(folder, job):
+    """File of a job in the queue."""
     return folder / f"{job}.json"
 
 
 def _set(folder, job, **values):
+    """Change entries of a job, in one step for whoever reads it."""
     file = _file(folder, job)
     former = json.loads(file.read_text()) if file.is_file() else {}
     aside = file.with_suffix(f".{os.getpid()}")

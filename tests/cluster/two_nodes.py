@@ -34,6 +34,7 @@ class TwoNodes:
 
     @property
     def address(self):
+        """Address at which drivers join the cluster."""
         return str(self._cluster.address)
 
     def holds(self, node, pid):
@@ -51,14 +52,17 @@ class TwoNodes:
         self._cluster.remove_node(node, allow_graceful=False)
 
     def shut_down(self):
+        """End all nodes."""
         self._cluster.shutdown()
 
 
 def _raylet(node):
+    """Process of the daemon of a node."""
     return int(node.all_processes["raylet"][0].process.pid)
 
 
 def _children(parent):
+    """Processes that a process has started."""
     children = []
     for file in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
@@ -104,6 +108,7 @@ class Driver:
 
     @property
     def output_text(self):
+        """Output and errors of the process so far."""
         return self._log.read_text(encoding="utf-8")
 
 

@@ -55,10 +55,12 @@ ill-conditioned, so that a last digit grows.
 
 @cache
 def model(name):
+    """Fitted estimator of a family, well conditioned for comparisons in single precision."""
     return fitted(name, **WELL_CONDITIONED.get(name, {}))
 
 
 def drive(estimator, seed, seconds=40.0):
+    """A drive with the channels of an estimator, at its rate."""
     rate = estimator.settings.rate_hz
     if "motor_current" in estimator.channels:
         return small_car_drive(seconds, seed)
@@ -137,11 +139,13 @@ class Export:
     trusted: bool = True
 
     def stepper(self):
+        """Python model that the exported program must agree with."""
         return GuardedStepper(
             model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz
         )
 
     def write(self):
+        """Write the files of the program into its folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, text in program_files(self.stepper(), self.precision, self.name).items():
             (self.folder / name).write_text(text)
@@ -164,9 +168,11 @@ class Export:
 
     @property
     def sources(self):
+        """C files of the program."""
         return sorted(path.name for path in self.folder.glob("vehest_*.c"))
 
     def build(self, compiler, *options, main="main.c", out="main"):
+        """Compile the program with a compiler and options."""
         flags = [*STRICT, *(["-Wdouble-promotion"] if self.precision == "float" else [])]
         command(
             [tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder

@@ -177,6 +177,7 @@ def at_rate(recording, estimator):
 
 
 def sideslip(vy, vx):
+    """Sideslip angle [deg]."""
     return np.degrees(np.arctan2(vy, vx))
 
 
@@ -236,6 +237,7 @@ def try_family(ground, name):
     back = SETTLE + LASTS + max(RECOVERS, estimator.warm_up_steps / rate)
 
     def error(vy, chosen):
+        """Root mean square of the error of the sideslip angle over chosen samples [deg]."""
         return float(
             np.sqrt(np.mean(np.square(sideslip(vy[chosen], speed[chosen]) - reference[chosen])))
         )

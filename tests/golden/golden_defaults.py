@@ -70,6 +70,7 @@ def defaults_of(kind):
 
 
 def _values(prefix, settings):
+    """Dotted option -> its default."""
     values = {}
     for option in fields(settings):
         name = f"{prefix}.{option.name}"

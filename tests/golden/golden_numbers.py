@@ -162,6 +162,7 @@ def _values(array):
 
 
 def _are_close(recorded, now, tolerance):
+    """Whether recorded and present numbers agree within a tolerance."""
     if set(recorded) != set(now):
         return False
     for name, values in recorded.items():
@@ -175,6 +176,7 @@ def _are_close(recorded, now, tolerance):
 
 
 def _estimator(name):
+    """Weights and estimates of a family."""
     cls = estimator_class(name)
     versions = {f"{cls.__name__}.version": cls.version}
     if hasattr(cls.training_type, "version"):
@@ -189,20 +191,24 @@ def _estimator(name):
 
 
 def in_folder(make):
+    """What a function makes of an empty folder."""
     with tempfile.TemporaryDirectory() as folder:
         return {"numbers": make(Path(folder))}
 
 
 def _channels(recording):
+    """Times and channels of a recording."""
     return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
 
 
 def _tabular(folder):
+    """Channels of a CSV table."""
     write_csv(folder / "lap.csv", 1, 5.0)
     return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
 
 
 def _text_log(folder):
+    """Channels of a table with a row of units."""
     write_csv(folder / "lap.csv", 1, 5.0)
     lines = (folder / "lap.csv").read_text().splitlines()
     (folder / "lap.csv").write_text("\n".join([lines[0], "s,km/h,deg/s,,,", *lines[1:]]) + "\n")
@@ -214,6 +220,7 @@ def _text_log(folder):
 
 
 def _vbo(folder):
+    """Channels of a VBO file."""
     from vbo_log import dataset, write_log
 
     write_log(folder / "lap.vbo")
@@ -221,6 +228,7 @@ def _vbo(folder):
 
 
 def _can(folder):
+    """Channels of a log of a CAN bus."""
     from can_drive import SIGNALS, write_log
 
     write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
@@ -239,6 +247,7 @@ def _can(folder):
 
 
 def _rosbag(folder):
+    """Channels of a ROS bag."""
     from test_sources_rosbag import configuration, drive, write_bag
 
     write_bag(folder, drive(2.0))
@@ -246,6 +255,7 @@ def _rosbag(folder):
 
 
 def _mdf(folder):
+    """Channels of a measurement."""
     from mdf_log import write_mdf
 
     from fuzz.families.mdf import DECLARED, signals
@@ -255,6 +265,7 @@ def _mdf(folder):
 
 
 def _revs(folder):
+    """Channels of a folder of the Revs database."""
     from test_sources_revs import configuration
 
     time = np.arange(300) / 100.0
@@ -265,6 +276,7 @@ def _revs(folder):
 
 
 def simulated(folder, seconds=3.0, **car):
+    """Channels of a simulated drive."""
     drive = {
         "id": "a",
         "seed": 1,
@@ -286,6 +298,7 @@ SOURCES |= {"tabular": _tabular, "text_log": _text_log, "vbo": _vbo}
 
 
 def _downsampled(folder):
+    """Channels of a recording after the stage ``downsample``."""
     recording = planar_drive(10.0, 100.0, seed=1, noise=0.02)
     for transform in downsample.transforms_of(
         {"rate_hz": 20.0, "method": "polyphase", "transforms": []}
@@ -295,11 +308,13 @@ def _downsampled(folder):
 
 
 def _artefact_file(pattern):
+    """The one file of the study that matches a pattern."""
     (file,) = (Path(_study().name) / "outputs").glob(pattern)
     return file
 
 
 def _metrics(chosen):
+    """Metrics of the rows of chosen conditions."""
     with _artefact_file("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
     metrics = {}

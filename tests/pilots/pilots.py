@@ -144,6 +144,7 @@ def collect(report, folder):
 
 
 def _rounded(cell):
+    """A number at the digits that are compared; text as it is."""
     try:
         return f"{float(cell):.{DIGITS}g}"
     except ValueError:

@@ -42,10 +42,10 @@ SIGNALS = {
 }
 ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from its first frame
 Written = namedtuple("Written", "dbc log lost origin")
-"""Files of a log.
+"""Files of a log, frames that were lost and its clock.
 
-``lost``: message -> numbers of the samples whose frames were lost. ``origin``: recording time [s] at
-which the clock of the log is 0.
+``lost``: message -> numbers of the samples whose frames were lost. ``origin``: time of the
+recording at which the clock of the log is 0 [s].
 """
 
 
