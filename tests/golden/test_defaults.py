@@ -44,8 +44,8 @@ def test_a_changed_default_names_the_version_to_raise():
     assert recorded["Settings"]["defaults"] == {
         "step": 0.1,
         "group.width": 8,
-        "further": None,
-        "further.width (if given)": 4,
+        "optional_group": None,
+        "optional_group.width (if given)": 4,
     }
     changed = {"Settings": record("Settings.version", "1", ChangedStep)}
     assert unversioned(recorded, changed) == [
