@@ -179,12 +179,14 @@ def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are(
     own = piece_of(np.random.default_rng(7), 50)
     together = np.empty((50, 2))
     one = np.empty((1, 2))
-    band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
+    unchecked = np.zeros(50)
+    band_rows(own.rows, own.vy, own.variance, unchecked, packed.columns, packed.numbers, together)
     for k in range(50):
         band_rows(
             own.rows[k : k + 1],
             own.vy[k : k + 1],
             own.variance[k : k + 1],
+            unchecked[k : k + 1],
             packed.columns,
             packed.numbers,
             one,
