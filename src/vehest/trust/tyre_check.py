@@ -23,7 +23,7 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_number, check_numbers
 
-FRICTION_SLIP = 0.08
+FRICTION_SLIP = 0.05
 """c [rad], error of the slip angle where the friction is e times as large.
 
 Chosen by the interval score on development tyres (docs/learned_ukf.md, "Bands on other tyres").
