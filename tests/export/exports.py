@@ -23,6 +23,7 @@ from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
+from vehest.trust.tyre_check import tyre_check_of
 
 FAMILIES = exportable()
 STRICT = [
@@ -87,6 +88,7 @@ def trust(name):
     drives = [drive(estimator, seed) for seed in (1, 2)]
     rate = estimator.settings.rate_hz
     band = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
+    check = tyre_check_of(estimator)
     about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
     bands = Bands(
         *about,
@@ -95,6 +97,7 @@ def trust(name):
         LARGEST,
         band,
         replace(band, floor=0.001),
+        tyre_check=check and check.scaled_by((1.8, 1.8)),
     )
     health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)

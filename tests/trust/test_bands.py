@@ -191,12 +191,16 @@ def test_bands_agree_row_by_row_and_are_finite_where_estimates_are():
     piece = piece_of(np.random.default_rng(7), 50)
     together = np.empty((50, 2))
     single_row = np.empty((1, 2))
-    band_rows(piece.rows, piece.vy, piece.variance, packed.columns, packed.numbers, together)
+    unchecked = np.zeros(50)
+    band_rows(
+        piece.rows, piece.vy, piece.variance, unchecked, packed.columns, packed.numbers, together
+    )
     for k in range(50):
         band_rows(
             piece.rows[k : k + 1],
             piece.vy[k : k + 1],
             piece.variance[k : k + 1],
+            unchecked[k : k + 1],
             packed.columns,
             packed.numbers,
             single_row,

@@ -148,6 +148,14 @@ class Description(ABC):
         return False
 
     @property
+    def training_friction(self) -> float | None:
+        """Friction of the training recordings, where ``friction`` is estimated with ``vx``.
+
+        Bands widen as the estimate departs from it.
+        """
+        return None
+
+    @property
     def warm_up_steps(self) -> int:
         """Samples after its first for which it has no estimate yet."""
         return 0
