@@ -316,7 +316,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     by steps that are far larger than usual.
 
     A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre needs
-    longer to come and go.
+    longer to come and go. A wheel that shows nothing is the finding ``dropout``.
     Those beyond what a vehicle can do are the finding ``impossible``. A sideslip angle without
     speed is noise.
     """
@@ -359,7 +359,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         jumps = [
             run
             for run in _between_jumps(samples, recording.rate_hz)
-            if run not in spikes and counts[slice(*run)].all()
+            if run not in spikes and name not in WHEELS and counts[slice(*run)].all()
         ]
         if jumps:
             begin, end = max(jumps, key=lambda run: run[1] - run[0])
