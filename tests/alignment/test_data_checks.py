@@ -307,6 +307,27 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
     )
 
 
+@pytest.mark.parametrize(
+    ("length", "value", "is_found"),
+    [(1, 0.0, True), (30, 0.0, True), (30, 60.0, True), (1, 60.0, False), (120, 0.0, False)],
+    ids=["one zero", "0.4 s of zeros", "one code", "a single sample", "a stop of 1.6 s"],
+)
+def test_a_speed_that_jumps_to_one_value_and_back_is_found_within_its_usual_range(
+    length, value, is_found
+):
+    drive = clean_drive()
+    speed = drive["vx"].copy()
+    speed[:1000] += np.linspace(60.0, 0.0, 1000)  # so that the code is no unusual speed
+    speed[3000 : 3000 + length] = value
+    found = checks_of_recording(replace(drive, channels={**drive.channels, "vx": speed}))
+    messages = [one.message for one in found if (one.check, one.channel) == ("spike", "vx")]
+    assert len(messages) == is_found
+    assert all(
+        f"jumps away and back 1 time within 1 s, the longest to {value:.4g} m/s" in text
+        for text in messages
+    )
+
+
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
     drive = clean_drive()
     shaking = 5.0 * (-1.0) ** np.arange(len(drive))

@@ -12,12 +12,12 @@ import yaml
 from dressed_logs import LOGS, write_log
 from mdf_log import write_mdf
 from own_car_proposals import ANSWERS, outcome_of, rows_of
-from planted_logs import RADIUS, drive, usual, write
+from planted_logs import RADIUS, G, drive, usual, write
 from vbo_log import clock
 
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
-from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import _busiest, inspect
@@ -936,7 +936,9 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
         "km/h",
         "g",
     )
-    assert "but deg/s according to the header" in by_channel["yaw_rate"].question
+    assert (
+        "its unit is rad/s, not deg/s, according to ay vs." in by_channel["yaw_rate"].question
+    )
     assert (by_channel["vx"].question, by_channel["ay"].question) == ("", "")
     recording = read_back(draft(examined))
     np.testing.assert_allclose(
@@ -958,9 +960,122 @@ def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offe
     )
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"vx": "vx [m/s]", "ay": "ay [m/s²]"}
-    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[1].split()
+    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[0].split()
     assert (name, unit, sign) == ("yaw_rate", "rad/s", "+1")
     assert float(factor) == pytest.approx(0.01, rel=0.05)
+
+
+def with_units(d, **factors):
+    """A log with units in its header, of which some channels are multiplied by factors."""
+    columns = {
+        "t [s]": ("t", d["t"]),
+        "speed [km/h]": ("vx", 3.6 * d["vx"]),
+        "yaw rate [deg/s]": ("yaw_rate", np.degrees(d["r"])),
+        "lat acc [m/s²]": ("ay", d["ay"]),
+        "long acc [m/s²]": ("ax", d["ax"]),
+        "steering wheel [deg]": ("handwheel", np.degrees(d["handwheel"])),
+        "lat vel [m/s]": ("vy_ref", d["vy"]),
+    }
+    return pd.DataFrame(
+        {name: factors.get(channel, 1.0) * samples for name, (channel, samples) in columns.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor"),
+    [
+        ("ay", 10.0),
+        ("ay", 2.0),
+        ("vx", 10.0),
+        ("vx", 3.0),
+        ("vx", 0.1),
+        ("yaw_rate", 10.0),
+        ("vy_ref", 10.0),
+    ],
+)
+def test_a_wrong_factor_is_found_by_a_second_relation_and_its_column_alone_is_left_out(
+    tmp_path, channel, factor
+):
+    table = with_units(drive(), **{channel: factor})
+    channels, open_questions = left_out(tmp_path, table)
+    assert {"vx", "yaw_rate", "ay", "ax", "handwheel", "vy_ref"} - set(channels) == {channel}
+    column = next(question for question in open_questions.values() if question.proposed == "-")
+    assert column.candidates[0].startswith(f"{channel} ")
+    if channel != "vy_ref":
+        assert float(column.candidates[0].split()[-1]) == pytest.approx(1.0 / factor, rel=0.1)
+        assert " and " in column.text
+
+
+@pytest.mark.parametrize(
+    ("factors", "units"),
+    [
+        ({"ay": 1.0 / G}, {"ay": "g", "ax": "m/s²"}),
+        ({"ay": 1.0 / G, "ax": 1.0 / G}, {"ay": "g", "ax": "g"}),
+        ({"vx": 1.0 / 3.6}, {"vx": "m/s", "ay": "m/s²"}),
+        ({"vx": 1.0 / 1.609344}, {"vx": "mph", "ay": "m/s²"}),
+        ({"yaw_rate": np.pi / 180.0}, {"yaw_rate": "rad/s", "vx": "km/h"}),
+    ],
+)
+def test_a_unit_that_two_relations_contradict_is_corrected_with_both_named(
+    tmp_path, factors, units
+):
+    d = drive()
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", with_units(d, **factors))])
+    made = draft(ask(examined, interactive=False)[0])
+    found = made.examined.proposals.by_channel
+    assert {name: found[name].unit for name in units} == units
+    for name in factors:
+        assert re.search("according to ay vs. .* and ", found[name].question)
+    samples = {"vx": d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "ax": d["ax"]}
+    for name in units:
+        np.testing.assert_allclose(read_back(made)[name], samples[name], atol=2e-3)
+
+
+def test_a_wrong_gain_that_nothing_else_explains_leaves_out_all_that_may_be_wrong(tmp_path):
+    table = with_units(drive(), ay=2.0)[
+        ["t [s]", "speed [km/h]", "yaw rate [deg/s]", "lat acc [m/s²]"]
+    ]
+    with pytest.raises(ConfigurationError, match="no channel is supported by two pieces"):
+        left_out(tmp_path, table)
+
+
+def test_a_speed_12_percent_too_high_is_noted(tmp_path):
+    notes = proposals_of(tmp_path, with_units(drive(), vx=1.12)).notes
+    assert any("12 % too high compared with ay/yaw_rate" in note for note in notes)
+
+
+def test_tilt_is_asked_where_accelerations_may_be_reversed_as_those_of_a_telephone(tmp_path):
+    d = drive()
+    table = with_units(d, ay=-1.0, ax=-1.0).assign(**{"roll [rad]": 0.01 * d["ay"]})
+    found = proposed(tmp_path, table)
+    assert (found["ax"].sign, found["ay"].sign, found["yaw_rate"].sign) == (-1, -1, 1)
+    assert "only its accelerations are reversed" in found["roll"].question
+
+
+def test_an_unnamed_angle_that_no_wheel_turns_by_is_no_steering_command(tmp_path):
+    d = drive()
+    table = with_units(d).drop(columns="steering wheel [deg]")
+    channels, open_questions = left_out(tmp_path, table.assign(**{"aux [rad]": 0.2 * d["steer"]}))
+    assert "aux [rad]" not in channels.values()
+    assert open_questions["aux [rad]"].proposed == "-"
+
+
+def test_wheels_named_wsp_are_wheels(tmp_path):
+    d = drive()
+    table = with_units(d)
+    for corner in CORNERS:
+        table[f"WSP_{corner.upper()} [km/h]"] = 3.6 * RADIUS * d[f"wheel_{corner}"]
+    assert {f"wheel_speed_{corner}" for corner in CORNERS} <= set(proposed(tmp_path, table))
+
+
+def test_recordings_by_a_column_of_laps_are_named_as_such(tmp_path):
+    d = drive()
+    table = with_units(d)
+    laps = np.searchsorted([50.0, 90.0], d["t"], side="right")
+    table["t [s]"] = d["t"] - np.array([0.0, 50.0, 90.0])[laps]
+    made = drafted(tmp_path, table.assign(Lap=laps + 1))
+    assert len(made.durations) == 3
+    assert any("split into 3 recordings at each value of 'Lap'" in note for note in made.notes)
 
 
 def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_read_twice(

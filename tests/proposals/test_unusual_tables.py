@@ -237,6 +237,32 @@ UNSUITED = {
         "".join(f"(1436509052.{k:06d}) can0 1A{k % 9}#2A36{k % 256:02X}\n" for k in range(99)),
         "raw frames of a CAN bus as candump writes them",
     ),
+    "German names": (
+        long_format("Zeit,Runde,Messgröße,Messwert"),
+        "'Messgröße' names the quantity, 'Messwert' holds",
+    ),
+    "an OBD logger": (long_format("time,lap,PID,Data"), "'PID' names the quantity, 'Data' holds"),
+    "annotated CSV": (
+        "#group,false,false,true,true,false,false,true,true\n"
+        ",result,table,_start,_stop,_time,_value,_field,_measurement\n"
+        + "".join(f",,0,2024-03-01,2024-03-02,{0.1 * k:.1f},{k},speed,car\n" for k in range(99)),
+        "'_field' names the quantity, '_value' holds",
+    ),
+    "line protocol": (
+        "".join(f"car,lap=2 speed={k},ay={k % 7} {1_700_000_000_000 + k}\n" for k in range(99)),
+        "InfluxDB's line protocol; export a table with a column of each field",
+    ),
+    "candump with dates": (
+        "".join(
+            f" (2024-03-01 10:00:00.{k:06d})  can0  1A0   [2]  00 {k:02X}\n" for k in range(99)
+        ),
+        "raw frames of a CAN bus as candump writes them",
+    ),
+    "frames in base64": (
+        "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
+        + "".join(f"{k},0x1a0,0,0,0,8,ChssAAD/{k % 10}AA=\n" for k in range(99)),
+        "raw frames of a CAN bus; decode them by the bus's DBC",
+    ),
     "quoted rows": (
         "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
         "each row in one pair of quotes; remove them",
