@@ -936,9 +936,7 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
         "km/h",
         "g",
     )
-    assert (
-        "its unit is rad/s, not deg/s, according to ay vs." in by_channel["yaw_rate"].question
-    )
+    assert "its unit is rad/s, not deg/s, according to ay vs." in by_channel["yaw_rate"].question
     assert (by_channel["vx"].question, by_channel["ay"].question) == ("", "")
     recording = read_back(draft(examined))
     np.testing.assert_allclose(
