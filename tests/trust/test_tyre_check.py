@@ -1,4 +1,4 @@
-"""The check of a filter's tyre model: a planted wrong and a planted right one, and its constants."""
+"""Check of a filter's tyre model: a planted wrong one, a planted right one, its constants."""
 
 import math
 from dataclasses import replace

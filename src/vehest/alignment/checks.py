@@ -315,8 +315,8 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """Short excursions that begin and end with a jump: far beyond the usual range, or to one value
     by steps that are far larger than usual.
 
-    A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre needs
-    longer to come and go. A wheel that shows nothing is the finding ``dropout``.
+    A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre
+    needs longer to come and go. A wheel that shows nothing is the finding ``dropout``.
     Those beyond what a vehicle can do are the finding ``impossible``. A sideslip angle without
     speed is noise.
     """
@@ -367,8 +367,9 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             message = (
                 f"jumps away and back {len(jumps)} time{'s' if len(jumps) > 1 else ''} within "
                 f"{JUMP_SECONDS:g} s, the longest to {samples[begin]:.4g} {unit} for "
-                f"{(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} s; "
-                "mark these samples as missing, or exclude them"
+                f"{(end - begin) / recording.rate_hz:.3g} s from "
+                f"t = {recording.time[begin]:.12g} s; mark these samples as missing, "
+                "or exclude them"
             )
             yield Finding("warning", "spike", name, message)
 

@@ -122,10 +122,8 @@ def unevenness(stamps: FloatArray) -> str:
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
-        gaps = (
-            f"{number_of((steps > GAP * step).sum(), 'gap')}, the longest of {steps[longest]:.6g} s after "
-            f"{stamps[longest]:.12g} s"
-        )
+        number = number_of((steps > GAP * step).sum(), "gap")
+        gaps = f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
         return f"{gaps} (interval {step:.6g} s)"
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:

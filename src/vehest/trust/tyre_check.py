@@ -37,7 +37,8 @@ class TyreCheck:
     """Constants of the check of one model."""
 
     friction: float  # μ₀, that of the training [1]
-    # of x in the squared scales of v and β: (1.645/q)², so that the factor q of 90 % leaves 1.645 √x
+    # of x in the squared scales of v and β: (1.645/q)², so that the factor q of 90 % leaves
+    # 1.645 √x
     weights: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

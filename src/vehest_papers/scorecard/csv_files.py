@@ -73,7 +73,8 @@ def changed_verdicts(studies: Sequence[Study], before: Path) -> str:
         missing = [name for name in ids if (row["paper"], name) not in judged]
         if missing:
             raise DataError(
-                f"'{before}': {row['paper']} has no claim {missing[0]!r}; write an id of claims.yaml"
+                f"'{before}': {row['paper']} has no claim {missing[0]!r}; "
+                "write an id of claims.yaml"
             )
         now = [judged[row["paper"], name] for name in ids]
         rows.append(

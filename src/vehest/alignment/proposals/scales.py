@@ -1,4 +1,4 @@
-"""Which of speed, yaw rate and lateral acceleration is wrong where ay is not vx·yaw_rate in size."""
+"""Which of speed, yaw rate and ay has a wrong scale where ay is not vx·yaw_rate in size."""
 
 from __future__ import annotations
 
