@@ -59,6 +59,7 @@ from vehest_papers.learned_ukf.order import order_lines
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
 
+RESULTS = Path(__file__).parents[2] / "results"
 PROTOCOL = Protocol(
     rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True
 )
@@ -685,6 +686,18 @@ def test_published_figures_agree_with_text_and_friction_and_slip_with_a_calculat
     )
     np.testing.assert_allclose(rear_slip([slipping], 0.1), [45.0, -45.0])
     assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
+
+
+def test_published_report_counts_the_seeds_of_the_filters_and_not_of_single_steps():
+    errors = pd.read_csv(RESULTS / "learned_ukf" / "tables" / "blocks.csv")
+    errors = errors[(errors["part"] == "real") & (errors["metric"] == "mse_weighted")]
+    n_seeds = errors.groupby("candidate")["seed"].nunique()
+    text = (RESULTS / "learned_ukf" / "report.md").read_text(encoding="utf-8")
+    table = text.split("| method | tyre A | tyre D | seeds |\n")[1].split("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    counted = {row[0]: int(row[3]) for row in rows[1:] if row[0] in n_seeds}
+    assert "NNTF" in counted
+    assert counted == {name: n_seeds[name] for name in counted}
 
 
 def test_losses_of_a_sequence_are_those_of_a_hand_calculation():

@@ -136,7 +136,11 @@ def _values(
 ) -> dict[str, object]:
     """Numbers and names that the template has places for."""
     blocks = blocks_of(rows)
-    seeds = {key.candidate: len(errors.seeds) for key, errors in blocks.items() if key.part == MAIN}
+    seeds = {
+        key.candidate: len(errors.seeds)
+        for key, errors in blocks.items()
+        if key.part == MAIN and key.metric == "mse_weighted"
+    }
     main_rows = [
         {"name": name, "seeds": seeds[name]}
         | {test: tables.mse_text(blocks, MAIN, name, test) for test in SETS}
