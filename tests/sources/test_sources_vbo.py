@@ -70,7 +70,7 @@ def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(t
     head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
     lines = rows.splitlines(keepends=True)
     (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[650:]]))
-    assert "gaps, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
+    assert "1 gap, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
     first, second = open_source(dataset(tmp_path, max_gap=1.0)).recordings()
     assert (first.id, second.id, second.provenance["run"], second.start_time) == (
         "lap_run_0",
