@@ -95,7 +95,7 @@ def check(names: list[str]) -> None:
 def soak(minutes: float, model: str) -> int:
     """Replay in real time, and look at the memory of this process once a second; returns the deadlines missed."""
     from can_drive import write_log
-    from replayed_drive import FERRARI, JITTER, LOST, told_for
+    from replayed_drive import FERRARI, JITTER, LOST, signals_for
 
     from conftest import planar_drive
     from vehest.api import load_model
@@ -114,7 +114,7 @@ def soak(minutes: float, model: str) -> int:
     with tempfile.TemporaryDirectory() as folder:
         drive = drive.cut(drive.start_time, drive.start_time + 60.0 * minutes / repeats)
         written = write_log(drive, Path(folder), ".blf", jitter=JITTER, lost=LOST, repeats=repeats)
-        signals = told_for(load_model(model).channels)
+        signals = signals_for(load_model(model).channels)
         out = Path(folder) / "estimates.csv"
         resident: list[float] = []
 

@@ -110,10 +110,12 @@ def pages() -> dict[Path, str]:
     found = {
         file: file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").rglob("*.md"))
     }
-    return {file: PART.sub(_made, text) for file, text in found.items() if PART.search(text)}
+    return {
+        file: PART.sub(generated_part, text) for file, text in found.items() if PART.search(text)
+    }
 
 
-def _made(part: re.Match[str]) -> str:
+def generated_part(part: re.Match[str]) -> str:
     """A part anew; as it is where the results that it shows are not here."""
     paragraphs = list(PARTS[part[1]](*part[2].split()))
     return f"{part[1]}{part[2]} -->\n" + "\n\n".join(paragraphs) if paragraphs else part[0]
@@ -292,14 +294,9 @@ def _as_yaml(value: Any) -> str:
 
 
 def _sections(described: type) -> dict[str, str]:
-    """A docstring's first paragraph, under the empty name, and arguments or fields by name: from the docstring or the comment of each."""
+    """A docstring's first paragraph, under the empty name, and the comments of fields by name."""
     text = inspect.getdoc(described) or ""
     sections = {"": " ".join(text.split("\n\n")[0].split())}
-    if "Args:" in text:
-        for entry in re.split(r"\n    (?=\w)", text.split("Args:")[1].split("\n\n")[0]):
-            names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
-            if names:
-                sections |= dict.fromkeys(names.split(", "), meaning)
     for name, meaning in field_comments(described).items():
         sections.setdefault(name, f"{meaning.removesuffix('.')}.".replace("``", "`"))
     return sections

@@ -39,7 +39,13 @@ from vehest.data.resampling import resampled
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.inference.car_values import LIMITS, WIDENING, CarRecord, calibrated, with_settings
+from vehest.inference.car_values import (
+    DEVIATION_FACTOR,
+    LIMITS,
+    CarRecord,
+    calibrated,
+    with_settings,
+)
 from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.report.style import fixed
@@ -206,7 +212,7 @@ def carried_over(runner: Runner, root: str) -> tuple[pd.DataFrame, pd.DataFrame]
             if others:
                 record = record_of(model, others)
                 errors = {"cold": judged(model, drive, car.slowest)[0]}
-                for title, by in product(SETS, (1.0, WIDENING, 3.0)):
+                for title, by in product(SETS, (1.0, DEVIATION_FACTOR, 3.0)):
                     errors[f"{title}; {by:g}"] = judged(
                         started(model, record, SETS[title], by), drive, car.slowest
                     )[0]
@@ -686,12 +692,12 @@ def report(
         planted=markdown(pd.DataFrame(cells).T.rename_axis("number")),
         scenes=markdown(seen.set_index("scene")),
         verdict=f"Worse than v = 0: {', '.join(worse) or 'none'}; by more than the median band: {', '.join(beyond) or 'none'}.",
-        worst=fixed(ratios[f"κ, b, a_max, C; {WIDENING:g}"].max(), 2),
-        better=int((ratios[f"κ, b; {WIDENING:g}"] < 1.0).sum()),
+        worst=fixed(ratios[f"κ, b, a_max, C; {DEVIATION_FACTOR:g}"].max(), 2),
+        better=int((ratios[f"κ, b; {DEVIATION_FACTOR:g}"] < 1.0).sum()),
         drives=len(rows),
         real=int((origins == "real").sum()),
         simulated=int((origins == "simulated").sum()),
-        widening=WIDENING,
+        widening=DEVIATION_FACTOR,
         cars=len(cars),
     )
 

@@ -1,4 +1,6 @@
-"""Headless Chromium for tests of pages: starting it, opening a page at a width and in a scheme, what it and axe complain of."""
+"""Headless Chromium for tests of pages: starting it, opening a page at a width and in a scheme,
+what it and axe complain of.
+"""
 
 import shutil
 from contextlib import contextmanager
@@ -21,7 +23,10 @@ READY_SECONDS = 60.0
 
 @contextmanager
 def browser(profile):
-    """A browser with a profile of its own, in an empty folder; the test is skipped where there is none."""
+    """A browser with a profile of its own, in an empty folder.
+
+    The test is skipped where there is none.
+    """
     webdriver = pytest.importorskip(
         "selenium.webdriver", reason="selenium is not installed: pip install 'vehest[dev]'"
     )
@@ -45,11 +50,13 @@ def browser(profile):
         started.quit()
 
 
-def opened(driver, path, *, width=1280, scheme="light"):
-    """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all that it draws by itself is drawn."""
+def opened(driver, path, *, width=1280, scheme="light", pixel_ratio=1):
+    """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all
+    that it draws by itself is drawn.
+    """
     from selenium.webdriver.support.ui import WebDriverWait
 
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    size = {"width": width, "height": 900, "deviceScaleFactor": pixel_ratio, "mobile": width < 600}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     driver.execute_cdp_cmd(
         "Emulation.setEmulatedMedia",
@@ -60,7 +67,7 @@ def opened(driver, path, *, width=1280, scheme="light"):
     drawn = (
         "return [...document.querySelectorAll('figure.live')].every(figure => figure.dataset.ready)"
     )
-    WebDriverWait(driver, READY_SECONDS, 0.1).until(lambda own: own.execute_script(drawn))
+    WebDriverWait(driver, READY_SECONDS, 0.1).until(lambda page: page.execute_script(drawn))
 
 
 def complaints(driver):
@@ -69,15 +76,17 @@ def complaints(driver):
 
 
 def axe_violations(driver, within="html"):
-    """What axe finds on the page that is open, or in a part of it, a line each: rule, and the first element."""
+    """What axe finds on the page that is open, or in a part of it, a line each: rule, and the first
+    element.
+    """
     pytest.importorskip(
         "axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'"
     )
     driver.execute_script((files("axe_core_python") / "axe.min.js").read_text(encoding="utf-8"))
-    found = driver.execute_async_script(
+    result = driver.execute_async_script(
         "const done = arguments[arguments.length - 1]; axe.run(arguments[0]).then(done)", within
     )
     return [
-        f"{own['id']}: {own['help']}, {own['nodes'][0]['html'][:200]}"
-        for own in found["violations"]
+        f"{violation['id']}: {violation['help']}, {violation['nodes'][0]['html'][:200]}"
+        for violation in result["violations"]
     ]

@@ -17,7 +17,7 @@ torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_core():
+def _single_core():
     """Commands that name no number of jobs run them in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sched_getaffinity", lambda _: {0})
@@ -35,34 +35,36 @@ def _composed_once():
     compose = config.compose
     composed = {}
 
-    def kept(command, overrides):
+    def compose_once(command, overrides):
         *local, packaged, _ = config.conf_folders()
-        found = {
+        contents = {
             file: file.read_bytes()
             for folder in local
             for file in sorted(folder.rglob("*.yaml"))
             if file.is_file()
         }
-        all_count = any(b"defaults" in text for text in found.values())
+        all_count = any(b"defaults" in text for text in contents.values())
         words = " ".join(overrides)
         counts = [
             file
-            for file in found
+            for file in contents
             if all_count or file.stem in words or (packaged / file.relative_to("conf")).exists()
         ]
-        key = (command, *overrides, *((str(file), found[file]) for file in counts))
+        key = (command, *overrides, *((str(file), contents[file]) for file in counts))
         if key not in composed:
             composed[key] = compose(command, overrides=overrides)
         return composed[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(config, "compose", kept)
+        patch.setattr(config, "compose", compose_once)
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _readers_forked():
-    """Files of others are read in a process that has imported what it reads with, which takes a new one 1 to 2 s."""
+    """Files of others are read in a process that has imported what it reads with, which takes a new
+    one 1 to 2 s.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vehest.sources.limited.subprocess", processes.READING)
         yield
@@ -70,6 +72,7 @@ def _readers_forked():
 
 @pytest.fixture(autouse=True)
 def _processes_end_with_their_test():
+    """End the processes that a test started and left running."""
     yield
     processes.end_all()
 
@@ -84,7 +87,9 @@ def data_root():
 
 
 def planar_drive(seconds=60.0, rate_hz=20.0, seed=0, noise=0.0, name="drive"):
-    """A drive that obeys planar kinematics exactly (up to noise): smooth vx, yaw rate and vy, accelerations derived from them."""
+    """A drive that obeys planar kinematics exactly (up to noise): smooth vx, yaw rate and vy,
+    accelerations derived from them.
+    """
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     phases = generator.uniform(0, 2 * np.pi, 6)
@@ -123,6 +128,7 @@ def die_after(reports):
     left = iter(range(reports - 1))
 
     def die(progress):
+        """Interrupt once the calls are used up."""
         if next(left, None) is None:
             raise KeyboardInterrupt
 
@@ -142,7 +148,9 @@ def drawn():
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """An empty working folder, without a data root, an output root or a tracking server from outside."""
+    """An empty working folder, without a data root, an output root or a tracking server from
+    outside.
+    """
     monkeypatch.chdir(tmp_path)
     for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
         monkeypatch.delenv(name, raising=False)

@@ -11,18 +11,21 @@ FRONT = DugoffAxle(1.2e5, 1.0, 0.005)
 REAR = DugoffAxle(1.7e5, 1.05, 0.004)
 TYRES = {
     f"{name}_{axle}": value
-    for axle, own in (("front", FRONT), ("rear", REAR))
-    for name, value in own._asdict().items()
+    for axle, curve in (("front", FRONT), ("rear", REAR))
+    for name, value in curve._asdict().items()
 }
 NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 
 def dugoff_track(tyres="plain"):
+    """Single track with the tyres and the car of `dugoff_drive`."""
     return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0)
 
 
 def driven(inputs):
-    """What the track does at 100 Hz from rest under speed, steering angle and ax, (T, 3): its two states and what is measured of them."""
+    """What the track does at 100 Hz from rest under speed, steering angle and ax, (T, 3): its two
+    states and what is measured of them.
+    """
     track = CompiledDugoffTrack(dugoff_track())
     states = np.zeros((len(inputs), 1, 2))
     for k in range(len(inputs) - 1):
@@ -31,7 +34,10 @@ def driven(inputs):
 
 
 def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0):
-    """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces; its last seconds lead straight ahead."""
+    """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces.
+
+    Its last seconds lead straight ahead.
+    """
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * 100)) / 100
     phases = generator.uniform(0, 6, 3)
@@ -46,19 +52,19 @@ def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0)
         )
     vy, true_yaw_rate, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
 
-    def shown(values, level):
+    def measured(values, level):
         return values + noise * level * generator.standard_normal(len(time))
 
     channels = {
         "vx": vx,
         "ax": ax,
         "steer": steer,
-        "ay": shown(ay, NOISE["ay"]),
-        "yaw_rate": shown(yaw_rate, NOISE["yaw_rate"]),
-        "fy_fl": shown(0.4 * front, NOISE["fy"]),
-        "fy_fr": shown(0.6 * front, NOISE["fy"]),
-        "fy_rl": shown(0.4 * rear, NOISE["fy"]),
-        "fy_rr": shown(0.6 * rear, NOISE["fy"]),
+        "ay": measured(ay, NOISE["ay"]),
+        "yaw_rate": measured(yaw_rate, NOISE["yaw_rate"]),
+        "fy_fl": measured(0.4 * front, NOISE["fy"]),
+        "fy_fr": measured(0.6 * front, NOISE["fy"]),
+        "fy_rl": measured(0.4 * rear, NOISE["fy"]),
+        "fy_rr": measured(0.6 * rear, NOISE["fy"]),
         "vx_ref": vx,
         "vy_ref": vy,
         "yaw_rate_ref": true_yaw_rate,

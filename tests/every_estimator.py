@@ -1,4 +1,6 @@
-"""Every estimator that vehest has, fitted for a moment, and a drive for each: what holds for all families is tested on all."""
+"""Every estimator that vehest has, fitted for a moment, and a drive for each: what holds for all
+families is tested on all.
+"""
 
 from copy import deepcopy
 
@@ -22,7 +24,9 @@ from vehest.training.through_filter import ThroughFilterSettings
 VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
 SMALL = {"inputs": "imu", "hidden": [8, 4]}
 DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
-CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurrent ones see what the drives below have
+# With these offline estimators run online, baselines at 100 Hz, and recurrent networks read the
+# channels of the drives below.
+CONFIGS = {
     "factor_graph": {"window": 0.05},
     **{name: {"rate_hz": 100.0} for name in ("zero", "static_map", "prior_map", "kinematic")},
     "data_sheet": {"rate_hz": 100.0, "wheelbase": 2.7},
@@ -38,12 +42,14 @@ CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurren
     },
 }
 ONCE = PhaseSettings(max_epochs=1)
-GIVEN = IdentificationSettings(method="data")
+FROM_DATA = IdentificationSettings(method="data")
 SAMPLED = {
     SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype=dtype),
-    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype=dtype, identification=GIVEN),
+    EnsembleSettings: lambda dtype: EnsembleSettings(
+        ONCE, 256, dtype=dtype, identification=FROM_DATA
+    ),
     EndToEndSettings: lambda dtype: EndToEndSettings(
-        ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype
+        ONCE, 256, ONCE, steps=50, batch_size=16, identification=FROM_DATA, dtype=dtype
     ),
 }
 _FITTED = {}
@@ -58,6 +64,7 @@ def fitted(name, dtype="float64", **config):
 
 
 def _fit(name, dtype, config):
+    """An estimator of a family, fitted with as few epochs as possible."""
     estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:

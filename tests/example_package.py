@@ -1,4 +1,6 @@
-"""The worked examples of docs/adding_an_estimator.md as a package of their own, installed into a folder."""
+"""The worked examples of docs/adding_an_estimator.md as a package of their own, installed into a
+folder.
+"""
 
 import sys
 from pathlib import Path

@@ -9,6 +9,7 @@ STRUCT_OF_A_DATA_PAGE = 0x2C
 
 
 def varint(number):
+    """A number in the variable length of Thrift."""
     content = bytearray()
     while number >= 0x80:
         content.append(number & 0x7F | 0x80)
@@ -17,7 +18,9 @@ def varint(number):
 
 
 def page_header(n_bytes_unpacked, n_bytes_packed, n_values):
-    """A header of a data page of plain values, in Thrift's compact protocol, which counts numbers in zigzag."""
+    """A header of a data page of plain values, in Thrift's compact protocol, which counts numbers
+    in zigzag.
+    """
     sizes = [(0x15, 0), (0x15, n_bytes_unpacked), (0x15, n_bytes_packed)]
     page = [(STRUCT_OF_A_DATA_PAGE, None), (0x15, n_values), (0x15, 0), (0x15, 3), (0x15, 3)]
     fields = [
@@ -28,7 +31,9 @@ def page_header(n_bytes_unpacked, n_bytes_packed, n_values):
 
 
 def bomb(file, n_bytes, names=("vx", "ay")):
-    """A file whose columns have one page of zeros each, of ``n_bytes``, behind metadata that say nothing of it."""
+    """A file whose columns have one page of zeros each, of ``n_bytes``, behind metadata that say
+    nothing of it.
+    """
     rng = np.random.default_rng(0)
     schema = pa.schema([pa.field(name, pa.float64(), nullable=False) for name in names])
     table = pa.table({name: rng.normal(size=N) for name in names}, schema=schema)

@@ -1,4 +1,6 @@
-"""A small data set with a configuration and a pipeline of its own, and the command line run on it."""
+"""A small data set with a configuration and a pipeline of its own, and the command line run
+on it.
+"""
 
 import json
 import shutil
@@ -40,6 +42,7 @@ def write_csv(path, seed, seconds=30.0):
 
 @cache
 def _table(seed, seconds):
+    """Table of a drive, in the units of its data set."""
     drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
     table = pd.DataFrame(
         {
@@ -76,7 +79,9 @@ DATASET = {
 
 
 def undrawn(patch):
-    """Save figures without their content: laying out those of a small study takes longer than all the rest of it."""
+    """Save figures without their content: laying out those of a small study takes longer than all
+    the rest of it.
+    """
     save = Figure.savefig
     patch.setattr(
         Figure,
@@ -97,6 +102,7 @@ SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
 
 
 def write_yaml(file, content):
+    """Write a file of configuration and the folders above it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
 
@@ -109,20 +115,22 @@ def write_drives(folder, seconds=30.0):
 
 
 def write_steered(folder, names):
-    """A data set ``steered`` of a linear single track with a steering angle: drives of 30 s, name -> seed."""
+    """A data set ``steered`` of a linear single track with a steering angle: drives of 30 s, name
+    -> seed.
+    """
     (folder / "raw" / "steered").mkdir(parents=True)
     for name, seed in names.items():
         drive = linear_drive(30.0, seed=seed)[0]
         table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
         table.to_csv(folder / "raw" / "steered" / f"{name}.csv", index=False)
     channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
-    own = {
+    entries = {
         "name": "steered",
         "path": "${root}/steered",
         "time": {"column": "t", "unit": "s"},
         "channels": channels,
     }
-    write_yaml(folder / "conf" / "dataset" / "steered.yaml", DATASET | own)
+    write_yaml(folder / "conf" / "dataset" / "steered.yaml", DATASET | entries)
 
 
 def run_vehest(capsys, *arguments):
@@ -141,7 +149,7 @@ def run_vehest(capsys, *arguments):
 
 
 _DONE = {}
-_KEPT = TemporaryDirectory()
+_COPIES = TemporaryDirectory()
 
 
 class Place:
@@ -156,7 +164,9 @@ class Place:
         self.change("pipelines/small.yaml", **PIPELINE)
 
     def add_steered(self):
-        """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single track with a steering angle."""
+        """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single
+        track with a steering angle.
+        """
         write_steered(self.folder, {"first": 1, "second": 2})
 
     def __call__(self, *arguments):
@@ -183,7 +193,9 @@ class Place:
         return content
 
     def once(self, *arguments):
-        """Output and errors of a command that must succeed: it runs once, later places like this one get a copy of what it made."""
+        """Output and errors of a command that must succeed: it runs once, later places like this
+        one get a copy of what it made.
+        """
         files = [
             file
             for file in sorted(self.folder.rglob("*"))
@@ -197,18 +209,21 @@ class Place:
             ),
         )
         if key not in _DONE:
-            said = self.done(*arguments)
-            kept = Path(_KEPT.name) / str(len(_DONE))
-            _DONE[key] = said, shutil.copytree(self.folder, kept)
+            output = self.done(*arguments)
+            copy = Path(_COPIES.name) / str(len(_DONE))
+            _DONE[key] = output, shutil.copytree(self.folder, copy)
         else:
             shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)
         return _DONE[key][0]
 
     def refused(self, *arguments, code=None, says=()):
-        """Exit code and the one line of a command that must fail and leave nothing behind; what is expected of them."""
+        """Exit code and error line of a command that must fail and leave nothing behind.
+
+        ``code`` and ``says`` are what is expected of both.
+        """
         before = self.files()
-        found, _, err = self(*arguments)
-        assert found != 0
+        exit_code, _, err = self(*arguments)
+        assert exit_code != 0
         lines = [
             line for line in err.splitlines() if not line.startswith(("done", "reused", "once"))
         ]
@@ -220,12 +235,12 @@ class Place:
             if "/ingest/" not in name and "/downsample/" not in name
         } == set()
         assert not any(ASIDE_PREFIX in name for name in self.files())
-        assert code in (None, found), lines[0]
-        assert found == 1 or "defect" not in lines[0]
+        assert code in (None, exit_code), lines[0]
+        assert exit_code == 1 or "defect" not in lines[0]
         assert [
             words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]
         ] == [], lines[0]
-        return found, lines[0]
+        return exit_code, lines[0]
 
     def files(self):
         """Every file in the output root but the locks, which stay where they are and are empty."""

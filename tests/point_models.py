@@ -9,18 +9,18 @@ from vehest.filters.unscented_steps import room
 def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     """What an entry writes for points (B, S, n) and inputs (B, p): (B, S, size)."""
     out = room((points.shape[1], size, len(points)), points.dtype)
-    given = []
+    upstreams = []
     learnt = []
     x = _sequences_last(points)
     u = _sequences_last(inputs)
     if upstream is not None:
-        given = [_sequences_last(upstream)]
+        upstreams = [_sequences_last(upstream)]
         learnt = [model.learnt(gradients)]
         u = _sequences_last(np.pad(inputs, ((0, 0), (0, model.scratch_rows * points.shape[1]))))
         model.entries[entry - 2](
-            x, u, model.car, np.empty_like(given[0]), 0, len(points)
+            x, u, model.car, np.empty_like(upstreams[0]), 0, len(points)
         )  # leaves what its adjoint takes
-    model.entries[entry](x, u, model.car, *given, out, *learnt, 0, len(points))
+    model.entries[entry](x, u, model.car, *upstreams, out, *learnt, 0, len(points))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))
 
 
@@ -36,7 +36,9 @@ def noise_by(function):
 
 
 def covariances(noise, states, inputs):
-    """What a `CompiledNoise` of `vehest.filters.noise_models` says at states (B, n) under inputs (B, p): (B, k, k)."""
+    """What a `CompiledNoise` of `vehest.filters.noise_models` says at states (B, n) under inputs
+    (B, p): (B, k, k).
+    """
     out = room((*noise.car[0].shape, len(states)), states.dtype)
     noise.entry(_sequences_last(states), _sequences_last(inputs), noise.car, out, 0, len(states))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))

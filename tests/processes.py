@@ -35,19 +35,23 @@ def end_all():
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def wait_for(event, process=None, said=None):
-    """Wait for an event and return what it says; a process that ends before it fails the test with what it ``said``."""
+def wait_for(event, process=None, output=None):
+    """Wait for an event and return what it says.
+
+    A process that ends before it fails the test, with what it wrote, ``output``.
+    """
     limit = time.monotonic() + HANGS
-    while not (found := event()):
+    while not (result := event()):
         assert process is None or process.poll() is None, (
-            f"it ended before the event: {(said or process.communicate)()}"
+            f"it ended before the event: {(output or process.communicate)()}"
         )
-        assert time.monotonic() < limit, f"the event did not come: {said() if said else ''}"
+        assert time.monotonic() < limit, f"the event did not come: {output() if output else ''}"
         time.sleep(MOMENT)
-    return found
+    return result
 
 
 def is_alive(pid):
+    """Whether a process has not ended."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
@@ -62,7 +66,10 @@ def status_kb(field, pid="self"):
 
 
 class Striking:
-    """A function that sends its process a signal once it is through for the n-th time; keeps its arguments."""
+    """A function that sends its process a signal once it is through for the n-th time.
+
+    Keeps its arguments.
+    """
 
     def __init__(self, function, call=0, number=0):
         self.function = function
@@ -79,7 +86,9 @@ class Striking:
 
 
 class ForkedReader:
-    """The process of `vehest.sources.limited`, forked from this one: it need not import again what it reads with."""
+    """The process of `vehest.sources.limited`, forked from this one: it need not import again what
+    it reads with.
+    """
 
     def __init__(self):
         order, stdin = os.pipe()
@@ -108,6 +117,7 @@ class ForkedReader:
         return self._code
 
     def kill(self):
+        """End the process at once."""
         if self._code is None:
             os.kill(self.pid, signal.SIGKILL)
 
@@ -118,9 +128,10 @@ def _read_order(order, answers):
         from vehest.sources.limited import _answer, _send
 
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - as long as the process lives
-        with os.fdopen(order, "rb") as told, os.fdopen(answers, "wb") as stream:
-            request = json.load(told)
+        # Open as long as the process lives.
+        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+        with os.fdopen(order, "rb") as orders, os.fdopen(answers, "wb") as stream:
+            request = json.load(orders)
             _send(
                 stream,
                 *_answer(request | {"memory": request["memory"] + 1024 * status_kb("VmData")}),
@@ -130,7 +141,9 @@ def _read_order(order, answers):
 
 
 def _reading_process(command, **options):
-    """As `subprocess.Popen`, which it is where memory is limited, since this process has taken more than a new one would."""
+    """As `subprocess.Popen`, which it is where memory is limited, since this process has taken more
+    than a new one would.
+    """
     from vehest.data.limits import Limits, current_limits
 
     return (

@@ -1,4 +1,6 @@
-"""Drives of a single track with rational tyres, integrated finely, with known curves, states and noise."""
+"""Drives of a single track with rational tyres, integrated finely, with known curves, states and
+noise.
+"""
 
 import numpy as np
 

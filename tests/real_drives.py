@@ -10,6 +10,7 @@ FERRARI = "20140222_01_01_03_250lm"
 
 @cache
 def source_of(data_root, dataset="ferrari_250lm"):
+    """Source of a real data set."""
     return open_source(
         compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
     )
@@ -17,4 +18,5 @@ def source_of(data_root, dataset="ferrari_250lm"):
 
 @cache
 def real_drive(data_root, recording=FERRARI, dataset="ferrari_250lm"):
+    """A real recording, read once."""
     return source_of(data_root, dataset).read(recording)

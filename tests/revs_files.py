@@ -1,6 +1,8 @@
-"""Writes files in the official layouts of the Revs database, from signals that the caller knows; for tests and benchmarks.
+"""Writes files in the official layouts of the Revs database, from signals that the caller knows;
+for tests and benchmarks.
 
-Names of columns and parameters are those that public programs read from the real files; values are made here.
+Names of columns and parameters are those that public programs read from the real files; values are
+made here.
 """
 
 from collections.abc import Mapping
@@ -79,20 +81,20 @@ def _columns():
         columns[name] = (unit, INS_RATE_HZ)
     for name in ("numSVsTracked", "gpsPosMode", "gpsVelMode", "gpsOrientMode", "HDOP", "PDOP"):
         columns[name] = ("-", GPS_RATE_HZ)
-    for what, unit, axes in (
+    for quantity, unit, axes in (
         ("pos", "m", "north east down"),
         ("vel", "m/s", "north east down"),
         ("orient", "°", "heading pitch roll"),
     ):
         for axis in axes.split():
-            columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ)
-    for what, unit, corners in (
+            columns[f"{quantity}Accuracy_{axis}"] = (unit, GPS_RATE_HZ)
+    for quantity, unit, corners in (
         ("chassisAccel", "g", "FL FR RL RR"),
         ("deflection", "mm", "FL FR RR"),
         ("wheelAccel", "g", "FL FR RL RR"),
     ):
         for corner in corners.split():
-            columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ)
+            columns[f"{quantity}{corner}"] = (unit, CSV_RATE_HZ)
     return columns
 
 
@@ -102,18 +104,23 @@ assert len(COLUMNS) == 55
 
 @dataclass(frozen=True)
 class Drive:
-    """What the sensors delivered over a whole number of tenths of a second: column -> samples at its rate, in the files' units."""
+    """What the sensors delivered over a whole number of tenths of a second: column -> samples at
+    its rate, in the files' units.
+    """
 
     seconds: float
     signals: Mapping[str, FloatArray]
     start_time: float = 0.0
 
     def rows(self):
+        """Number of rows of the CSV file."""
         return round(self.seconds * CSV_RATE_HZ)
 
 
 def smooth_drive(seconds, start_time=0.0, decimals=None):
-    """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with nothing held and every digit kept."""
+    """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with
+    nothing held and every digit kept.
+    """
     time = np.arange(round(seconds * CSV_RATE_HZ)) / CSV_RATE_HZ
     yaw_rate = 0.35 * np.sin(0.5 * time + 0.3) + 0.15 * np.sin(1.3 * time + 1.1)
     yaw_rate_dot = 0.175 * np.cos(0.5 * time + 0.3) + 0.195 * np.cos(1.3 * time + 1.1)
@@ -145,13 +152,15 @@ def smooth_drive(seconds, start_time=0.0, decimals=None):
 
 
 def write_csv(path, drive, *, blank_rows=37):
-    """One official CSV file: lines about the drive, names, units, a row a millisecond; slower sensors' values are held.
+    """One official CSV file: lines about the drive, names, units, a row a millisecond; slower
+    sensors' values are held.
 
-    Columns that the drive lacks are filled with something; every column slower than 1 kHz, or those named, begin with ``blank_rows``.
+    Columns that the drive lacks are filled with something; every column slower than 1 kHz, or those
+    named, begin with ``blank_rows``.
     """
     arrays = []
     for name, (_, rate) in COLUMNS.items():
-        values = _held(drive, name, rate)
+        values = _hold_samples(drive, name, rate)
         blank = (
             blank_rows.get(name, 0)
             if isinstance(blank_rows, Mapping)
@@ -172,7 +181,7 @@ def write_vehicle_parameters(path):
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
 
 
-def _held(drive, name, rate):
+def _hold_samples(drive, name, rate):
     """A column of the CSV file, held between the samples of its sensor."""
     if name == "time":
         return np.round(drive.start_time + np.arange(drive.rows()) / CSV_RATE_HZ, 3)

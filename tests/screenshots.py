@@ -10,7 +10,7 @@ from PIL import Image
 
 from chromium import browser, opened
 
-LOOKS = {1280: 1.0, 390: 2.0}  # width [px] -> pixels of the picture for one of the page
+PIXEL_RATIOS = {1280: 1, 390: 2}  # width [px] -> pixels of the picture for one of the page
 MARGIN = 16  # px above the first element
 HEIGHTS = {1280: 1150, 390: 1500}
 SCHEMES = ("light", "dark")
@@ -18,13 +18,15 @@ SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"
 
 
 def picture(driver, top, width, path):
-    """A part of the page that is open, from ``top`` down, in 256 colours."""
+    """A part of the page that is open, from ``top`` down, at most to its end, in 256 colours."""
+    y = max(top - MARGIN, 0)
+    page_height = driver.execute_script("return document.documentElement.scrollHeight")
     clip = {
         "x": 0,
-        "y": max(top - MARGIN, 0),
+        "y": y,
         "width": width,
-        "height": HEIGHTS[width],
-        "scale": LOOKS[width],
+        "height": min(HEIGHTS[width], page_height - y),
+        "scale": 1.0,
     }
     shot = driver.execute_cdp_cmd(
         "Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip}
@@ -36,14 +38,18 @@ def picture(driver, top, width, path):
 
 
 def main(report, site, out):
-    """Write ``report_*`` (its beginning), ``traces_*`` (traces, course, filter) and ``site_*`` at both widths, light and dark."""
+    """Write ``report_*`` (its beginning), ``traces_*`` (traces, course, filter) and ``site_*`` at
+    both widths, light and dark.
+    """
     out.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as driver:
-        for width in LOOKS:
+        for width, pixel_ratio in PIXEL_RATIOS.items():
             for scheme in SCHEMES:
-                opened(driver, report.resolve(), width=width, scheme=scheme)
+                look = {"width": width, "scheme": scheme, "pixel_ratio": pixel_ratio}
+                opened(driver, report.resolve(), **look)
                 for name, selector in {"report": "h1", "traces": "figure.live"}.items():
-                    script = f"return document.querySelector('{selector}').getBoundingClientRect().top + scrollY"
+                    element = f"document.querySelector('{selector}')"
+                    script = f"return {element}.getBoundingClientRect().top + scrollY"
                     picture(
                         driver,
                         driver.execute_script(script),
@@ -51,7 +57,7 @@ def main(report, site, out):
                         out / f"{name}_{width}_{scheme}.png",
                     )
                 for name, page in SITE.items():
-                    opened(driver, (site / page).resolve(), width=width, scheme=scheme)
+                    opened(driver, (site / page).resolve(), **look)
                     picture(driver, 0, width, out / f"{name}_{width}_{scheme}.png")
 
 

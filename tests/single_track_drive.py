@@ -12,7 +12,8 @@ NOISE = {"yaw_rate": 0.01, "ay": 0.5, "steer": 0.01}
 def linear_drive(seconds=20.0, rate_hz=100.0, seed=0, noise=NOISE):
     """A recording of the model's own equations and its states (β, r), (T, 2).
 
-    The steering angle that acts between samples is the measured one plus white noise; ay and yaw rate are measured with noise.
+    The steering angle that acts between samples is the measured one plus white noise; ay and yaw
+    rate are measured with noise.
     """
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate_hz)) / rate_hz
@@ -42,8 +43,8 @@ def linear_drive(seconds=20.0, rate_hz=100.0, seed=0, noise=NOISE):
 def with_gaps(drive, gaps):
     """The same drive where some samples of some channels were not measured."""
     channels = {name: samples.copy() for name, samples in drive.channels.items()}
-    for name, where in gaps.items():
-        channels[name][where] = np.nan
+    for name, gap in gaps.items():
+        channels[name][gap] = np.nan
     return Recording(
         drive.id,
         drive.vehicle,

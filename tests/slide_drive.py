@@ -1,4 +1,6 @@
-"""A slide after a drive: the self-calibrating filter must not take it for the place of the inertial unit."""
+"""A slide after a drive: the self-calibrating filter must not take it for the place of the inertial
+unit.
+"""
 
 import numpy as np
 
@@ -6,7 +8,9 @@ RATE = 20.0
 
 
 def slide_after(samples):
-    """Samples (T, 4) of yaw rate, speed, ay and ax, then a straight, a bend and a slide: the car turns faster than it is pushed."""
+    """Samples (T, 4) of yaw rate, speed, ay and ax, then a straight, a bend and a slide: the car
+    turns faster than it is pushed.
+    """
     straight = np.tile([0.0, 22.0, 0.0, 0.0], (100, 1))
     bend = np.tile([-0.36, 22.0, -8.0, 0.0], (60, 1))
     bend[:, [0, 2]] *= np.minimum(np.arange(60) / 30.0, 1.0)[:, None]

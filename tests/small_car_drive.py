@@ -18,7 +18,10 @@ NOISE = {"ax": 0.4, "ay": 0.4, "yaw_rate": 0.02, "motor_speed": 0.4}
 
 @cache
 def small_car_drive(seconds=4.0, seed=0, noise=1.0):
-    """Swerves at 2 to 4 m/s, tyres that saturate; measurements with noise of a small car's sensors."""
+    """Swerves at 2 to 4 m/s, tyres that saturate.
+
+    Measurements with noise of a small car's sensors.
+    """
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * RATE)) / RATE
     phase = generator.uniform(0.0, 2.0 * np.pi, 4)

@@ -16,19 +16,19 @@ LOCK = ROOT / "constraints.txt"
 PINNED = dict(line.split("==") for line in LOCK.read_text(encoding="utf-8").split())
 
 
-def test_what_pyproject_asks_for_is_pinned_to_one_version_that_it_allows_and_no_place():
+def test_requirements_are_pinned_to_an_allowed_version_and_to_no_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    asked = [
+    requirements = [
         Requirement(line)
         for line in chain(project["dependencies"], *project["optional-dependencies"].values())
     ]
     pinned = {name.lower().replace("_", "-"): version for name, version in PINNED.items()}
-    others = [own for own in asked if own.name != "vehest"]
-    assert len(others) > 40
+    third_party = [requirement for requirement in requirements if requirement.name != "vehest"]
+    assert len(third_party) > 40
     assert not [
-        str(own)
-        for own in others
-        if not own.specifier.contains(pinned[own.name.lower().replace("_", "-")])
+        str(requirement)
+        for requirement in third_party
+        if not requirement.specifier.contains(pinned[requirement.name.lower().replace("_", "-")])
     ]
     assert all(
         re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line)
@@ -37,7 +37,7 @@ def test_what_pyproject_asks_for_is_pinned_to_one_version_that_it_allows_and_no_
     assert not [name for name in PINNED if name.startswith(("nvidia", "cuda", "triton"))]
 
 
-def test_libraries_that_numbers_depend_on_are_installed_as_locked_and_provenance_names_the_lock():
+def test_numerical_libraries_are_installed_as_locked_and_provenance_names_the_lock():
     assert {name: version.partition("+")[0] for name, version in library_versions().items()} == {
         name: PINNED[name] for name in library_versions()
     }

@@ -1,4 +1,6 @@
-"""The documentation says what the code does: generated pages, links, commands, examples, constants."""
+"""The documentation says what the code does: generated pages, links, commands, examples,
+constants.
+"""
 
 import re
 import shlex
@@ -56,12 +58,10 @@ def without_fences(text):
     return re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def of_pages(found):
+def of_pages(find):
     """Parameters from all pages, each named by its page."""
     return [
-        pytest.param(file, item, id=f"{file.name}: {item}")
-        for file in PAGES
-        for item in found(file)
+        pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in find(file)
     ]
 
 
@@ -77,26 +77,31 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     columns = (
         "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     )
-    rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,best,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not significant,,,0.2\n'
+    rows = (
+        '"KS-NN, small",12,0.12345,0.100 … 0.200,best,yes,no,0.0123\n'
+        "Other,2,0.5,0.400 … 0.600,not significant,,,0.2\n"
+    )
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
-    (made,) = make_reference.leaderboard(str(source))
+    (leaderboard,) = make_reference.leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | best | yes | no | 0.012 |"
     second = "| Other | 2 | 0.500 | 0.400 … 0.600 | not significant | – | – | 0.200 |"
-    assert made.endswith(f"{first}\n{second}")
+    assert leaderboard.endswith(f"{first}\n{second}")
 
 
 def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
     monkeypatch.setattr(make_reference, "RESULTS", tmp_path)
-    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page(
+    assert make_reference.PART.sub(make_reference.generated_part, page("docs/results.md")) == page(
         "docs/results.md"
     )
 
 
 def links(file):
     text = without_fences(file.read_text(encoding="utf-8"))
-    found = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
+    targets = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
     return [
-        target for target in dict.fromkeys(found) if not target.startswith(("https://", "http://"))
+        target
+        for target in dict.fromkeys(targets)
+        if not target.startswith(("https://", "http://"))
     ]
 
 
@@ -111,17 +116,19 @@ def anchors(file):
 @pytest.mark.parametrize(("file", "target"), of_pages(links))
 def test_relative_links_and_images_resolve(file, target):
     path, _, anchor = target.partition("#")
-    there = (file.parent / path).resolve() if path else file
-    if not there.exists() and there.is_relative_to(STUDY) and not STUDY.exists():
+    linked = (file.parent / path).resolve() if path else file
+    if not linked.exists() and linked.is_relative_to(STUDY) and not STUDY.exists():
         pytest.skip("results/ferrari_drive is not here: run 'make ferrari_drive'")
-    assert there.exists(), f"{file.name} links to {target}"
+    assert linked.exists(), f"{file.name} links to {target}"
     if anchor:
-        assert anchor in anchors(there), f"{file.name} links to {target}"
+        assert anchor in anchors(linked), f"{file.name} links to {target}"
 
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
-    """An empty folder with the configuration files that the pages show, each under the name in its first line."""
+    """An empty folder with the configuration files that the pages show, each under the name in its
+    first line.
+    """
     for file in PAGES:
         for block in fences(file.read_text(encoding="utf-8"), "yaml"):
             named = re.match(r"# ((?:conf|pipelines)/\S+?\.yaml)", block)
@@ -135,12 +142,12 @@ def workplace(tmp_path, monkeypatch):
 
 
 def test_example_files_are_valid(workplace):
-    shown = {file.relative_to(workplace).as_posix() for file in workplace.rglob("*.yaml")}
+    example_files = {file.relative_to(workplace).as_posix() for file in workplace.rglob("*.yaml")}
     assert {
         "conf/dataset/my_car.yaml",
         "conf/split/my_car.yaml",
         "pipelines/my_study.yaml",
-    } <= shown
+    } <= example_files
     for file in sorted((workplace / "conf" / "dataset").glob("*.yaml")):
         open_source(compose_config("ingest", [f"dataset={file.stem}"])["dataset"])
     lap = Recording("lap", "car", 20.0, 0.0, {"vx": np.full(400, 20.0)})
@@ -170,7 +177,9 @@ def test_python_examples_run(workplace, monkeypatch, request):
     assert (workplace / "models" / "static_map").is_dir()
 
 
-Given = namedtuple("Given", "command arguments overrides")  # a command line, taken apart
+CommandLine = namedtuple(
+    "CommandLine", "command arguments overrides"
+)  # a command line, taken apart
 
 
 def command_lines(file):
@@ -186,8 +195,11 @@ def command_lines(file):
     return list(dict.fromkeys(lines))
 
 
-def taken_apart(line):
-    """Command, arguments and overrides; none where only a command is named. Unknown commands and options fail."""
+def parsed(line):
+    """Command, arguments and overrides.
+
+    None where only a command is named. Unknown commands and options fail.
+    """
     words = shlex.split(line, comments=True)[1:]
     command = typer.main.get_command(app)
     options = {
@@ -230,59 +242,62 @@ def taken_apart(line):
             positional.append(word)
     if not positional:
         return None
-    needed = [parameter for parameter in fixed if parameter.required]
-    assert len(positional) >= len(needed), (
-        f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in needed)}"
+    required = [parameter for parameter in fixed if parameter.required]
+    assert len(positional) >= len(required), (
+        f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in required)}"
     )
-    if len(positional) > len(needed) and any(
-        "=" in word for word in positional[len(needed) : len(fixed)]
+    if len(positional) > len(required) and any(
+        "=" in word for word in positional[len(required) : len(fixed)]
     ):
-        fixed = needed  # what may be left out is left out
+        fixed = required  # what may be left out is left out
     takes_overrides = any(
         parameter.name == "overrides" or parameter.nargs == -1 for parameter in command.params
     )
-    assert takes_overrides or len(needed) <= len(positional) <= len(fixed), (
+    assert takes_overrides or len(required) <= len(positional) <= len(fixed), (
         f"vehest {' '.join(path)} takes no overrides"
     )
-    return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
+    return CommandLine(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
 
 
-def overrides_of(given):
-    """The root configuration and overrides that a command composes; nothing where placeholders stand."""
-    first = given.arguments[0] if given.arguments else ""
-    match given.command:
+def overrides_of(command_line):
+    """The root configuration and overrides that a command composes.
+
+    Nothing where placeholders stand.
+    """
+    first = command_line.arguments[0] if command_line.arguments else ""
+    match command_line.command:
         case ("ingest",) | ("downsample",):
-            yield given.command[0], [f"dataset={first}", *given.overrides]
+            yield command_line.command[0], [f"dataset={first}", *command_line.overrides]
         case ("data", "show" | "check" | "usable"):
             if Path(first).suffix or PLACEHOLDER.search(first):
-                yield "estimate", given.overrides
+                yield "estimate", command_line.overrides
             else:
-                yield "ingest", [f"dataset={first}", *given.overrides]
+                yield "ingest", [f"dataset={first}", *command_line.overrides]
         case ("config",):
-            yield first, given.overrides
+            yield first, command_line.overrides
         case ("sweep",):
-            jobs = expand(given.overrides)
+            jobs = expand(command_line.overrides)
             yield from (("eval", job) for job in (jobs[0], jobs[-1]))
         case ("train",) | ("eval",) | ("estimate",):
-            yield given.command[0], given.overrides
+            yield command_line.command[0], command_line.overrides
 
 
 @pytest.mark.parametrize(("file", "line"), of_pages(command_lines))
-def test_command_line_is_one_that_vehest_takes(file, line, workplace):
-    given = taken_apart(line)
-    if given is None:
+def test_documented_command_line_is_valid(file, line, workplace):
+    command_line = parsed(line)
+    if command_line is None:
         return
-    if given.command[0] == "report" and "--check" in line:
-        for name in (*given.arguments, *given.overrides):
+    if command_line.command[0] == "report" and "--check" in line:
+        for name in (*command_line.arguments, *command_line.overrides):
             assert PLACEHOLDER.search(name) or read_study(name).publish
-    elif given.command[0] in {"run", "report"}:
-        if not PLACEHOLDER.search(" ".join([*given.arguments, *given.overrides])):
+    elif command_line.command[0] in {"run", "report"}:
+        if not PLACEHOLDER.search(" ".join([*command_line.arguments, *command_line.overrides])):
             pipeline = read_study(
-                given.arguments[0]
+                command_line.arguments[0]
             )  # what composes without overrides is known from test_config
-            assert not given.overrides or jobs_of(pipeline, given.overrides)
+            assert not command_line.overrides or jobs_of(pipeline, command_line.overrides)
     else:
-        for root, overrides in overrides_of(given):
+        for root, overrides in overrides_of(command_line):
             if not PLACEHOLDER.search(" ".join([root, *overrides])):
                 config = compose_config(root, overrides)
                 if root == "estimate":
@@ -305,7 +320,7 @@ def test_make_targets_exist():
     assert {"run", "test", "ui"} <= named <= targets
 
 
-def test_command_lines_are_found_and_wrong_ones_would_be_noticed():
+def test_command_lines_are_collected_and_wrong_ones_detected():
     assert len(of_pages(command_lines)) > 60
     for line in (
         "vehest trian",
@@ -315,7 +330,7 @@ def test_command_lines_are_found_and_wrong_ones_would_be_noticed():
         "vehest --quick",
     ):
         with pytest.raises(AssertionError):
-            taken_apart(line)
+            parsed(line)
 
 
 def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers():
@@ -328,14 +343,14 @@ def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers()
     papers = citation["references"]
     assert len({paper["title"] for paper in papers}) == 7
     assert all(paper["authors"] and paper["year"] for paper in papers)
-    known = {
+    dois = {
         "10.1109/TITS.2023.3303776",
         "10.1109/ACCESS.2020.3012770",
         "10.1109/TVT.2024.3389493",
         "10.3390/s21165409",
         "10.48550/arXiv.2408.15610",
     }
-    assert {paper["doi"] for paper in papers if "doi" in paper} == known
+    assert {paper["doi"] for paper in papers if "doi" in paper} == dois
 
 
 def test_pages_know_every_name():
@@ -348,10 +363,10 @@ def test_pages_know_every_name():
         for name in re.findall(r"\(estimators/(\w+)\.md\)", overview)
     )
     for source in source_names():
-        own = page(f"docs/sources/{source}.md")
+        source_page = page(f"docs/sources/{source}.md")
         assert f"(sources/{source}.md)" in data
         for option in fields(source_class({"source": source}).options_type):
-            assert f"`{option.name}`" in own, (
+            assert f"`{option.name}`" in source_page, (
                 f"docs/sources/{source}.md does not explain {option.name}"
             )
     named_checks = {
@@ -381,7 +396,7 @@ def test_pages_know_every_name():
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 
-def test_page_of_the_python_interface_has_every_public_name_and_that_of_commands_the_exit_codes_of_the_errors():
+def test_pages_have_every_public_name_and_every_exit_code():
     documented = set(
         re.findall(
             r"^\.\. auto(?:function|class):: (\w+)$", page("docs/from_python.md"), re.MULTILINE
@@ -399,11 +414,11 @@ def test_page_of_the_python_interface_has_every_public_name_and_that_of_commands
         assert words in table[str(error.exit_code)]
 
 
-def test_stated_filter_is_the_one_that_resamples():
+def test_stated_filter_is_the_resampling_filter():
     text = " ".join(page("docs/data.md").split())
     assert f"β = {Resample.kaiser_beta:g}, {Resample.zero_crossings} zero crossings" in text
     assert f"is at {Resample.cutoff:g} of the slower Nyquist frequency" in text
-    frequencies, response = signal.freqz(Resample(20.0)._taps(1, 5), worN=1 << 14, fs=100.0)
+    frequencies, response = signal.freqz(Resample(20.0).taps(1, 5), worN=1 << 14, fs=100.0)
     decibels = 20.0 * np.log10(np.abs(response) + 1e-12)
     assert (
         "flat within 0.1 dB up to 7.5 Hz, -3 dB at 8.3 Hz, and at least 71 dB down from 10 Hz on"

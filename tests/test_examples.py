@@ -1,4 +1,6 @@
-"""The worked examples of docs/adding_an_estimator.md: found through entry points, trained, run online, saved, compared."""
+"""The worked examples of docs/adding_an_estimator.md: found through entry points, trained, run
+online, saved, compared.
+"""
 
 import ast
 import re
@@ -57,14 +59,16 @@ def test_each_example_is_a_module_and_a_configuration_of_few_lines_on_the_page()
     }
     assert lines["sliding_mode.c.j2"] <= 40
     page = PAGE.read_text(encoding="utf-8")
-    for name, most in {"window_transformer": 90, "sliding_mode": 70, "saturating_ekf": 135}.items():
-        assert lines[f"{name}.py"] + lines[f"{name}.yaml"] <= most
+    for name, max_lines in {
+        "window_transformer": 90,
+        "sliding_mode": 70,
+        "saturating_ekf": 135,
+    }.items():
+        assert lines[f"{name}.py"] + lines[f"{name}.yaml"] <= max_lines
         assert all(f"(examples/{name}.{end})" in page for end in ("py", "yaml"))
 
 
-def test_entry_points_of_another_package_are_found_and_only_while_it_is_there(
-    examples, monkeypatch
-):
+def test_entry_points_of_another_package_are_used_while_it_is_installed(examples, monkeypatch):
     assert set(NAMES) <= set(estimator_names())
     assert [estimator_class(name).__module__ for name in NAMES] == list(NAMES)
     monkeypatch.undo()
@@ -157,8 +161,8 @@ def block_with(words):
     blocks = re.findall(
         r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     )
-    (found,) = (block for block in blocks if words in block)
-    return found
+    (matching_block,) = (block for block in blocks if words in block)
+    return matching_block
 
 
 def test_smallest_estimator_on_the_page_integrates_and_runs_online():
@@ -206,7 +210,7 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
         np.sqrt(np.mean(scored**2)), rel=1e-3
     )
     bare = lap.without_references()
-    for act, error, said in (
+    for act, error, message in (
         (lambda: vehest.score(model, [bare]), DataError, "has no channel 'vy_ref'"),
         (
             lambda: vehest.train("static_map", [bare], [lap]),
@@ -219,16 +223,16 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
             "n_hiden",
         ),
     ):
-        with pytest.raises(error, match=said):
+        with pytest.raises(error, match=message):
             act()
     file = examples.folder / "raw" / "one.csv"
     assert [
-        "vy_ref" in vehest.read_recording(file, ["dataset=mine"], references=own)
-        for own in (False, True)
+        "vy_ref" in vehest.read_recording(file, ["dataset=mine"], references=references)
+        for references in (False, True)
     ] == [False, True]
 
 
-def test_python_trains_what_the_command_trains(examples):
+def test_python_and_the_command_train_equal_models(examples):
     words = ["split=mine", "estimator=ksnn", "training.max_epochs=2", "seed=3"]
     assert examples("train", *words, "tracking=none")[0] == 0
     (folder,) = (examples.folder / "outputs" / "train").iterdir()
@@ -238,9 +242,9 @@ def test_python_trains_what_the_command_trains(examples):
         )
         for name in ("one", "two")
     ]
-    own = vehest.train("ksnn", laps[:1], laps[1:], ["training.max_epochs=2"], seed=3)
+    trained = vehest.train("ksnn", laps[:1], laps[1:], ["training.max_epochs=2"], seed=3)
     for name, values in vehest.load_model(folder).weights().items():
-        assert np.array_equal(values, own.weights()[name])
+        assert np.array_equal(values, trained.weights()[name])
 
 
 def test_sliding_mode_decays_as_its_gain_says(examples):

@@ -1,15 +1,19 @@
-"""Every number that README.md and the pages in docs/ state as a result is the one in results/, or the one that a test asserts.
+"""Every number that README.md and the pages in docs/ state as a result is the one in results/, or
+the one that a test asserts.
 
 docs/figures.csv lists them, a row a statement:
 
-- ``page``, ``stated``: the page, and the shortest text on it that holds the number or numbers and occurs once;
+- ``page``, ``stated``: the page, and the shortest text on it that holds the number or numbers and
+  occurs once;
 - ``source``: a CSV, JSON, Markdown or text file, a test, or ``not a result``;
-- ``rows``: of a table the rows, as `pandas.DataFrame.query` takes them (empty: all); of a test or module the name of the function,
-  class or constant (a share of 0.05 in it agrees with 5 % on a page); of prose in Markdown or text (``column`` empty) a phrase of it;
-  for ``not a result`` the reason;
-- ``column``: column or expression of columns (`pandas.DataFrame.eval`), several separated by ``;``; of a test that compares the page
-  itself ``reads the page``;
-- ``statistic``: min, max, median, mean, sum or count over these rows, several separated by ``;``; empty for a single row.
+- ``rows``: of a table the rows, as `pandas.DataFrame.query` takes them (empty: all); of a test or
+  module the name of the function, class or constant (a share of 0.05 in it agrees with 5 % on a
+  page); of prose in Markdown or text (``column`` empty) a phrase of it; for ``not a result`` the
+  reason;
+- ``column``: column or expression of columns (`pandas.DataFrame.eval`), several separated by ``;``;
+  of a test that compares the page itself ``reads the page``;
+- ``statistic``: min, max, median, mean, sum or count over these rows, several separated by ``;``;
+  empty for a single row.
 
 A number agrees if it is the value of the source rounded to the digits that the page prints.
 """
@@ -51,7 +55,7 @@ UNITS = "%|s|ms|µs|ns|MB|GB|kB|bytes|minutes|min|hours|h|times"
 FIGURE = re.compile(
     rf"(?<![\w./:-])\d[\d,]*(?:\.\d+(?:e[-−]?\d+)?(?![.\d/]*\w)|e[-−]?\d+|(?= (?:{UNITS})(?!\w)))"
 )
-"""A number that has to be in the list: with a decimal point, an exponent, or a unit of `UNITS` after it."""
+"""A number that has to be in the list: with a decimal point, an exponent or a unit of `UNITS`."""
 MASKED = (
     r"<!-- made by docs/make_\w+\.py.*?<!-- end -->",  # tests/test_docs.py compares these
     r"^[ \t]*(`{3,})[^`\n]*\n.*?^[ \t]*\1[ \t]*$",
@@ -79,7 +83,9 @@ def numbers_in(text):
 
 
 def unlisted_figures(text, statements):
-    """Numbers on a page that look like results and are in none of its statements, each with words around it."""
+    """Numbers on a page that look like results and are in none of its statements, each with words
+    around it.
+    """
     masked = text
     for pattern in MASKED:
         masked = re.sub(pattern, lambda m: "·" * len(m[0]), masked, flags=re.MULTILINE | re.DOTALL)
@@ -289,7 +295,7 @@ def test_an_expression_and_statistics_over_rows_are_compared(folder):
     assert disagreement(row | {"stated": "1.18 to 1.20 times"}) == ""
 
 
-def test_a_limit_is_one_that_its_test_asserts(folder):
+def test_a_stated_limit_must_be_asserted_by_its_test(folder):
     row = row_of("1e-9 m/s", "test_c.py", "test_c", "")
     assert disagreement(row) == ""
     (folder / "test_c.py").write_text("def test_c():\n    assert difference < 1e-6\n")

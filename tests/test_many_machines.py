@@ -1,4 +1,7 @@
-"""What docs/many_machines.md rests on was measured completely; its tables are made from it (docs/make_reference.py)."""
+"""What docs/many_machines.md rests on was measured completely.
+
+Its tables are made from it (docs/make_reference.py).
+"""
 
 import json
 from pathlib import Path

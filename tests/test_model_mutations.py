@@ -139,7 +139,7 @@ DAMAGES = {  # family, array -> (place, value, what is said of it)
 
 
 @pytest.mark.parametrize(("name", "array"), DAMAGES)
-def test_a_number_that_no_fit_makes_is_one_line_that_names_the_file(tmp_path, name, array):
+def test_an_impossible_weight_is_refused_in_a_line_that_names_the_file(tmp_path, name, array):
     save_model(fitted(name), tmp_path)
     load_model(tmp_path)
     tensors = load_file(tmp_path / WEIGHTS)
@@ -154,7 +154,7 @@ def test_a_number_that_no_fit_makes_is_one_line_that_names_the_file(tmp_path, na
         assert "\n" not in str(refused.value)
 
 
-def test_settings_with_which_no_estimator_can_be_built_are_one_line(tmp_path, monkeypatch):
+def test_settings_that_no_estimator_accepts_are_refused_in_a_line(tmp_path, monkeypatch):
     save_model(fitted("gru"), tmp_path)
     kind = type(fitted("gru"))
 

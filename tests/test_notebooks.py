@@ -1,4 +1,6 @@
-"""From Python: notebooks and the page's lines run as shown, the interface is typed, complete and quick to import."""
+"""From Python: notebooks and the page's lines run as shown, the interface is typed, complete and
+quick to import.
+"""
 
 import re
 import subprocess
@@ -29,7 +31,7 @@ def block(language, number=0):
 
 @pytest.mark.apart
 @pytest.mark.parametrize("path", notebooks(), ids=lambda path: path.stem)
-def test_notebook_shows_what_its_cells_say_when_they_are_run(path):
+def test_notebook_stores_the_current_output_of_its_cells(path):
     notebook = read_notebook(path)
     stored = [cell["outputs"] for cell in code_cells(notebook)]
     results = run_cells(notebook)
@@ -38,7 +40,7 @@ def test_notebook_shows_what_its_cells_say_when_they_are_run(path):
 
 
 @pytest.mark.apart
-def test_lines_of_the_page_do_a_whole_job_and_print_what_it_shows(tmp_path, monkeypatch, capsys):
+def test_lines_of_the_page_run_and_print_the_stated_output(tmp_path, monkeypatch, capsys):
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)
     lines = block("python")
@@ -52,7 +54,7 @@ def test_lines_of_the_page_do_a_whole_job_and_print_what_it_shows(tmp_path, monk
 
 
 @pytest.mark.apart
-def test_types_of_the_page_s_lines_are_known_to_mypy(tmp_path):
+def test_mypy_infers_the_types_of_the_pages_lines(tmp_path):
     revealed = "\n".join(
         f"reveal_type({name})"
         for name in ("vehest.estimate", "recording", "estimate", "estimate.plot", "vehest.online")
@@ -94,11 +96,11 @@ def test_a_dataframe_and_its_file_give_the_numbers_of_the_command(tmp_path, monk
     code, _, err = run_vehest(capsys, *words)
     assert code == 0, err
     of_command = read_estimate(Path("out.parquet"))
-    own = vehest.estimate(vehest.read_recording("lap.csv"), wheelbase=2.4)
-    assert own.channels.keys() == of_command.channels.keys()
+    from_python = vehest.estimate(vehest.read_recording("lap.csv"), wheelbase=2.4)
+    assert from_python.channels.keys() == of_command.channels.keys()
     for name, values in vehest.estimate(recording, wheelbase=2.4).channels.items():
         np.testing.assert_array_equal(values, of_command[name], err_msg=name)
-        np.testing.assert_array_equal(values, own[name], err_msg=name)
+        np.testing.assert_array_equal(values, from_python[name], err_msg=name)
 
 
 def test_default_model_is_that_of_the_command_and_the_earlier_order_still_works():
@@ -111,17 +113,17 @@ def test_default_model_is_that_of_the_command_and_the_earlier_order_still_works(
     np.testing.assert_array_equal(earlier["vy"], now["vy"])
 
 
-def test_steps_by_keyword_are_those_of_the_whole_drive():
+def test_steps_by_keyword_equal_the_batch_estimate():
     recording = vehest.read_recording(pd.read_csv(LOG).iloc[:400], columns=COLUMNS)
-    whole = vehest.estimate(recording, wheelbase=2.4)
+    batch = vehest.estimate(recording, wheelbase=2.4)
     stepper = vehest.online(wheelbase=2.4)
     for k in range(len(recording)):
         step = stepper.step(**{name: values[k] for name, values in recording.channels.items()})
-    last = {name: whole[name][-1] for name in step._fields}
+    last = {name: batch[name][-1] for name in step._fields}
     assert step._asdict() == pytest.approx(last, abs=1e-9)
 
 
-def test_speed_that_is_not_there_is_one_clear_error():
+def test_missing_speed_is_a_clear_error():
     log = pd.read_csv(LOG).iloc[:100]
     columns = {name: text for name, text in COLUMNS.items() if name != "vx"}
     recording = vehest.read_recording(log, columns=columns)

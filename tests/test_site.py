@@ -1,4 +1,6 @@
-"""The documentation site: it builds without a warning, its links lead somewhere, and it reads well in a browser."""
+"""The documentation site: it builds without a warning, its links lead somewhere, and it reads well
+in a browser.
+"""
 
 import subprocess
 import sys
@@ -10,12 +12,14 @@ from check_site import broken_links
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 
 ROOT = Path(__file__).resolve().parents[1]
-SHOWN = (
+CHECKED_PAGES = (
     "docs/index.html",
     "docs/from_python.html",
     "docs/estimators.html",
     "docs/estimators/ksnn.html",
     "results/ferrari_drive/report.html",
+    "results/scorecard.html",
+    "results/scorecard/heavy_ekf.html",
 )
 
 
@@ -50,7 +54,7 @@ def chromium(tmp_path_factory):
         yield driver
 
 
-def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path):
+def test_links_to_no_file_no_anchor_or_out_of_the_site_are_detected(tmp_path):
     folder = tmp_path / "site"
     folder.mkdir()
     (tmp_path / "outside.html").write_text("", encoding="utf-8")
@@ -89,7 +93,7 @@ def test_every_equation_of_the_pages_is_mathml(site):
 
 @pytest.mark.page
 @pytest.mark.parametrize(("width", "scheme"), zip(WIDTHS, ("light", "dark"), strict=True))
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", CHECKED_PAGES)
 def test_pages_are_accessible_and_fit_their_width(chromium, site, name, scheme, width):
     opened(chromium, site / name, width=width, scheme=scheme)
     assert axe_violations(chromium, "article") == []  # what stands around it is the theme's

@@ -1,4 +1,6 @@
-"""Tables of results/unseen_car: bands with a factor from the other cars, and the cars that are drawn."""
+"""Tables of results/unseen_car: bands with a factor from the other cars, and the cars that are
+drawn.
+"""
 
 import numpy as np
 import pytest
@@ -34,16 +36,16 @@ def errors(sideslip, half_width, valid=True, turning=True):
     )
 
 
-def test_factor_of_a_development_car_comes_from_the_other_ones_and_of_a_test_car_is_one():
+def test_factor_of_a_development_car_comes_from_the_others_and_a_test_car_has_1():
     first, second = DEVELOPMENT[:2]
-    found = {
+    car_errors = {
         first: [errors(np.linspace(0.0, 1.0, 201), 1.0)] * 20,
         second: [errors(np.linspace(0.0, 3.0, 201), 1.0)] * 20,
         TEST: [errors(np.full(2001, 50.0), 1.0)],
     }
-    assert factor_without(first, found) == pytest.approx(3.0 * 0.9, rel=0.02)
-    assert factor_without(second, found) == pytest.approx(1.0 * 0.9, rel=0.02)
-    assert factor_without(TEST, found) == 1.0
+    assert factor_without(first, car_errors) == pytest.approx(3.0 * 0.9, rel=0.02)
+    assert factor_without(second, car_errors) == pytest.approx(1.0 * 0.9, rel=0.02)
+    assert factor_without(TEST, car_errors) == 1.0
 
 
 def test_figures_of_a_band_against_values_worked_out_by_hand():

@@ -82,7 +82,9 @@ def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_pat
     assert "name: leave_av21" in vehest("config", "train", "split=leave_av21").stdout
     assert json.loads(vehest("config", "train", "--json").stdout)["estimator"]["name"] == "ksnn"
     lap = "manoeuvre: {name: laps, course: handling, duration: "
-    drives = f"drives=[{{id: drive_1, {lap}20}}}}, {{id: drive_2, {lap}10}}}}, {{id: drive_3, {lap}10}}}}]"
+    seconds = {"drive_1": 20, "drive_2": 10, "drive_3": 10}
+    entries = (f"{{id: {name}, {lap}{duration}}}}}" for name, duration in seconds.items())
+    drives = f"drives=[{', '.join(entries)}]"
     ingested = json.loads(vehest("ingest", "sim_quickstart", f"dataset.{drives}", "--json").stdout)
     assert ingested["recordings"] == ["drive_1", "drive_2", "drive_3"]
     assert "would" in vehest("run", "quickstart", "--dry-run").stderr
@@ -92,12 +94,12 @@ def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_pat
         json.loads(vehest("estimate", str(recording), "--json").stdout)["model"]
         == "self_calibrating"
     )
-    where = _python(
+    location = _python(
         installed,
         tmp_path,
         "-c",
         "import vehest, pathlib; print(pathlib.Path(vehest.__file__).parent)",
     )
-    assert where.stdout.strip() == str(installed / "vehest"), (
+    assert location.stdout.strip() == str(installed / "vehest"), (
         "the wheel was tested, not the checkout"
     )

@@ -1,4 +1,7 @@
-"""vehest: published estimators of a car's lateral velocity and sideslip angle, trained and compared on the same recordings."""
+"""Published estimators of a car's lateral velocity and sideslip angle.
+
+They are trained, run and compared on the same recordings.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ if not TYPE_CHECKING:
         return __all__
 
     def __getattr__(name: str) -> object:
-        """Load the Python interface when it is first used, so that the command line starts quickly."""
+        """Load the Python interface on first use, so that the command line starts quickly."""
         if name in __all__:
             from vehest import api
 

@@ -1,6 +1,7 @@
 """Entry point of the command ``vehest`` and of ``python -m vehest``.
 
-It imports the command line after Ctrl-C has a handler, since that import takes longer than many commands.
+It imports the command line after Ctrl-C has a handler, since that import takes longer than many
+commands.
 """
 
 import atexit
@@ -13,7 +14,10 @@ INTERRUPTED = 128 + signal.SIGINT  # exit code
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends the process at once while modules are imported and at its exit."""
+    """Run the command line.
+
+    Ctrl-C ends the process at once while modules are imported and at its exit.
+    """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_at_once)
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # no handler runs after that
@@ -29,7 +33,7 @@ def _end_at_once(number: int, frame: FrameType | None) -> None:
 
 
 def _end_if_stopped(unraisable: "sys.UnraisableHookArgs") -> None:
-    """End where `Stopped` was raised in a finaliser or callback, which drops every exception and prints it."""
+    """End if `Stopped` was raised in a finaliser or callback, where Python only prints it."""
     from vehest.run.signals import Stopped
 
     if isinstance(unraisable.exc_value, Stopped):

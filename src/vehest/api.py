@@ -231,7 +231,8 @@ def score(
     if isinstance(estimate, PlainEstimate):
         if len(drives) != 1:
             raise ConfigurationError(
-                f"an estimate is scored against the recording that it was made of, not {len(drives)}"
+                "an estimate is scored against the recording that it was made of, not "
+                f"{len(drives)}"
             )
         return metrics.accuracy([metrics.score_whole(estimate, drives[0])])
     parts = []
@@ -246,8 +247,10 @@ def score(
 def save_model(model: Estimator, folder: str | Path) -> None:
     """Write a fitted estimator into a new folder, for `load_model` and ``vehest estimate``.
 
-    Raises:
-        MissingError: it cannot be written, or a folder that is not empty is there already.
+    Raises
+    ------
+    MissingError
+        It cannot be written, or a folder that is not empty is there already.
     """
     with written_aside(Path(folder)) as aside:
         aside.mkdir()
@@ -497,8 +500,11 @@ def online(
 def write_estimate(estimate: PlainEstimate, path: str | Path) -> None:
     """Write an estimate as Parquet or CSV, by the file's ending.
 
-    Raises:
-        ConfigurationError: another ending.
-        MissingError: it cannot be written.
+    Raises
+    ------
+    ConfigurationError
+        Another ending.
+    MissingError
+        It cannot be written.
     """
     write_estimate_table([estimate], Path(path))

@@ -1,4 +1,4 @@
-"""What every room shares: standard gravity as vehicle dynamics rounds it, and the type of arrays of numbers."""
+"""Standard gravity as rounded in vehicle dynamics, and the type of arrays of numbers."""
 
 from __future__ import annotations
 

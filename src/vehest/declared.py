@@ -1,4 +1,4 @@
-"""Declarations of an estimator's settings and fitted numbers: bounds, unit and text, each stated once."""
+"""Declarations of an estimator's settings and fitted numbers: bounds, unit and text."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any, ClassVar, TypeVar
 
 from vehest.data.errors import ConfigurationError
 
-LARGEST = (
-    1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
-)
+# of a setting, in SI units: far beyond what any of them means, far below what overflows
+MAX_SETTING = 1e12
 UNSET: Any = None  # default of a number that has to be given, or else follows from others
 MAX_WIDTH = 4096  # of a layer, a window or an ensemble: more would take all memory
 
@@ -28,38 +27,35 @@ class Declaration:
     most: float | None = None  # largest value
     above: float | None = None  # value that it has to exceed
     below: float | None = None  # value that it has to stay under
-    start: tuple[
-        float, ...
-    ] = ()  # values that the search for a fitted number starts from; empty where it has a closed form
+    # values that the search for a fitted number starts from; empty where it has a closed form
+    start: tuple[float, ...] = ()
     box: tuple[float, float] = (0.0, 0.0)  # range that the search stays within
-    of_largest: str = (
-        ""  # channel whose largest absolute value in training multiplies start and box; empty: none
-    )
+    # channel whose largest absolute value in training multiplies start and box; empty: none
+    of_largest: str = ""
     is_fitted: bool = False  # whether the fit determines it unless it is given
 
     def problem(self, value: Any) -> str:
-        """What is wrong with a value, in words that follow its name; empty where nothing is."""
+        """What is wrong with a value, as text that follows its name; empty if it is valid."""
         if value is None:
             return ""
-        if isinstance(value, int | float) and not abs(value) <= LARGEST:
-            return f"must be a number of at most {LARGEST:g}, not {value}"
+        if isinstance(value, int | float) and not abs(value) <= MAX_SETTING:
+            return f"must be a number of at most {MAX_SETTING:g}, not {value}"
         if self.positive and not value > 0:
             return f"must be positive, not {value}"
-        low, high = (
-            one if one is not None else other
-            for one, other in ((self.least, self.above), (self.most, self.below))
-        )
+        low = self.least if self.least is not None else self.above
+        high = self.most if self.most is not None else self.below
         fits_low = low is None or (value >= low if self.least is not None else value > low)
         fits_high = high is None or (value <= high if self.most is not None else value < high)
         if fits_low and fits_high:
             return ""
         if low is not None and high is not None:
-            return f"must lie between {low:g} and {high:g}{self.unit and f' {self.unit}'}, not at {value}"
+            unit = f" {self.unit}" if self.unit else ""
+            return f"must lie between {low:g} and {high:g}{unit}, not at {value}"
         if low is not None:
-            return f"must be {'at least' if self.least is not None else 'more than'} {low:g}, not {value}"
-        return (
-            f"must be {'at most' if self.most is not None else 'less than'} {high:g}, not {value}"
-        )
+            relation = "at least" if self.least is not None else "more than"
+            return f"must be {relation} {low:g}, not {value}"
+        relation = "at most" if self.most is not None else "less than"
+        return f"must be {relation} {high:g}, not {value}"
 
 
 def setting(
@@ -75,8 +71,9 @@ def setting(
 ) -> T:
     """A dataclass field with its default, text, unit and bounds, as in `Declaration`.
 
-    Type checkers take it for a value of the default's type, as they do `dataclasses.field`: a default of another type than the annotation is
-    an error, and the setting is optional in the constructor.
+    Type checkers take it for a value of the default's type, as they do `dataclasses.field`: a
+    default of another type than the annotation is an error, and the setting is optional in the
+    constructor.
     """
     declared = Declaration(doc, unit, positive, least, most, above, below)
     return field(default=default, metadata={"declared": declared})
@@ -88,29 +85,31 @@ def fitted(doc: str, **declared: Any) -> Any:
 
 
 def declaration(of: Field[Any]) -> Declaration | None:
-    """What is declared of a dataclass's field, if anything."""
-    found: Declaration | None = of.metadata.get("declared")
-    return found
+    """The declaration of a dataclass's field; None if it was not made by `setting` or `fitted`."""
+    declared: Declaration | None = of.metadata.get("declared")
+    return declared
 
 
 @dataclass(frozen=True)
 class Group:
     """Settings that belong together; their bounds are checked when they are made.
 
-    Raises:
-        ConfigurationError: a value is out of its bounds.
+    Raises
+    ------
+    ConfigurationError
+        A value is out of its bounds.
     """
 
     group: ClassVar[str] = "estimator"
 
     def __post_init__(self) -> None:
-        for own in fields(self):
-            declared = declaration(own)
-            problem = declared.problem(getattr(self, own.name)) if declared else ""
+        for name, declared in self.declarations().items():
+            problem = declared.problem(getattr(self, name))
             if problem:
-                raise ConfigurationError(f"{self.group}.{own.name} {problem}")
+                raise ConfigurationError(f"{self.group}.{name} {problem}")
 
     @classmethod
     def declarations(cls) -> Mapping[str, Declaration]:
         """Name -> declaration."""
-        return {own.name: declared for own in fields(cls) if (declared := declaration(own))}
+        declared = {field_.name: declaration(field_) for field_ in fields(cls)}
+        return {name: value for name, value in declared.items() if value is not None}

@@ -1,8 +1,9 @@
-"""Vectors in registers for compiled code: what reads like code for one window or sequence runs on many at once.
+"""Vectors in registers for compiled code: written like code for one window, run on many at once.
 
-`load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below work on it lane by lane, with a number
-as the same in every lane; a product and a sum are fused where the processor can, but not of vectors from `load_unfused`. Without
-compilation vectors are arrays.
+`load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below
+work on it lane by lane, with a number as the same in every lane; a product and a sum are fused
+where the processor can, but not of vectors from `load_unfused`. Without compilation vectors are
+arrays.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def width(array: Any) -> int:
 
 
 def load(array: Any, at: int) -> Any:
-    """The vector that begins at index ``at`` of a contiguous array, (N,), or of one of more dimensions as if it were flat."""
+    """The vector that begins at index ``at`` of a contiguous array, which is indexed as flat."""
     vector = np.zeros(width(array), array.dtype)
     there = array.reshape(-1)[at : at + width(array)]
     vector[: len(there)] = there
@@ -73,7 +74,7 @@ def store_some(array: Any, at: int, vector: Any, count: int) -> None:
 
 
 def choose(condition: Any, one: Any, other: Any) -> Any:
-    """``one`` in the lanes where the condition holds, ``other`` in the rest; one of both may be a number."""
+    """``one`` in the lanes where the condition is true, else ``other``; either may be a number."""
     return np.where(condition, one, other)
 
 
@@ -124,7 +125,11 @@ def _pair(one: Any, other: Any) -> Lanes | None:
 
 
 def _between(function: Any, write: Any, truth: bool = False) -> None:
-    """Let compiled code apply a function of two operands to vectors; ``write(builder, one, other, flags)`` writes its instruction."""
+    """Let compiled code apply a function of two operands to vectors.
+
+    ``write(builder, one, other, flags)`` writes its LLVM instruction; ``truth``: the result is a
+    condition.
+    """
 
     @infer_global(function)
     class _Typing(AbstractTemplate):  # type: ignore[misc]
@@ -236,7 +241,10 @@ def _of(array: Any, fused: bool = True) -> Lanes:
 
 
 def _compiled(function: Any, type_of: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of what lowers a function of the above; ``type_of`` gives its type from those of the arguments."""
+    """Decorator of the code generator of one of the functions above.
+
+    ``type_of`` returns the type of the result from those of the arguments.
+    """
 
     @infer_global(function)
     class _Typing(AbstractTemplate):  # type: ignore[misc]

@@ -1,5 +1,8 @@
-"""A drive in closed form with content at many frequencies, any channel of which may be late or low-passed to the last digit."""
+"""A drive in closed form with content at many frequencies, any channel of which may be late or
+low-passed to the last digit.
+"""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +13,9 @@ NOISE = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "steer": 0.001}
 
 
 class Wave:
-    """A sum of sines that can be taken at any time, derived, delayed and sent through a first-order low-pass."""
+    """A sum of sines that can be taken at any time, derived, delayed and sent through a first-order
+    low-pass.
+    """
 
     def __init__(self, amplitudes, omegas, phases, level=0.0):
         self.amplitudes = amplitudes
@@ -50,9 +55,11 @@ class Wave:
 def broadband_drive(
     seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0
 ):
-    """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for noise and what is asked for.
+    """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for
+    noise and what is asked for.
 
-    Channels are ``late`` by so many seconds; ``lever`` is how far ahead the inertial unit sits [m], ``slow_yaw_rate`` a time constant [s].
+    Channels are ``late`` by so many seconds; ``lever`` is how far ahead the inertial unit sits [m],
+    ``slow_yaw_rate`` a time constant [s].
     """
     return _made(
         seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise
@@ -65,7 +72,7 @@ def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
     turn, slide, speed, state = _waves(seed)
     generator = np.random.default_rng()
     generator.bit_generator.state = state
-    shown = turn.low_passed(slow_yaw_rate) if slow_yaw_rate else turn
+    measured_turn = turn.low_passed(slow_yaw_rate) if slow_yaw_rate else turn
     clock = np.arange(round(seconds * rate_hz)) / rate_hz
 
     def vy(time):
@@ -73,7 +80,7 @@ def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
 
     exact = {
         "vx": speed,
-        "yaw_rate": shown,
+        "yaw_rate": measured_turn,
         "ax": lambda time: speed(time, 1) - vy(time) * turn(time),
         "ay": lambda time: (
             -0.9 * turn(time, 1) + slide(time, 1) + speed(time) * turn(time) + lever * turn(time, 1)
@@ -106,3 +113,9 @@ def _waves(seed):
 def without(recording, *names):
     """The same drive without some channels."""
     return recording.select([name for name in recording.channels if name not in names])
+
+
+def changed(recording, **changes):
+    """The same drive with some channels changed: channel -> function of its samples."""
+    channels = {name: change(recording[name]) for name, change in changes.items()}
+    return replace(recording, channels={**recording.channels, **channels})

@@ -1,4 +1,6 @@
-"""Alignment of a measuring set-up: what was planted comes back, with intervals that hold, and nothing happens unasked."""
+"""Alignment of a measuring set-up: what was planted comes back, with intervals that hold, and
+nothing happens unasked.
+"""
 
 import csv
 import json
@@ -38,11 +40,16 @@ PLANTED = {"lever_x": 1.0, "lever_y": 0.3, "yaw": math.radians(3.0), "delay": 0.
 PLANTED |= {"offset_ax": 0.15, "offset_ay": -0.10, "offset_yaw_rate": 0.010}
 TOLERANCE = {"lever_x": 0.1, "lever_y": 0.1, "yaw": math.radians(0.3), "delay": 0.003}
 TOLERANCE |= {"offset_ax": 0.03, "offset_ay": 0.03, "offset_yaw_rate": 0.002}
-"""The stated standard uncertainties on this drive are 0.04 m, 0.01 m, 0.04°, 0.05 to 3.7 ms, 0.010 and 0.02 m/s² and 0.0008 rad/s: the
-tolerances are at least 1.5 times those, except for the delay without a reference yaw rate, which is known less well than that."""
+"""At least 1.5 times the stated standard uncertainties on this drive.
+
+These are 0.04 m, 0.01 m, 0.04°, 0.05 to 3.7 ms, 0.010 and 0.02 m/s² and 0.0008 rad/s. The delay
+without a reference yaw rate is estimated less accurately than that.
+"""
 LARGEST_UNCERTAINTY = TOLERANCE | {"delay": 0.004}
 
-NOISE = replace(  # nothing but noise, so that no other errors come on top of the planted ones: 0.0017 rad/s, 0.035 m/s² and 0.05 m/s
+# Noise alone, so that no other errors add to the planted ones: 0.0017 rad/s, 0.035 m/s² and
+# 0.05 m/s.
+NOISE = replace(
     PRESETS["ideal"],
     yaw_rate=SensorLevel(noise=2.4e-4),
     ax=SensorLevel(noise=0.005),
@@ -55,7 +62,9 @@ CONFIGURATION = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.y
 
 @pytest.fixture(scope="module")
 def motion():
-    """150 s of a multi-body car that weaves between 12 and 28 m/s: its steering is three sines, its speed another."""
+    """150 s of a multi-body car that weaves between 12 and 28 m/s: its steering is three sines, its
+    speed another.
+    """
     vehicle = vehicle_from_configuration(yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8")))
     plant = MultiBodyPlant(vehicle)
     state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
@@ -91,8 +100,9 @@ def motion():
 def recorded(motion, planted, *, leaning=False, reference_rate=False):
     """A recording of a motion by a sensor that is misplaced, turned, late and off.
 
-    Written with rotation matrices and cross products, on the true motion, before noise; the plane as complex numbers is the code's way.
-    If ``leaning``, roll and pitch let gravity into the accelerometers.
+    Written with rotation matrices and cross products, on the true motion, before noise; the plane
+    as complex numbers is the code's way. If ``leaning``, roll and pitch let gravity into the
+    accelerometers.
     """
     p = dict.fromkeys(PLANTED, 0.0) | planted
     time = np.arange(len(motion)) / 100.0
@@ -102,7 +112,7 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
         [np.zeros(len(time)), np.zeros(len(time)), CubicSpline(time, motion.yaw_rate)(time, 1)]
     )
     lever = np.broadcast_to(np.array([[p["lever_x"]], [p["lever_y"]], [0.0]]), spin.shape)
-    there = (
+    force_at_sensor = (
         force
         + (
             np.cross(spin_dot, lever, axis=0)
@@ -112,8 +122,10 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
     axes = np.array(
         [[math.cos(p["yaw"]), -math.sin(p["yaw"])], [math.sin(p["yaw"]), math.cos(p["yaw"])]]
     )  # the sensor's, as columns
-    shown = [*(axes.T @ there), motion.yaw_rate]
-    late = [CubicSpline(time, samples)(np.maximum(time - p["delay"], 0.0)) for samples in shown]
+    true_signals = [*(axes.T @ force_at_sensor), motion.yaw_rate]
+    late = [
+        CubicSpline(time, samples)(np.maximum(time - p["delay"], 0.0)) for samples in true_signals
+    ]
     ax, ay, yaw_rate = (
         samples + p[f"offset_{name}"]
         for samples, name in zip(late, ("ax", "ay", "yaw_rate"), strict=True)
@@ -131,9 +143,9 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
     return Recording("planted", "car", 100.0, 5.0, channels, "simulated")
 
 
-def assert_recovered(found, truth, names):
+def assert_recovered(alignment, truth, names):
     for name in names:
-        parameter = found[name]
+        parameter = alignment[name]
         assert parameter.value == pytest.approx(truth.get(name, 0.0), abs=TOLERANCE[name]), name
         assert parameter.low <= truth.get(name, 0.0) <= parameter.high, name
         assert parameter.uncertainty <= LARGEST_UNCERTAINTY[name], name
@@ -141,21 +153,25 @@ def assert_recovered(found, truth, names):
 
 @pytest.mark.parametrize("reference_rate", [False, True])
 def test_cross_correlation_finds_a_delay_alone(motion, reference_rate):
-    found = align(
+    alignment = align(
         recorded(motion, {"delay": 0.040}, reference_rate=reference_rate),
         AlignmentSettings(("delay",)),
     )
-    assert found.correlation.peak == pytest.approx(0.040, abs=0.010)
+    assert alignment.correlation.peak == pytest.approx(0.040, abs=0.010)
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
 def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, reference_rate):
-    """Gravity through roll is 6 % of ay here, through pitch 4 % of ax: taken for motion it would shift rotation and offset of ay."""
+    """Gravity through roll is 6 % of ay here, through pitch 4 % of ax: taken for motion it would
+    shift rotation and offset of ay.
+    """
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=reference_rate)
-    found = align(recording, AlignmentSettings(IMU))
-    assert_recovered(found, PLANTED, tuple(PLANTED))
-    assert any(re.search(r"3\.[567] % in ax and 5\.[789] % in ay", note) for note in found.notes)
-    for residual in found.residuals[:2]:
+    alignment = align(recording, AlignmentSettings(IMU))
+    assert_recovered(alignment, PLANTED, tuple(PLANTED))
+    assert any(
+        re.search(r"3\.[567] % in ax and 5\.[789] % in ay", note) for note in alignment.notes
+    )
+    for residual in alignment.residuals[:2]:
         assert (
             residual.rms["rest"] < 0.045 < residual.rms["after"]
         )  # the tilt of the body is not corrected, and the table says so
@@ -170,22 +186,22 @@ def test_measured_roll_and_pitch_take_gravity_off_and_a_sensor_mounted_crosswise
     recording = replace(
         recording, channels={**recording.channels, "roll": motion.roll, "pitch": motion.pitch}
     )
-    found = align(recording, AlignmentSettings(IMU))
-    assert_recovered(found, PLANTED, tuple(PLANTED))
-    assert found["offset_ax"].value == pytest.approx(0.15, abs=0.003)  # without the mean pitch
-    assert any(re.search(r"acceleration: -?0\.[01] % in ax", note) for note in found.notes)
+    alignment = align(recording, AlignmentSettings(IMU))
+    assert_recovered(alignment, PLANTED, tuple(PLANTED))
+    assert alignment["offset_ax"].value == pytest.approx(0.15, abs=0.003)  # without the mean pitch
+    assert any(re.search(r"acceleration: -?0\.[01] % in ax", note) for note in alignment.notes)
     truth = PLANTED | {"yaw": math.radians(-90.0)}
-    found = align(recorded(motion, truth, reference_rate=True), AlignmentSettings(IMU))
-    assert_recovered(found, truth, tuple(PLANTED))
+    alignment = align(recorded(motion, truth, reference_rate=True), AlignmentSettings(IMU))
+    assert_recovered(alignment, truth, tuple(PLANTED))
 
 
 def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_aligned(motion):
     clean = align(recorded(motion, {}), AlignmentSettings(("delay",)))
-    found = align(recorded(motion, PLANTED), AlignmentSettings(IMU))
-    for aligned, residual in zip(clean.residuals, found.residuals, strict=True):
+    alignment = align(recorded(motion, PLANTED), AlignmentSettings(IMU))
+    for aligned, residual in zip(clean.residuals, alignment.residuals, strict=True):
         assert residual.rms["before"] > 5 * aligned.rms["before"]
         assert residual.rms["after"] == pytest.approx(aligned.rms["before"], rel=0.1)
-    assert [transform["name"] for transform in found.transforms] == [
+    assert [transform["name"] for transform in alignment.transforms] == [
         "delay_correction",
         "offset_correction",
         "mounting_correction",
@@ -195,10 +211,10 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
 @pytest.mark.parametrize("quantity", IMU)
 def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     truth = {name: PLANTED[name] for name in QUANTITIES[quantity]}
-    found = align(recorded(motion, truth), AlignmentSettings((quantity,)))
-    assert tuple(parameter.name for parameter in found.parameters) == QUANTITIES[quantity]
-    assert_recovered(found, truth, QUANTITIES[quantity])
-    (transform,) = found.transforms
+    alignment = align(recorded(motion, truth), AlignmentSettings((quantity,)))
+    assert tuple(parameter.name for parameter in alignment.parameters) == QUANTITIES[quantity]
+    assert_recovered(alignment, truth, QUANTITIES[quantity])
+    (transform,) = alignment.transforms
     names = {
         "lever_arm": "mounting_correction",
         "mounting": "mounting_correction",
@@ -206,21 +222,21 @@ def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     }
     assert transform["name"] == names.get(quantity, "offset_correction")
     assert "yaw" not in transform or quantity == "mounting"
-    assert not any("residuals suggest" in note for note in found.notes)
+    assert not any("residuals suggest" in note for note in alignment.notes)
 
 
 def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion):
-    found = align(
+    alignment = align(
         recorded(motion, PLANTED, reference_rate=True), AlignmentSettings(("lever_arm", "offsets"))
     )
-    (note,) = [note for note in found.notes if "residuals suggest" in note]
+    (note,) = [note for note in alignment.notes if "residuals suggest" in note]
     assert re.search(r"yaw (2\.9|3\.0|3)\d* deg ±", note)
     assert re.search(r"delay (3[89]|40)[.\d]* ms ±", note)
-    assert {parameter.name for parameter in found.parameters} == {
+    assert {parameter.name for parameter in alignment.parameters} == {
         *QUANTITIES["lever_arm"],
         *QUANTITIES["offsets"],
     }
-    assert "Not requested and assumed to be zero: mounting, delay." in found.notes
+    assert "Not requested and assumed to be zero: mounting, delay." in alignment.notes
 
 
 RATE = 50.0
@@ -228,7 +244,9 @@ COVERED = AlignmentSettings(IMU, cutoff_hz=1.5, max_delay=0.2, tilt=0.0)
 
 
 def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
-    """100 s of a made-up motion in closed form, with `PLANTED` and noise that remembers for ``correlated`` seconds."""
+    """100 s of a made-up motion in closed form, with `PLANTED` and noise that remembers for
+    ``correlated`` seconds.
+    """
     generator = np.random.default_rng(seed)
     time = np.arange(5000) / RATE
     phases = generator.uniform(0.0, 2.0 * np.pi, (3, 3))
@@ -283,16 +301,23 @@ def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
 
 @pytest.mark.parametrize("correlated", [0.05, 2.0])
 def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
-    """Thirty drives, whose noise remembers for 0.05 s and for 2 s: by a binomial law of 95 % fewer than 25 of 30 have a chance of 0.3 %."""
-    found = [align(weaving(seed, correlated=correlated), COVERED) for seed in range(30)]
+    """Thirty drives, whose noise remembers for 0.05 s and for 2 s: by a binomial law of 95 % fewer
+    than 25 of 30 have a chance of 0.3 %.
+    """
+    alignments = [align(weaving(seed, correlated=correlated), COVERED) for seed in range(30)]
     inside = np.array(
-        [[p.low <= PLANTED[p.name] <= p.high for p in each.parameters] for each in found]
+        [
+            [p.low <= PLANTED[p.name] <= p.high for p in alignment.parameters]
+            for alignment in alignments
+        ]
     )
     assert inside.sum(axis=0).min() >= 25
     assert 0.91 <= inside.mean() <= 0.99
     values, stated = (
-        np.array([[getattr(p, what) for p in each.parameters] for each in found])
-        for what in ("value", "uncertainty")
+        np.array(
+            [[getattr(p, attribute) for p in alignment.parameters] for alignment in alignments]
+        )
+        for attribute in ("value", "uncertainty")
     )
     ratio = values.std(axis=0, ddof=1) / np.sqrt(np.square(stated).mean(axis=0))
     assert ratio.min() > 0.7  # intervals are not merely wide
@@ -301,10 +326,10 @@ def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
 
 def test_log_of_20_hz_is_aligned_without_options():
     slow = resampled(weaving(0), 20.0, {"method": "polyphase", "transforms": []})
-    found = align(slow, AlignmentSettings(IMU, tilt=0.0))
-    assert found.settings.cutoff_at(20.0) == pytest.approx(1.767, abs=1e-3)
-    assert found.settings.cutoff_at(22.0) < found.settings.cutoff_at(50.0) == 2.0
-    for parameter in found.parameters:
+    alignment = align(slow, AlignmentSettings(IMU, tilt=0.0))
+    assert alignment.settings.cutoff_at(20.0) == pytest.approx(1.767, abs=1e-3)
+    assert alignment.settings.cutoff_at(22.0) < alignment.settings.cutoff_at(50.0) == 2.0
+    for parameter in alignment.parameters:
         error = abs(parameter.value - PLANTED[parameter.name])
         assert error < 3 * parameter.uncertainty < 0.3, parameter.name
 
@@ -329,17 +354,17 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
         DataError, match=r"offset_ay and offset_yaw_rate cannot be separated .*\(condition"
     ):
         align(constant, AlignmentSettings(("offsets",)))
-    still = replace(
+    standstill = replace(
         motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion))
     )
-    straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
+    straight = replace(standstill, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
     with pytest.raises(
         DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"
     ):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
     ours = weaving(0)
-    other = weaving(1)
-    mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
+    other_drive = weaving(1)
+    mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other_drive["yaw_rate_ref"]})
     with pytest.raises(DataError, match=r"has a correlation of at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
     with pytest.raises(DataError, match="raise max_delay"):
@@ -378,11 +403,11 @@ def test_missing_channel_is_one_clear_line(motion, missing):
 
 def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion):
     recording = recorded(motion, PLANTED)
-    found = align(
+    alignment = align(
         recording.select([name for name in recording.channels if name != "vx_ref"]),
         AlignmentSettings(("offsets", "mounting")),
     )
-    assert any("No vx_ref" in note for note in found.notes)
+    assert any("No vx_ref" in note for note in alignment.notes)
 
 
 def test_gaps_short_recordings_and_slow_ones_are_refused():
@@ -398,18 +423,19 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "what"),
+    ("arguments", "message"),
     [
         (
             {"estimate": ()},
-            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, "
+            "steering_ratio",
         ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(arguments, what):
-    with pytest.raises(ConfigurationError, match=what):
+def test_settings_that_make_no_sense_are_refused(arguments, message):
+    with pytest.raises(ConfigurationError, match=message):
         AlignmentSettings(**arguments)
 
 
@@ -427,7 +453,9 @@ GRADIENT = (
 
 
 def single_track(ratio, offset, seed=0):
-    """Calm country-road driving of the linear single-track model, integrated with its lags, seen by noisy sensors."""
+    """Calm country-road driving of the linear single-track model, integrated with its lags, seen by
+    noisy sensors.
+    """
     generator = np.random.default_rng(seed)
     step = 0.01
     time = np.arange(20000) * step
@@ -458,21 +486,21 @@ def single_track(ratio, offset, seed=0):
 
 @pytest.mark.parametrize(("ratio", "offset"), [(15.5, 0.05), (-1.0, -0.01)])
 def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio, offset):
-    found = align(
+    alignment = align(
         single_track(ratio, offset), AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     )
-    assert found["steering_ratio"].value == pytest.approx(ratio, rel=0.02)
-    assert found["steering_offset"].value == pytest.approx(offset, abs=0.003)
-    assert found["understeer_gradient"].value == pytest.approx(GRADIENT, rel=0.1)
+    assert alignment["steering_ratio"].value == pytest.approx(ratio, rel=0.02)
+    assert alignment["steering_offset"].value == pytest.approx(offset, abs=0.003)
+    assert alignment["understeer_gradient"].value == pytest.approx(GRADIENT, rel=0.1)
     for name, true in (
         ("steering_ratio", ratio),
         ("steering_offset", offset),
         ("understeer_gradient", GRADIENT),
     ):
-        assert found[name].low <= true <= found[name].high, name
-    (transform,) = found.transforms
+        assert alignment[name].low <= true <= alignment[name].high, name
+    (transform,) = alignment.transforms
     assert (transform["name"], transform["channel"]) == ("steering_ratio", "handwheel")
-    assert found.residuals == ()
+    assert alignment.residuals == ()
 
 
 def test_steering_intervals_contain_the_truth():
@@ -497,7 +525,9 @@ def test_steering_intervals_contain_the_truth():
 
 
 def understeering(seed):
-    """Three minutes of a car whose tyres give way, at a speed, with a ratio and an understeer of its own."""
+    """Three minutes of a car whose tyres give way, at a speed, with a ratio and an understeer of
+    its own.
+    """
     generator = np.random.default_rng(seed)
     step = 0.01
     length = 18000
@@ -537,8 +567,8 @@ def test_the_interval_of_a_ratio_covers_it_whatever_the_understeer_and_the_speed
     inside = certain = 0
     for seed in range(24):
         recording, wheelbase, truth = understeering(seed)
-        found = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=wheelbase))
-        ratio = found["steering_ratio"]
+        alignment = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=wheelbase))
+        ratio = alignment["steering_ratio"]
         inside += ratio.low <= truth <= ratio.high
         if ratio.uncertainty <= 0.1 * ratio.value:
             certain += 1
@@ -563,7 +593,9 @@ def test_the_ratio_of_a_fast_ferrari_is_uncertain_and_covered(data_root):
 def test_a_ratio_lies_within_two_deviations_on_every_recording_of_known_ratio(
     data_root, dataset, wheelbase, truth, n_recordings
 ):
-    """The DevBot's road-wheel angles have a ratio of 1, and the Ferrari's is that of its handwheel to `delta` of the same drive."""
+    """The DevBot's road-wheel angles have a ratio of 1, and the Ferrari's is that of its handwheel
+    to `delta` of the same drive.
+    """
     source = source_of(data_root, dataset)
     errors = []
     for recording in source.ids():
@@ -744,17 +776,17 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     assert files() == before
     code, out, _ = called(*ASKED, "--json")
     assert code == 0
-    told = json.loads(out)
-    parameters = {entry["name"]: entry for entry in told["parameters"]}
+    printed = json.loads(out)
+    parameters = {entry["name"]: entry for entry in printed["parameters"]}
     assert (parameters["delay"]["unit"], parameters["yaw"]["unit"]) == ("s", "rad")
     assert parameters["delay"]["low"] <= 0.040 <= parameters["delay"]["high"]
-    assert told["kind"] == "simulated"
-    assert [transform["name"] for transform in told["transforms"]] == [
+    assert printed["kind"] == "simulated"
+    assert [transform["name"] for transform in printed["transforms"]] == [
         "delay_correction",
         "offset_correction",
         "mounting_correction",
     ]
-    assert {residual["channel"] for residual in told["residuals"]} == {"ax", "ay", "yaw_rate"}
+    assert {residual["channel"] for residual in printed["residuals"]} == {"ax", "ay", "yaw_rate"}
 
 
 def test_printed_override_is_one_that_downsample_takes(called):
@@ -763,14 +795,15 @@ def test_printed_override_is_one_that_downsample_takes(called):
     composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override])[
         "downsample"
     ]
-    found = align(weaving(0), AlignmentSettings(IMU, cutoff_hz=1.5, max_delay=0.2))
+    alignment = align(weaving(0), AlignmentSettings(IMU, cutoff_hz=1.5, max_delay=0.2))
     transforms = transforms_of({"rate_hz": 20.0, **composed})
     assert list(transforms[:-1]) == [
-        transform_from_config(transform) for transform in found.transforms
+        transform_from_config(transform) for transform in alignment.transforms
     ]
-    assert override == override_of(found)
+    assert override == override_of(alignment)
     small = replace(
-        found, transforms=({"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}},)
+        alignment,
+        transforms=({"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}},),
     )
     composed = compose_config(
         "downsample", ["dataset=sim_quickstart", "rate_hz=20", override_of(small)]
@@ -785,8 +818,8 @@ def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     folder = Path("found")
     assert {file.name for file in folder.iterdir()} == set(FILES)
     assert {path.name for path in Path().iterdir()} == {"weave.parquet", "found"}
-    told = yaml.safe_load((folder / "alignment.yaml").read_text(encoding="utf-8"))
-    assert len([transform_from_config(entry) for entry in told["transforms"]]) == 3
+    written = yaml.safe_load((folder / "alignment.yaml").read_text(encoding="utf-8"))
+    assert len([transform_from_config(entry) for entry in written["transforms"]]) == 3
     rows = list(csv.DictReader((folder / "alignment.csv").open(encoding="utf-8")))
     assert [row["name"] for row in rows] == list(PLANTED)
     assert {row["kind"] for row in rows} == {"simulated"}
@@ -816,12 +849,13 @@ def test_steering_alone_is_written_too(called):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "what"),
+    ("arguments", "code", "message"),
     [
         (
             ("weave.parquet",),
             2,
-            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio",
+            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, "
+            "steering_ratio",
         ),
         (
             ("sim_quickstart", "-e", "delay"),
@@ -837,26 +871,29 @@ def test_steering_alone_is_written_too(called):
         (("weave.parquet", "-e", "delay", "-o", "weave.parquet"), 2, "is not a folder"),
     ],
 )
-def test_command_refuses_in_one_line_and_writes_nothing(called, arguments, code, what):
+def test_command_refuses_in_one_line_and_writes_nothing(called, arguments, code, message):
     before = files()
     left, out, err = called(*arguments)
     assert (left, out) == (code, "")
     assert err.startswith("error: ")
-    assert what in err
+    assert message in err
     assert err.count("\n") == 1
     assert files() == before
 
 
 def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_its_laps(data_root):
-    """Its publishers give accelerations at the centre of gravity: lever arm, rotation and offsets should be near zero."""
+    """Its publishers give accelerations at the centre of gravity: lever arm, rotation and offsets
+    should be near zero.
+    """
     ferrari = real_drive(data_root)
-    found = align(ferrari, AlignmentSettings(IMU))
+    alignment = align(ferrari, AlignmentSettings(IMU))
     for name in ("lever_x", "lever_y", "yaw"):
-        assert found[name].low <= 0.0 <= found[name].high, name
-    assert all(math.isfinite(parameter.high - parameter.low) for parameter in found.parameters)
-    assert found["lever_x"].uncertainty < 0.5
-    assert abs(found["delay"].value) < 0.05
-    # Between two passes of one place the car has turned by whole circles: what is left over of the integrated yaw rate is its offset.
+        assert alignment[name].low <= 0.0 <= alignment[name].high, name
+    assert all(math.isfinite(parameter.high - parameter.low) for parameter in alignment.parameters)
+    assert alignment["lever_x"].uncertainty < 0.5
+    assert abs(alignment["delay"].value) < 0.05
+    # Between two passes of one place the car has turned by whole circles: what is left over of the
+    # integrated yaw rate is its offset.
     path = np.cumsum(ferrari["vx"]) / ferrari.rate_hz
     curvature = np.interp(np.arange(0.0, path[-1], 10.0), path, ferrari["yaw_rate"] / ferrari["vx"])
     curvature -= curvature.mean()
@@ -871,4 +908,4 @@ def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_i
         (last - first) / ferrari.rate_hz
     )
     assert abs(offset) < 2e-4
-    assert found["offset_yaw_rate"].low <= offset <= found["offset_yaw_rate"].high
+    assert alignment["offset_yaw_rate"].low <= offset <= alignment["offset_yaw_rate"].high

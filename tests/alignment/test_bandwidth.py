@@ -1,4 +1,6 @@
-"""Low-passed and held channels: time constants and rates in closed form, and the real cars that have them."""
+"""Low-passed and held channels: time constants and rates in closed form, and the real cars that
+have them.
+"""
 
 from dataclasses import replace
 
@@ -41,21 +43,21 @@ def test_delay_and_time_constant_are_told_apart(time_constant, late):
 @pytest.mark.parametrize("missing", [(), ("yaw_rate_ref",)])
 def test_a_low_passed_yaw_rate_is_found_and_is_not_late_besides(missing):
     slow = without(broadband_drive(slow_yaw_rate=0.4), *missing)
-    found = [finding for finding in checks_of_recording(slow) if finding.level != "note"]
-    assert [(one.check, one.channel) for one in found] == [("bandwidth", "yaw_rate")]
+    warnings = [finding for finding in checks_of_recording(slow) if finding.level != "note"]
+    assert [(warning.check, warning.channel) for warning in warnings] == [("bandwidth", "yaw_rate")]
     assert (
-        "time constant of 0.4 s" in found[0].message
-        or "time constant of 0.39 s" in found[0].message
+        "time constant of 0.4 s" in warnings[0].message
+        or "time constant of 0.39 s" in warnings[0].message
     )
 
 
-def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do_and_a_late_channel_is_not_low_passed():
+def test_late_channels_are_not_low_passed_and_steering_judges_a_slow_yaw_rate():
     for channel in ("yaw_rate", "ax", "ay"):
         assert not found_by("bandwidth", broadband_drive(late={channel: 0.15}))
     alone = ("ay", "yaw_rate_ref", "vy_ref", "sideslip_ref")
     assert not found_by("bandwidth", without(broadband_drive(), *alone))
-    found = found_by("bandwidth", without(broadband_drive(slow_yaw_rate=0.5), *alone))
-    assert "more than the 0.3 s usual for cars" in found["yaw_rate"].message
+    low_passed = found_by("bandwidth", without(broadband_drive(slow_yaw_rate=0.5), *alone))
+    assert "more than the 0.3 s usual for cars" in low_passed["yaw_rate"].message
 
 
 @pytest.mark.parametrize("step", [2, 5, 10, 33])
@@ -81,19 +83,19 @@ def test_held_rates_are_those_of_a_sensors_own_clock_and_none_of_noise_or_slow_s
 def test_channels_held_together_are_told_of_together_by_what_it_delays():
     drive = broadband_drive()
 
-    def held(step):
+    def hold_accelerations(step):
         changed = {
             name: np.repeat(drive[name][::step], step)[: len(drive)] for name in ("ax", "ay")
         }
         return replace(drive, channels={**drive.channels, **changed})
 
-    (slow,) = found_by("held", held(10)).values()
+    (slow,) = found_by("held", hold_accelerations(10)).values()
     assert (slow.level, slow.channel) == ("warning", "ax")
     assert (
-        "updated at only 10 Hz and held in between (also ay), in a recording at 100 Hz, which delays it by 50 ms on average"
-        in slow.message
+        "updated at only 10 Hz and held in between (also ay), in a recording at 100 Hz, which "
+        "delays it by 50 ms on average" in slow.message
     )
-    (fast,) = found_by("held", held(2)).values()
+    (fast,) = found_by("held", hold_accelerations(2)).values()
     assert (fast.level, fast.channel) == ("note", "ax")
 
 
@@ -107,20 +109,22 @@ def recordings_of(name, data_root):
 
 def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):
     for recording in recordings_of("av21", data_root):
-        found = found_by("bandwidth", recording)
-        assert set(found) == {"ax", "yaw_rate"}
-        assert 2.0 < float(found["ax"].message.split("time constant of ")[1].split(" s")[0]) < 3.0
+        low_passed = found_by("bandwidth", recording)
+        assert set(low_passed) == {"ax", "yaw_rate"}
+        assert (
+            2.0 < float(low_passed["ax"].message.split("time constant of ")[1].split(" s")[0]) < 3.0
+        )
 
 
 @pytest.mark.parametrize("name", ["ferrari_250lm", "f1tenth", "ferrari_250lm_unlabelled", "tum"])
 def test_no_other_cars_channels_are_low_passed_held_or_of_another_sign(data_root, name):
-    found = [
+    findings = [
         finding
         for recording in recordings_of(name, data_root)
         for finding in checks_of_recording(recording)
     ]
     assert not [
         finding
-        for finding in found
+        for finding in findings
         if finding.check in ("bandwidth", "held", "sign", "unit", "delay")
     ]

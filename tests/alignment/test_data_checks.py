@@ -13,7 +13,9 @@ LENGTH = 6000
 
 
 def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
-    """A car that obeys d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate, seen by sensors with a little noise."""
+    """A car that obeys d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate, seen by sensors
+    with a little noise.
+    """
     time = np.arange(round(seconds * rate)) / rate
     generator = np.random.default_rng(seed)
     yaw_rate = 0.25 * np.sin(2 * np.pi * 0.11 * time) + 0.15 * np.sin(2 * np.pi * 0.43 * time + 1.0)
@@ -91,27 +93,33 @@ def test_a_clean_drive_is_noted_to_follow_the_kinematics_and_a_bias_is_the_accel
 
 
 def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
-    found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
-    assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
-    assert "1 samples" in found.message
-    assert "500 m/s² at t = 22.34 s" in found.message
-    found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
-    assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
-    assert "if the column is in degrees, set its unit" in found[0].message
+    findings = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
+    assert (findings.level, findings.check, findings.channel) == ("error", "impossible", "ay")
+    assert "1 sample outside" in findings.message
+    assert "500 m/s² at t = 22.34 s" in findings.message
+    findings = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
+    assert (findings[0].level, findings[0].check, findings[0].channel) == (
+        "error",
+        "impossible",
+        "yaw_rate",
+    )
+    assert "if the column is in degrees, set its unit" in findings[0].message
 
 
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
-    found = only_complaint(changed(clean_drive(), ay=np.negative, yaw_rate=np.negative))
-    assert (found.level, found.check, found.channel) == ("warning", "sign", "")
+    finding = only_complaint(changed(clean_drive(), ay=np.negative, yaw_rate=np.negative))
+    assert (finding.level, finding.check, finding.channel) == ("warning", "sign", "")
     assert (
         "set sign: -1 for ay and yaw_rate together or sideslip_ref, steer and vy_ref together"
-        in found.message
+        in finding.message
     )
 
 
 def test_kinematics_are_judged_on_moving_cars_alone():
-    found = only_complaint(changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE))))
-    assert (found.level, found.check, found.channel) == ("warning", "kinematics", "vy_ref")
+    finding = only_complaint(
+        changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE)))
+    )
+    assert (finding.level, finding.check, finding.channel) == ("warning", "kinematics", "vy_ref")
     generator = np.random.default_rng(0)
     parked = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "vy_ref": 0.01}
     channels = {name: level * generator.standard_normal(LENGTH) for name, level in parked.items()}
@@ -124,18 +132,20 @@ def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_
     gappy = replace(
         recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"})
     )
-    found = checks_of_recording(gappy)
-    assert [(one.level, one.check, one.channel) for one in found] == [("note", "nan", "vy_ref")]
-    assert "80.0 %" in found[0].message
+    findings = checks_of_recording(gappy)
+    assert [(finding.level, finding.check, finding.channel) for finding in findings] == [
+        ("note", "nan", "vy_ref")
+    ]
+    assert "80.0 %" in findings[0].message
 
 
 def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held_ones_are_not():
-    found = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
-    assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
-    assert "constant at 1.5 m/s² for 2.5 s from t = 30 s" in found.message
-    found = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
-    assert (found.check, found.channel) == ("stuck", "steer")
-    assert "constant at 0.02 rad throughout" in found.message
+    finding = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
+    assert (finding.level, finding.check, finding.channel) == ("warning", "stuck", "ay")
+    assert "constant at 1.5 m/s² for 2.5 s from t = 30 s" in finding.message
+    finding = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
+    assert (finding.check, finding.channel) == ("stuck", "steer")
+    assert "constant at 0.02 rad throughout" in finding.message
     assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
     assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [
         ("warning", "held", "steer")
@@ -143,13 +153,13 @@ def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
     slow[2000:2500:5] = 0.03
-    found = only_complaint(
+    finding = only_complaint(
         replace(
             recording, channels={**recording.channels, "steer": slow}, gappy=frozenset({"steer"})
         )
     )
-    assert (found.check, found.channel) == ("stuck", "steer")
-    assert "4.96 s" in found.message
+    assert (finding.check, finding.channel) == ("stuck", "steer")
+    assert "4.96 s" in finding.message
 
 
 @pytest.mark.parametrize("steer", [0.0, 0.4])
@@ -158,18 +168,18 @@ def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
 
 
 def test_stuck_channels_are_told_from_standstill():
-    found = [
-        one
-        for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000)))
-        if one.check == "stuck"
+    findings = [
+        finding
+        for finding in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000)))
+        if finding.check == "stuck"
     ]
-    assert [finding.channel for finding in found] == ["vx"]
-    assert "constant at 0 m/s for 10 s from t = 30 s" in found[0].message
-    found = only_complaint(
+    assert [finding.channel for finding in findings] == ["vx"]
+    assert "constant at 0 m/s for 10 s from t = 30 s" in findings[0].message
+    findings = only_complaint(
         changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200))
     )
-    assert (found.check, found.channel) == ("stuck", "steer")
-    assert "0.03 rad for 2 s from t = 50 s" in found.message
+    assert (findings.check, findings.channel) == ("stuck", "steer")
+    assert "0.03 rad for 2 s from t = 50 s" in findings.message
 
 
 @pytest.mark.parametrize(
@@ -177,18 +187,20 @@ def test_stuck_channels_are_told_from_standstill():
     [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)],
 )
 def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
-    found = [
-        one
-        for one in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high)))
-        if one.level != "note"
+    findings = [
+        finding
+        for finding in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high)))
+        if finding.level != "note"
     ]
-    assert {(one.level, one.check, one.channel) for one in found if one.check == "saturated"} == {
-        ("warning", "saturated", "ay")
-    }
-    assert sum(one.check == "saturated" for one in found) == sides
-    for one in found:
-        if one.check == "saturated":
-            assert ("highest" in one.message) == (f", {high:g} m/s²" in one.message)
+    assert {
+        (finding.level, finding.check, finding.channel)
+        for finding in findings
+        if finding.check == "saturated"
+    } == {("warning", "saturated", "ay")}
+    assert sum(finding.check == "saturated" for finding in findings) == sides
+    for finding in findings:
+        if finding.check == "saturated":
+            assert ("highest" in finding.message) == (f", {high:g} m/s²" in finding.message)
 
 
 def test_quantised_resting_and_stepped_channels_are_not_saturated():
@@ -200,10 +212,10 @@ def test_quantised_resting_and_stepped_channels_are_not_saturated():
     time = np.arange(LENGTH) / RATE
     sine = np.round(8.0 * np.sin(2 * np.pi * 0.71 * time), 1)
     assert complaints(Recording("r", "car", RATE, 0.0, {"ay": sine})) == []
-    found = checks_of_recording(
+    findings = checks_of_recording(
         changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4))
     )
-    assert sum(one.check == "saturated" for one in found) == 2
+    assert sum(finding.check == "saturated" for finding in findings) == 2
     recording = with_standstill(clean_drive(), 20.0, 35.0)
     assert complaints(changed(recording, vx=lambda vx: vx.clip(0.0, None))) == []
     steer = np.where(np.arange(400) < 350, 0.01 * np.sin(np.arange(400)), 0.1)
@@ -211,16 +223,16 @@ def test_quantised_resting_and_stepped_channels_are_not_saturated():
 
 
 def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_named():
-    whole = clean_drive()
-    assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
-    assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [
+    full_drive = clean_drive()
+    assert complaints(changed(full_drive, steer=lambda samples: samples + np.deg2rad(1.0))) == []
+    assert complaints(changed(full_drive, steer=lambda samples: samples - np.deg2rad(5.0))) == [
         ("warning", "offset", "steer")
     ]
     drive = clean_drive()
     wheels = {f"wheel_speed_{wheel}": drive["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
-    whole = replace(drive, channels={**drive.channels, **wheels})
-    assert not complaints(whole)
-    dropped = changed(whole, wheel_speed_rl=stuck(0.0, 2000, 2060))
+    full_drive = replace(drive, channels={**drive.channels, **wheels})
+    assert not complaints(full_drive)
+    dropped = changed(full_drive, wheel_speed_rl=stuck(0.0, 2000, 2060))
     assert complaints(dropped) == [("warning", "dropout", "wheel_speed_rl")]
     assert "dropout" not in {
         check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))
@@ -228,7 +240,9 @@ def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_na
 
 
 def backwards(recording, *stretches, speed=-2.0):
-    """The same drive, with stretches of samples in which its speed and its reference's are negative."""
+    """The same drive, with stretches of samples in which its speed and its reference's are
+    negative.
+    """
     slow = {name: recording[name].copy() for name in ("vx", "vx_ref")}
     for samples in slow.values():
         for start, stop in stretches:
@@ -241,29 +255,29 @@ def reversing(recording):
 
 
 def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
-    (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
-    assert (found.level, found.channel) == ("note", "vx")
-    assert "reversing in 2 segments" in found.message
-    assert "the longest for 2.5 s from t = 40 s, minimum -2 m/s" in found.message
-    assert "start and stop in the split" in found.message
-    assert "sign: -1" in found.message
-    (found,) = reversing(changed(clean_drive(), vx=np.negative))
-    assert "reversing in 1 segment (" in found.message
-    assert "for 60 s from t = 10 s" in found.message
+    (finding,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
+    assert (finding.level, finding.channel) == ("note", "vx")
+    assert "reversing in 2 segments" in finding.message
+    assert "the longest for 2.5 s from t = 40 s, minimum -2 m/s" in finding.message
+    assert "start and stop in the split" in finding.message
+    assert "sign: -1" in finding.message
+    (finding,) = reversing(changed(clean_drive(), vx=np.negative))
+    assert "reversing in 1 segment (" in finding.message
+    assert "for 60 s from t = 10 s" in finding.message
 
 
 def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed():
     drive = backwards(clean_drive(), (1000, 1150))
     forwards = changed(drive, vx=np.abs)
     assert [
-        (found.level, "unsigned: positive while the car reverses in 1 segment" in found.message)
-        for found in reversing(forwards)
+        (finding.level, "unsigned: positive while the car reverses in 1 segment" in finding.message)
+        for finding in reversing(forwards)
     ] == [("warning", True)]
     without = replace(
         forwards,
         channels={name: samples for name, samples in forwards.channels.items() if name != "vx"},
     )
-    assert [found.channel for found in reversing(without)] == ["vx_ref"]
+    assert [finding.channel for finding in reversing(without)] == ["vx_ref"]
     assert not reversing(without.select(["yaw_rate", "ay"]))
 
 
@@ -285,10 +299,32 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
     handwheel = 15.0 * drive["steer"]
     handwheel[3000 : 3000 + length] = value
     drive = replace(drive, channels={**drive.channels, "handwheel": handwheel})
-    found = [one for one in checks_of_recording(drive) if one.check == "spike"]
-    assert [one.channel for one in found] == ["handwheel"] * is_found
+    spikes = [finding for finding in checks_of_recording(drive) if finding.check == "spike"]
+    assert [finding.channel for finding in spikes] == ["handwheel"] * is_found
     assert all(
-        "1 spike of" in one.message and "7.3 rad at t = 40 s" in one.message for one in found
+        "1 spike of" in finding.message and "7.3 rad at t = 40 s" in finding.message
+        for finding in spikes
+    )
+
+
+@pytest.mark.parametrize(
+    ("length", "value", "is_found"),
+    [(1, 0.0, True), (30, 0.0, True), (30, 60.0, True), (1, 60.0, False), (120, 0.0, False)],
+    ids=["one zero", "0.4 s of zeros", "one code", "a single sample", "a stop of 1.6 s"],
+)
+def test_a_speed_that_jumps_to_one_value_and_back_is_found_within_its_usual_range(
+    length, value, is_found
+):
+    drive = clean_drive()
+    speed = drive["vx"].copy()
+    speed[:1000] += np.linspace(60.0, 0.0, 1000)  # so that the code is no unusual speed
+    speed[3000 : 3000 + length] = value
+    found = checks_of_recording(replace(drive, channels={**drive.channels, "vx": speed}))
+    messages = [one.message for one in found if (one.check, one.channel) == ("spike", "vx")]
+    assert len(messages) == is_found
+    assert all(
+        f"jumps away and back 1 time within 1 s, the longest to {value:.4g} m/s" in text
+        for text in messages
     )
 
 
@@ -296,11 +332,11 @@ def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
     drive = clean_drive()
     shaking = 5.0 * (-1.0) ** np.arange(len(drive))
     shaking[3000] = 22.0  # by 27 m/s², two of its ranges, but not three of its steps of 10 m/s²
-    standing = {name: samples.copy() for name, samples in drive.channels.items()}
-    for samples in standing.values():
+    standing_car = {name: samples.copy() for name, samples in drive.channels.items()}
+    for samples in standing_car.values():
         samples[3000:3400] = 0.0
-    standing["sideslip_ref"] = 0.02 * np.sin(0.01 * np.arange(len(drive)))
-    standing["sideslip_ref"][3200] = 3.0
-    for channels in ({**drive.channels, "ax": shaking}, standing):
-        found = checks_of_recording(replace(drive, channels=channels))
-        assert "spike" not in [one.check for one in found]
+    standing_car["sideslip_ref"] = 0.02 * np.sin(0.01 * np.arange(len(drive)))
+    standing_car["sideslip_ref"][3200] = 3.0
+    for channels in ({**drive.channels, "ax": shaking}, standing_car):
+        findings = checks_of_recording(replace(drive, channels=channels))
+        assert "spike" not in [finding.check for finding in findings]

@@ -1,4 +1,6 @@
-"""Delays: a channel that is late is named with an interval that holds the truth, and nothing else is."""
+"""Delays: a channel that is late is named with an interval that holds the truth, and nothing else
+is.
+"""
 
 from dataclasses import replace
 from itertools import product
@@ -23,10 +25,10 @@ def delays(recording):
 
 
 def between(recording, channel, against):
-    (found,) = [
+    (delay_estimate,) = [
         delay for delay in delays(recording) if (delay.channel, delay.against) == (channel, against)
     ]
-    return found
+    return delay_estimate
 
 
 def reported(recording):
@@ -53,9 +55,9 @@ LATE = (("yaw_rate",), ("ay",), ("ax",), ("vy_ref", "sideslip_ref"), ("vx",))
     ("late", "rate"), [*product(LATE, (25.0, 100.0)), (("yaw_rate",), 1000.0 / 3.0)]
 )
 def test_the_late_channel_is_named_and_no_other(late, rate):
-    found = reported(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04)))
-    assert set(found) == {late[0]}
-    assert "\n" not in found[late[0]].message
+    by_channel = reported(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04)))
+    assert set(by_channel) == {late[0]}
+    assert "\n" not in by_channel[late[0]].message
     for delay in delays(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04))):
         truth = 0.04 * ((delay.channel in late) - (delay.against in late))
         assert delay.delay.value == pytest.approx(truth, abs=6e-3), delay
@@ -85,14 +87,16 @@ def test_without_references_of_their_own_accelerations_and_angles_still_tell_who
 def test_a_lever_arm_is_no_delay_and_one_in_channels_of_the_wrong_sign_and_unit_is_found():
     drive = without(broadband_drive(lever=1.5), "yaw_rate_ref")
     assert not reported(drive)
-    found = between(drive, "yaw_rate", "ay").delay
-    assert found.low < 0.0 < found.high
+    delay_estimate = between(drive, "yaw_rate", "ay").delay
+    assert delay_estimate.low < 0.0 < delay_estimate.high
     late = broadband_drive(late={"ay": 0.06})
     spoilt = replace(
         late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]}
     )
-    found = checks_of_recording(spoilt)
-    assert {(one.check, one.channel) for one in found if one.level == "warning"} == {
+    findings = checks_of_recording(spoilt)
+    assert {
+        (finding.check, finding.channel) for finding in findings if finding.level == "warning"
+    } == {
         ("sign", "ay"),
         ("unit", "vy_ref"),
         ("delay", "ay"),
@@ -143,8 +147,8 @@ def test_slipping_wheels_are_not_reported_and_late_ones_once():
     drive = broadband_drive(noise=0.0)
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
     wheels = {f"wheel_speed_{wheel}": late for wheel in ("fl", "fr", "rl", "rr")}
-    (found,) = reported(replace(drive, channels={**drive.channels, **wheels})).values()
-    assert "like the other wheels, by 59 ms" in found.message
+    (warning,) = reported(replace(drive, channels={**drive.channels, **wheels})).values()
+    assert "like the other wheels, by 59 ms" in warning.message
 
 
 @pytest.fixture
@@ -173,6 +177,6 @@ def test_a_delay_planted_into_the_ferrari_is_found_where_it_is(ferrari, channel,
     changed = {**drive.channels, channel: shifted}
     if channel == "vy_ref":
         changed["sideslip_ref"] = np.interp(drive.time - late, drive.time, drive["sideslip_ref"])
-    found = set(reported(replace(drive, channels=changed)))
-    assert found <= names
-    assert channel in found
+    late_channels = set(reported(replace(drive, channels=changed)))
+    assert late_channels <= names
+    assert channel in late_channels

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from broadband_drive import broadband_drive, without
+from broadband_drive import broadband_drive, changed, without
 from scipy import signal
 
 from vehest.alignment.band_pass import butterworth_band, without_phase
@@ -17,16 +17,6 @@ from vehest.data.recording import Recording
 REFERENCES = ("vy_ref", "sideslip_ref", "yaw_rate_ref", "vx_ref")
 
 
-def changed(recording, **changes):
-    return replace(
-        recording,
-        channels={
-            **recording.channels,
-            **{name: change(recording[name]) for name, change in changes.items()},
-        },
-    )
-
-
 def turned(recording, *names):
     return changed(recording, **dict.fromkeys(names, np.negative))
 
@@ -36,9 +26,9 @@ def warned(recording):
 
 
 def signs(recording):
-    found = warned(recording)
-    assert {finding.check for finding in found} <= {"sign"}, found
-    return [finding.channel for finding in found]
+    warnings = warned(recording)
+    assert {finding.check for finding in warnings} <= {"sign"}, warnings
+    return [finding.channel for finding in warnings]
 
 
 @pytest.mark.parametrize("rate_hz", [5.5, 20.0, 125.0, 1000.0])
@@ -67,28 +57,30 @@ def test_one_reversed_channel_is_named(channel, rate):
 def test_several_reversed_channels_are_all_named_with_the_products_that_contradict():
     assert signs(turned(broadband_drive(), "vy_ref", "sideslip_ref")) == ["sideslip_ref", "vy_ref"]
     assert signs(turned(broadband_drive(), "ax", "ay")) == ["ax", "ay"]
-    (found,) = warned(turned(without(broadband_drive(), *REFERENCES), "ay"))
-    assert found.channel == "ay"
-    assert found.message.startswith("sign reversed (ay vs. vx·yaw_rate: correlation -")
-    assert "consistent: steer vs. yaw_rate" in found.message
-    assert "set sign: -1 for ay, or instead steer and yaw_rate together" in found.message
+    (warning,) = warned(turned(without(broadband_drive(), *REFERENCES), "ay"))
+    assert warning.channel == "ay"
+    assert warning.message.startswith("sign reversed (ay vs. vx·yaw_rate: correlation -")
+    assert "consistent: steer vs. yaw_rate" in warning.message
+    assert "set sign: -1 for ay, or instead steer and yaw_rate together" in warning.message
 
 
 @pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
 def test_without_steering_and_heading_no_channel_is_named(channel):
-    (found,) = warned(turned(without(broadband_drive(), *REFERENCES, "steer"), channel))
-    assert (found.check, found.channel) == ("sign", "")
-    assert "set sign: -1 for ay or yaw_rate; a steering angle or yaw_rate_ref" in found.message
-    assert set(found.suspects) == {"ay", "yaw_rate"}
+    (warning,) = warned(turned(without(broadband_drive(), *REFERENCES, "steer"), channel))
+    assert (warning.check, warning.channel) == ("sign", "")
+    assert "set sign: -1 for ay or yaw_rate; a steering angle or yaw_rate_ref" in warning.message
+    assert set(warning.suspects) == {"ay", "yaw_rate"}
 
 
 def test_without_a_channel_that_decides_none_is_named():
-    """A unit and a slip sensor whose y axes point to the right are as likely as one whose yaw rate counts clockwise."""
-    (found,) = warned(
+    """A unit and a slip sensor whose y axes point to the right are as likely as one whose yaw rate
+    counts clockwise.
+    """
+    (warning,) = warned(
         turned(without(broadband_drive(), "sideslip_ref", "yaw_rate_ref", "steer"), "yaw_rate")
     )
-    assert found.channel == ""
-    assert "set sign: -1 for yaw_rate or ay and vy_ref together" in found.message
+    assert warning.channel == ""
+    assert "set sign: -1 for yaw_rate or ay and vy_ref together" in warning.message
 
 
 def test_steering_may_be_the_angle_of_the_steering_wheel():
@@ -125,23 +117,33 @@ def test_counter_steering_and_late_yaw_rates_are_not_taken_for_reversed_channels
     ],
 )
 def test_a_wrong_unit_is_named(channel, factor, units, level):
-    found = [
-        one
-        for one in warned(changed(broadband_drive(), **{channel: lambda samples: factor * samples}))
-        if one.check != "impossible"
+    unit_findings = [
+        finding
+        for finding in warned(
+            changed(broadband_drive(), **{channel: lambda samples: factor * samples})
+        )
+        if finding.check != "impossible"
     ]
-    assert [(one.level, one.check, one.channel) for one in found] == [(level, "unit", channel)]
-    assert f": {channel} is {units}; correct the unit" in found[0].message
+    assert [(finding.level, finding.check, finding.channel) for finding in unit_findings] == [
+        (level, "unit", channel)
+    ]
+    assert f": {channel} is {units}; correct the unit" in unit_findings[0].message
 
 
 def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
-    found = warned(
+    unit_findings = warned(
         changed(broadband_drive(), ay=lambda ay: ay / GRAVITY, vy_ref=lambda vy: 3.6 * vy)
     )
-    assert {(one.check, one.channel) for one in found} == {("unit", "ay"), ("unit", "vy_ref")}
-    # ay is a tenth of vx·yaw_rate: no factor of vx alone does that; a ninth of km/h and g together is not looked for.
-    found = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), vx=lambda vx: vx * 3.6))
-    assert [(one.check, one.channel) for one in found] == [("unit", "vx")]
+    assert {(finding.check, finding.channel) for finding in unit_findings} == {
+        ("unit", "ay"),
+        ("unit", "vy_ref"),
+    }
+    # ay is a tenth of vx·yaw_rate: no factor of vx alone does that; a ninth of km/h and g together
+    # is not looked for.
+    unit_findings = warned(
+        changed(without(broadband_drive(), *REFERENCES, "ax"), vx=lambda vx: vx * 3.6)
+    )
+    assert [(finding.check, finding.channel) for finding in unit_findings] == [("unit", "vx")]
     odd = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), ay=lambda ay: ay * 2.0))
     assert (
         "gain 2.03 instead of 1 (correlation 0.99); check the units of ay, yaw_rate and vx"
@@ -167,10 +169,12 @@ def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
 @pytest.mark.parametrize("missing", [(), ("vy_ref", "sideslip_ref")])
 def test_an_offset_of_ay_is_found_with_its_size(offset, level, missing):
     drive = without(changed(broadband_drive(), ay=lambda ay: ay + offset), *missing)
-    found = [finding for finding in checks_of_recording(drive) if finding.check == "offset"]
-    assert [(one.level, one.channel) for one in found] == ([(level, "ay")] if level else [])
+    offsets = [finding for finding in checks_of_recording(drive) if finding.check == "offset"]
+    assert [(finding.level, finding.channel) for finding in offsets] == (
+        [(level, "ay")] if level else []
+    )
     if level:
-        assert float(found[0].message.split()[3]) == pytest.approx(offset, abs=0.03)
+        assert float(offsets[0].message.split()[3]) == pytest.approx(offset, abs=0.03)
 
 
 def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():

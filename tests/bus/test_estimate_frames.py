@@ -25,35 +25,44 @@ NAMES = {
 }
 
 
-def decoded(said, first_id=1776):
+def decoded(estimate, first_id=1776):
     database = cantools.database.load_string(dbc_text(first_id), "dbc")
-    found = {}
-    for frame in EstimateFrames(first_id)(said, 1.0):
-        found |= database.decode_message(frame.arbitration_id, frame.data)
-    return found
+    signals = {}
+    for frame in EstimateFrames(first_id)(estimate, 1.0):
+        signals |= database.decode_message(frame.arbitration_id, frame.data)
+    return signals
 
 
-def test_cantools_reads_back_what_was_sent_within_half_a_step():
+def test_cantools_decodes_the_sent_values_within_half_a_step():
     rng = np.random.default_rng(0)
-    most = {"vy": 60, "sideslip": math.pi, "yaw_rate": 4, "band_vy": 100, "band_sideslip": math.pi}
-    for _ in range(200):
-        said = {name: rng.uniform(0 if "band" in name else -own, own) for name, own in most.items()}
-        said |= {"health": float(rng.integers(3)), "health_reason": 10000.0 * NO_ESTIMATE}
-        found = decoded(said)
-        for name, (signal, factor) in NAMES.items():
-            assert float(str(found[signal])) == pytest.approx(
-                said[name] * factor, abs=0.00025 + 1e-9
-            )
-        assert str(found["Health"]) == ("valid", "degraded", "invalid")[int(said["health"])]
-        assert reason_in_words(float(str(found["HealthReason"]))) == "there is no estimate"
-
-
-def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signal_are_cut_off():
-    found = decoded({"vy": math.nan, "sideslip": math.nan})
-    assert {str(found[name]) for name in (*(signal for signal, _ in NAMES.values()), "Health")} == {
-        "not available"
+    largest = {
+        "vy": 60,
+        "sideslip": math.pi,
+        "yaw_rate": 4,
+        "band_vy": 100,
+        "band_sideslip": math.pi,
     }
-    found = decoded(
+    for _ in range(200):
+        estimate = {
+            name: rng.uniform(0 if "band" in name else -limit, limit)
+            for name, limit in largest.items()
+        }
+        estimate |= {"health": float(rng.integers(3)), "health_reason": 10000.0 * NO_ESTIMATE}
+        signals = decoded(estimate)
+        for name, (signal, factor) in NAMES.items():
+            assert float(str(signals[signal])) == pytest.approx(
+                estimate[name] * factor, abs=0.00025 + 1e-9
+            )
+        assert str(signals["Health"]) == ("valid", "degraded", "invalid")[int(estimate["health"])]
+        assert reason_in_words(float(str(signals["HealthReason"]))) == "there is no estimate"
+
+
+def test_missing_values_are_not_available_and_excessive_ones_are_clipped():
+    signals = decoded({"vy": math.nan, "sideslip": math.nan})
+    assert {
+        str(signals[name]) for name in (*(signal for signal, _ in NAMES.values()), "Health")
+    } == {"not available"}
+    signals = decoded(
         {
             "vy": 1e300,
             "sideslip": -math.inf,
@@ -69,7 +78,7 @@ def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signa
         "YawRate": -13.1071,
         "LateralVelocityBand": 524.287,
     }
-    assert {name: found[name] for name in ends} == pytest.approx(ends)
+    assert {name: signals[name] for name in ends} == pytest.approx(ends)
     assert decoded({"vy": 1.0, "sideslip": 0.0}, 0x123)["LateralVelocity"] == pytest.approx(1.0)
     assert "must lie between" in refusal(lambda: dbc_text(0x7FF), ConfigurationError)
 

@@ -1,4 +1,6 @@
-"""A log on a virtual bus with a model behind it: estimates as without a bus, what is lost is missing, what was written stays."""
+"""A log on a virtual bus with a model behind it: estimates as without a bus, what is lost is
+missing, what was written stays.
+"""
 
 import io
 import math
@@ -22,7 +24,7 @@ cantools = pytest.importorskip(
 )
 
 from can_drive import DBC, SIGNALS, ferrari, write_log  # noqa: E402
-from replayed_drive import FERRARI, compare, told_for  # noqa: E402
+from replayed_drive import FERRARI, compare, signals_for  # noqa: E402
 
 CHANNELS = ("yaw_rate", "vx", "ay", "ax")  # of the pre-trained model
 RATE = 100.0
@@ -33,26 +35,26 @@ def drive(seconds=20.0):
 
 
 def replayed(written, **more):
-    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max", **more}
+    words = {"dbc": written.dbc, "signals": signals_for(CHANNELS), "speed": "max", **more}
     return replay_log(written.log, **words)
 
 
 def by_cantools(written):
     """Values of the frames in SI units and ISO 8855 signs, without vehest."""
     database = cantools.database.load_string(DBC, "dbc")
-    found = {name: [] for name in CHANNELS}
+    decoded = {name: [] for name in CHANNELS}
     for frame in can.LogReader(written.log):
         values = database.decode_message(frame.arbitration_id, frame.data)
         if "VehSpd" in values:
-            found["vx"].append(values["VehSpd"] / 3.6)
+            decoded["vx"].append(values["VehSpd"] / 3.6)
         if "AccLat" in values:
-            found["ay"].append(-values["AccLat"])
-            found["ax"].append(values["AccLong"])
-            found["yaw_rate"].append(math.radians(values["YawRate"]))
-    return found
+            decoded["ay"].append(-values["AccLat"])
+            decoded["ax"].append(values["AccLong"])
+            decoded["yaw_rate"].append(math.radians(values["YawRate"]))
+    return decoded
 
 
-def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold_for_their_sample_less_the_filters_delay(
+def test_replayed_estimates_equal_the_stepped_model_less_the_filters_delay(
     tmp_path,
 ):
     written = write_log(drive(), tmp_path, jitter=0.001)
@@ -65,10 +67,10 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold
     expected = []
     last = stepper.last
     for k in range(len(values["vx"])):
-        said = stepper.step({name: values[name][k] for name in CHANNELS})
-        if said is not last:
-            expected.append((said["vy"], said["sideslip"], said["health"]))
-            last = said
+        step = stepper.step({name: values[name][k] for name in CHANNELS})
+        if step is not last:
+            expected.append((step["vy"], step["sideslip"], step["health"]))
+            last = step
     assert figures["samples_lost"] == 0
     assert figures["estimates"] == len(table) == len(expected)
     np.testing.assert_allclose(
@@ -93,7 +95,7 @@ def test_lost_frames_are_missing_samples(tmp_path):
     assert figures["samples_lost"] == len({*lost["IMU"], *lost["Speed"]})
 
 
-def test_frames_of_estimates_say_what_the_table_says(tmp_path):
+def test_frames_of_estimates_agree_with_the_table(tmp_path):
     written = write_log(drive(), tmp_path, ".blf")
     replayed(written, out=tmp_path / "out.csv")
     figures = replayed(written, out=tmp_path / "sent.asc", identifier="0x321")
@@ -104,19 +106,19 @@ def test_frames_of_estimates_say_what_the_table_says(tmp_path):
         (frame, database.decode_message(frame.arbitration_id, frame.data))
         for frame in can.LogReader(tmp_path / "sent.asc")
     ]
-    said = [values for frame, values in frames if frame.arbitration_id == 0x321]
-    assert len(said) == len(table) == len(frames) / 2
-    assert [values["AliveCounter"] for values in said] == [k % 16 for k in range(len(said))]
-    known = [
-        k for k, values in enumerate(said) if str(values["LateralVelocity"]) != "not available"
+    sent = [values for frame, values in frames if frame.arbitration_id == 0x321]
+    assert len(sent) == len(table) == len(frames) / 2
+    assert [values["AliveCounter"] for values in sent] == [k % 16 for k in range(len(sent))]
+    available = [
+        k for k, values in enumerate(sent) if str(values["LateralVelocity"]) != "not available"
     ]
-    assert known == np.flatnonzero(table["vy"].notna()).tolist()
+    assert available == np.flatnonzero(table["vy"].notna()).tolist()
     np.testing.assert_allclose(
-        [said[k]["LateralVelocity"] for k in known], table["vy"].iloc[known], atol=0.0003
+        [sent[k]["LateralVelocity"] for k in available], table["vy"].iloc[available], atol=0.0003
     )
     np.testing.assert_allclose(
-        [said[k]["SideslipAngle"] for k in known],
-        np.degrees(table["sideslip"].iloc[known]),
+        [sent[k]["SideslipAngle"] for k in available],
+        np.degrees(table["sideslip"].iloc[available]),
         atol=0.0003,
     )
 
@@ -132,20 +134,21 @@ def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path):
 
 
 @pytest.mark.parametrize("speed", ["max", "1"])
-def test_what_was_written_before_a_stop_is_kept(tmp_path, speed):
+def test_estimates_written_before_a_stop_remain(tmp_path, speed):
     written = write_log(drive(), tmp_path)
     calls = iter(range(10_000))
-    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "out": tmp_path / "out.csv"}
+    words = {"dbc": written.dbc, "signals": signals_for(CHANNELS), "out": tmp_path / "out.csv"}
     figures = replay_log(written.log, stopped=lambda: next(calls) > 300, speed=speed, **words)
     assert figures["stopped"]
     assert 0 < figures["samples"] < 2000
     assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]
 
 
-def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_as_words_do(
+def test_signals_named_like_channels_need_no_map_and_a_data_set_equals_words(
     tmp_path,
 ):
-    text = 'VERSION ""\n\nBO_ 5 A: 8 X\n SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
+    text = 'VERSION ""\n\nBO_ 5 A: 8 X\n'
+    text += ' SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
     (tmp_path / "own.dbc").write_text(text)
     assert from_names(tmp_path / "own.dbc", ["vx", "ay"]).factors == {
         "vx": 1.0,
@@ -170,34 +173,37 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
     }
     maps = (
         from_dataset(dataset, CHANNELS),
-        from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(",")),
+        from_names(written.dbc, CHANNELS, words=signals_for(CHANNELS).split(",")),
     )
     declared, named = (
         (
-            own.factors,
-            {name: (one.message.name, one.signal) for name, one in own.by_channel.items()},
+            signal_map.factors,
+            {
+                name: (mapped_signal.message.name, mapped_signal.signal)
+                for name, mapped_signal in signal_map.by_channel.items()
+            },
         )
-        for own in maps
+        for signal_map in maps
     )
     assert declared == named
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ({"signals": "ay"}, "takes CHANNEL=MESSAGE.SIGNAL"),
         ({"signals": "steer=SteerAng"}, "'steer', which the model does not read"),
         ({"signals": "vx=VehSpd"}, "reads channel 'yaw_rate', and no signal"),
         (
-            {"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")},
+            {"signals": signals_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")},
             "'parsec' of signal 'Speed.VehSpd' is no unit",
         ),
         (
-            {"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")},
+            {"signals": signals_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")},
             "is in 'km/h' by the file and in 'm/s'",
         ),
         (
-            {"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")},
+            {"signals": signals_for(CHANNELS).replace("Speed.VehSpd", "Counter")},
             "stands in several messages",
         ),
         ({"dbc": None}, "nothing describes the bus"),
@@ -216,9 +222,9 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
         ({"model": "nothing"}, "there is no model 'nothing'"),
     ],
 )
-def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
+def test_senseless_options_are_refused_in_a_line(tmp_path, words, message):
     written = write_log(drive(2.0), tmp_path)
-    with pytest.raises(VehestError, match=said) as caught:
+    with pytest.raises(VehestError, match=message) as caught:
         replayed(written, **words)
     assert "\n" not in str(caught.value)
     assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
@@ -232,7 +238,7 @@ def test_an_output_that_links_to_itself_is_refused(tmp_path):
         replayed(written, out=out)
 
 
-def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(
+def test_a_damaged_log_ends_a_replay_in_a_line_and_is_never_overwritten(
     tmp_path,
 ):
     written = write_log(drive(2.0), tmp_path)
@@ -260,28 +266,29 @@ def test_the_view_shows_estimate_band_health_and_reason_in_a_line_every_ten_seco
         "band_vy": 0.1,
         "band_sideslip": math.radians(0.5),
     }
-    for view, shown in (
+    for view, estimate in (
         (View(stream), {**values, "health": 2.0, "health_reason": 3e5}),
         (View(stream), {}),
         (View(None), {}),
     ):
-        view.show(FIGURES, shown, 10.1)
-        view.show(FIGURES, shown, 10.2)
+        view.show(FIGURES, estimate, 10.1)
+        view.show(FIGURES, estimate, 10.2)
     first, second = stream.getvalue().splitlines()
     assert first.startswith(
-        "time 10.1 s, v +0.500 ± 0.100 m/s, β -1.25 ± 0.50 °, health invalid: there is no estimate, 2 estimates, "
+        "time 10.1 s, v +0.500 ± 0.100 m/s, β -1.25 ± 0.50 °, "
+        "health invalid: there is no estimate, 2 estimates, "
     )
     assert second.startswith("time 10.1 s, v -, β -, health -, ")
 
 
 def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root, tmp_path):
     assert data_root.is_dir()
-    found = compare("pretrained", ferrari(*FERRARI), tmp_path)
-    assert found.lost > 200  # of 15,000 samples and two messages, 1 % each
-    assert max(found.ratios) < 1.05
+    comparison = compare("pretrained", ferrari(*FERRARI), tmp_path)
+    assert comparison.lost > 200  # of 15,000 samples and two messages, 1 % each
+    assert max(comparison.ratios) < 1.05
 
 
-def test_a_stray_stamp_in_a_log_is_refused_before_a_sample_or_a_file_is_made(tmp_path):
+def test_a_stray_stamp_in_a_log_is_refused_before_anything_is_written(tmp_path):
     written = write_log(drive(), tmp_path, ".log")
     lines = written.log.read_text().splitlines(keepends=True)
     at = len(lines) * 3 // 4

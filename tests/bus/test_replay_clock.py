@@ -1,4 +1,6 @@
-"""Stamps of a log's frames that stand still, jump or go back: invalid after 0.2 s with a reason, as online."""
+"""Stamps of a log's frames that stand still, jump or go back: invalid after 0.2 s with a reason, as
+online.
+"""
 
 import numpy as np
 import pandas as pd
@@ -13,7 +15,7 @@ pytest.importorskip("can", reason="python-can is not installed: pip install 'veh
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
 
 from can_drive import write_log
-from replayed_drive import told_for
+from replayed_drive import signals_for
 
 from clock_faults import faulted_times
 
@@ -42,7 +44,7 @@ def replayed(folder, kind):
         for line, cycle in zip(lines, cycles, strict=True)
     ]
     written.log.write_text("\n".join(faulty) + "\n", encoding="utf-8")
-    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max"}
+    words = {"dbc": written.dbc, "signals": signals_for(CHANNELS), "speed": "max"}
     replay_log(written.log, out=folder / "out.csv", **words)
     return pd.read_csv(folder / "out.csv")
 
@@ -69,7 +71,7 @@ def test_stamps_of_frames_that_fail_make_the_estimate_invalid_with_a_reason(tmp_
 
 def test_right_stamps_with_jitter_are_not_suspected(tmp_path):
     written = write_log(planar_drive(SECONDS, RATE, seed=3), tmp_path, jitter=0.001, lost=0.02)
-    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max"}
+    words = {"dbc": written.dbc, "signals": signals_for(CHANNELS), "speed": "max"}
     replay_log(written.log, out=tmp_path / "out.csv", **words)
     reasons = pd.read_csv(tmp_path / "out.csv")["health_reason"].astype(str)
     assert not reasons.str.startswith("the time stamps").any()

@@ -1,4 +1,6 @@
-"""`vehest replay` as people call it: figures, files, one line for what is wrong, and a clean end by Ctrl-C."""
+"""`vehest replay` as people call it: figures, files, one line for what is wrong, and a clean end by
+Ctrl-C.
+"""
 
 import json
 import signal
@@ -14,9 +16,9 @@ pytest.importorskip("can", reason="python-can is not installed: pip install 'veh
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
 
 from can_drive import SIGNALS, write_log
-from replayed_drive import told_for
+from replayed_drive import signals_for
 
-TOLD = told_for(("vx", "yaw_rate", "ax", "ay"))
+SIGNAL_OPTION = signals_for(("vx", "yaw_rate", "ax", "ay"))
 
 
 @pytest.fixture
@@ -44,12 +46,12 @@ def bus(place):
     return place
 
 
-def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_in_plain_lines(bus):
+def test_replay_prints_json_writes_a_table_and_reports_progress_in_plain_lines(bus):
     words = (
         "--dbc",
         "raw/bus/car.dbc",
         "--signals",
-        TOLD,
+        SIGNAL_OPTION,
         "--speed",
         "max",
         "--json",
@@ -67,7 +69,7 @@ def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_
         "--dbc",
         "raw/bus/car.dbc",
         "--signals",
-        TOLD,
+        SIGNAL_OPTION,
         "--speed",
         "max",
         "--quiet",
@@ -84,7 +86,7 @@ def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_
         "--dbc",
         "raw/bus/car.dbc",
         "--signals",
-        TOLD,
+        SIGNAL_OPTION,
         "--speed",
         "max",
     )
@@ -92,7 +94,7 @@ def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_
     assert "\x1b" not in err
 
 
-def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_line(bus):
+def test_a_data_set_serves_replays_and_estimates_and_faults_are_a_line(bus):
     code, _, err = bus(
         "replay",
         "raw/bus/drive.asc",
@@ -114,13 +116,22 @@ def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_
     assert bus.refused("replay", "raw/bus/car.dbc", "--dataset", "bus")[0] == 3
 
 
-def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus, monkeypatch):
+def test_ctrl_c_ends_with_figures_and_the_written_estimates(bus, monkeypatch):
     def interrupt(self, figures, values, seconds):
         if figures.samples == 400:
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(View, "show", interrupt)
-    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "-o", "out.csv")
+    words = (
+        "--dbc",
+        "raw/bus/car.dbc",
+        "--signals",
+        SIGNAL_OPTION,
+        "--speed",
+        "max",
+        "-o",
+        "out.csv",
+    )
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert code == 130
     assert "stopped: True" in out

@@ -1,4 +1,6 @@
-"""The ROS 2 node of the documentation, without ROS: messages of a bag go through it and come back as they were."""
+"""The ROS 2 node of the documentation, without ROS: messages of a bag go through it and come back
+as they were.
+"""
 
 import math
 import runpy
@@ -30,34 +32,34 @@ def node():
 
 @pytest.fixture(scope="module")
 def types():
-    found = get_typestore(Stores.ROS2_HUMBLE)
-    found.register(get_types_from_msg((EXAMPLE / "msg" / "SideslipEstimate.msg").read_text(), KIND))
-    return found
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg((EXAMPLE / "msg" / "SideslipEstimate.msg").read_text(), KIND))
+    return store
 
 
-def made(types, kind, **fields):
+def ros_message(types, kind, **fields):
     return types.types[kind](**fields)
 
 
 def header(types, time):
     nanoseconds = START * 10**9 + round(1e9 * time)
-    stamp = made(
+    stamp = ros_message(
         types, "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
     )
-    return made(types, "std_msgs/msg/Header", stamp=stamp, frame_id="base_link")
+    return ros_message(types, "std_msgs/msg/Header", stamp=stamp, frame_id="base_link")
 
 
 def vector(types, x=0.0, y=0.0, z=0.0):
-    return made(types, "geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+    return ros_message(types, "geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def imu(types, time, yaw_rate, ax, ay):
     nothing = np.zeros(9)
-    return made(
+    return ros_message(
         types,
         "sensor_msgs/msg/Imu",
         header=header(types, time),
-        orientation=made(types, "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation=ros_message(types, "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=nothing,
         angular_velocity=vector(types, z=yaw_rate),
         angular_velocity_covariance=nothing,
@@ -67,8 +69,12 @@ def imu(types, time, yaw_rate, ax, ay):
 
 
 def speed(types, time, vx):
-    twist = made(types, "geometry_msgs/msg/Twist", linear=vector(types, vx), angular=vector(types))
-    return made(types, "geometry_msgs/msg/TwistStamped", header=header(types, time), twist=twist)
+    twist = ros_message(
+        types, "geometry_msgs/msg/Twist", linear=vector(types, vx), angular=vector(types)
+    )
+    return ros_message(
+        types, "geometry_msgs/msg/TwistStamped", header=header(types, time), twist=twist
+    )
 
 
 def through(types, message):
@@ -94,17 +100,17 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path,
                 types, imu(types, k / 100, *(drive[name][k] for name in ("yaw_rate", "ax", "ay")))
             )
         )
-        said = stepper.step(sample, time)
+        step = stepper.step(sample, time)
         plain = bare.step({name: drive[name][k] for name in ("vx", "yaw_rate", "ax", "ay")})
-        if said is not last:
-            last = said
+        if step is not last:
+            last = step
             expected.append(plain["vy"])
             sent.append(
-                made(
+                ros_message(
                     types,
                     KIND,
                     header=header(types, time - START + node.ahead_of(stepper)),
-                    **node.fields_of(said),
+                    **node.fields_of(step),
                 )
             )
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
@@ -112,20 +118,20 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path,
         for k, message in enumerate(sent):
             bag.write(topic, START * 10**9 + k, types.serialize_cdr(message, KIND))
     with Reader(tmp_path / "bag") as bag:
-        got = [types.deserialize_cdr(raw, KIND) for _, _, raw in bag.messages()]
-    assert len(got) == len(expected) == 400
-    np.testing.assert_array_equal([message.lateral_velocity for message in got], expected)
-    assert [message.reason for message in got] == [message.reason for message in sent]
-    assert {message.health for message in got[100:]} <= {
+        received = [types.deserialize_cdr(raw, KIND) for _, _, raw in bag.messages()]
+    assert len(received) == len(expected) == 400
+    np.testing.assert_array_equal([message.lateral_velocity for message in received], expected)
+    assert [message.reason for message in received] == [message.reason for message in sent]
+    assert {message.health for message in received[100:]} <= {
         types.types[KIND].VALID,
         types.types[KIND].DEGRADED,
         types.types[KIND].INVALID,
     }
-    held = node.seconds(got[-1].header.stamp) - START
-    assert held == pytest.approx(19.95 + 1 / 20 - stepper.delay, abs=1e-6)
+    last_time = node.seconds(received[-1].header.stamp) - START
+    assert last_time == pytest.approx(19.95 + 1 / 20 - stepper.delay, abs=1e-6)
 
 
-def test_a_speed_that_is_too_old_counts_as_not_measured_and_what_there_is_not_is_nan(node, types):
+def test_an_outdated_speed_counts_as_not_measured_and_absent_fields_are_nan(node, types):
     samples = node.Samples()
     assert math.isnan(samples.imu(imu(types, 0.0, 0.1, 0.0, 1.0))[1]["vx"])
     samples.speed(speed(types, 0.0, 20.0))

@@ -22,19 +22,19 @@ def arrivals(n=2000, phase=0.003, jitter=0.0, period=CYCLE, seed=0):
 
 def run(timing, frames, until):
     sampler = Sampler(timing)
-    found = []
+    samples = []
     for stamp, values in sorted(frames, key=lambda frame: frame[0]):
         while sampler.next_time < stamp:
             sample = sampler.sample()
-            found.append((sample.time, dict(sample.values), sample.missing))
+            samples.append((sample.time, dict(sample.values), sample.missing))
         sampler.take(values, stamp)
     while sampler.next_time < until:
         sample = sampler.sample()
-        found.append((sample.time, dict(sample.values), sample.missing))
-    return found
+        samples.append((sample.time, dict(sample.values), sample.missing))
+    return samples
 
 
-def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle_and_a_rate_that_is_none_is_refused():
+def test_instants_lie_in_the_longest_pause_of_a_cycle():
     timing = timing_of(
         {"ay": arrivals(phase=0.001), "vx": arrivals(phase=0.003), "steer": arrivals(phase=0.002)}
     )
@@ -50,26 +50,26 @@ def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle_and_a_rate_t
     )
 
 
-def test_every_frame_is_in_one_sample_however_it_jitters_or_its_clock_is_wrong_by_100_ppm():
+def test_every_frame_is_in_a_single_sample_despite_jitter_and_clock_error():
     stamps = arrivals(jitter=0.005, seed=4)
     timing = timing_of({"ay": stamps})
-    found = run(
+    samples = run(
         timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(stamps)], stamps[-1] + 0.002
     )
-    values = [sample["ay"] for _, sample, missing in found if not missing]
+    values = [sample["ay"] for _, sample, missing in samples if not missing]
     assert len(values) >= len(stamps) - 2
     assert np.diff(values).min() == np.diff(values).max() == 1.0
     stamps = arrivals(n=60_000, period=CYCLE * (1 + 1e-4))  # ten minutes, 60 ms of drift
-    found = run(
+    samples = run(
         Timing(100.0, {"ay": CYCLE}, "ay", 0.005, 0.008),
         [(stamp, {"ay": 1.0}) for stamp in stamps],
         stamps[-1],
     )
-    assert not any(missing for _, _, missing in found)
-    assert len(found) == pytest.approx(len(stamps), abs=1)
+    assert not any(missing for _, _, missing in samples)
+    assert len(samples) == pytest.approx(len(stamps), abs=1)
 
 
-def test_lost_frames_are_missing_samples_and_a_late_one_is_superseded_at_the_next():
+def test_lost_frames_are_missing_samples_and_a_late_frame_is_superseded():
     stamps = arrivals(jitter=0.001)
     lost = {50, 51, 700, 1203}
     timing = timing_of({"ay": stamps, "vx": stamps})
@@ -77,20 +77,20 @@ def test_lost_frames_are_missing_samples_and_a_late_one_is_superseded_at_the_nex
         (stamp, {"ay": float(k)} if k in lost else {"ay": float(k), "vx": float(k)})
         for k, stamp in enumerate(stamps)
     ]
-    found = run(timing, frames, stamps[-1])
-    assert {int(values["ay"]) for _, values, missing in found if missing == ["vx"]} == lost
-    assert all("vx" not in values for _, values, missing in found if missing)
+    samples = run(timing, frames, stamps[-1])
+    assert {int(values["ay"]) for _, values, missing in samples if missing == ["vx"]} == lost
+    assert all("vx" not in values for _, values, missing in samples if missing)
     stamps = arrivals()
     timing = timing_of({"ay": stamps})
     late = stamps.copy()
     late[100] += 0.9 * CYCLE  # its instant is half a cycle after it was due
-    found = run(timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(late)], late[-1])
-    numbers = [values.get("ay") for _, values, _ in found]
+    samples = run(timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(late)], late[-1])
+    numbers = [values.get("ay") for _, values, _ in samples]
     at = numbers.index(99.0)
     assert numbers[at : at + 3] == [99.0, None, 101.0]
 
 
-def test_slower_messages_hold_for_their_own_period_and_no_longer():
+def test_slower_messages_are_valid_for_their_period_only():
     fast = arrivals()
     slow = arrivals(n=400, phase=0.0031, period=0.05)
     timing = timing_of({"ay": fast, "vx": slow})

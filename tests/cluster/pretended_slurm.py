@@ -1,6 +1,8 @@
-"""A queue that answers to SLURM's commands and runs two jobs at a time on this machine: enough of them for submitit.
+"""A queue that answers to SLURM's commands and runs two jobs at a time on this machine: enough of
+them for submitit.
 
-Jobs stand in a folder as files: ``ID_INDEX.json`` with state and process. `install` writes the commands, which call this file.
+Jobs stand in a folder as files: ``ID_INDEX.json`` with state and process. `install` writes the
+commands, which call this file.
 """
 
 import json
@@ -25,21 +27,24 @@ def install(folder):
     for name in COMMANDS:
         file = commands / name
         file.write_text(
-            f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).resolve()}" "{folder}" {name} "$@"\n'
+            f'#!/bin/sh\nexec "{sys.executable}" "{Path(__file__).resolve()}" '
+            f'"{folder}" {name} "$@"\n'
         )
         file.chmod(0o755)
     return {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
 
 
 def _file(folder, job):
+    """File of a job in the queue."""
     return folder / f"{job}.json"
 
 
 def _set(folder, job, **values):
+    """Change entries of a job, in one step for whoever reads it."""
     file = _file(folder, job)
-    known = json.loads(file.read_text()) if file.is_file() else {}
+    former = json.loads(file.read_text()) if file.is_file() else {}
     aside = file.with_suffix(f".{os.getpid()}")
-    aside.write_text(json.dumps({**known, **values}))
+    aside.write_text(json.dumps({**former, **values}))
     aside.replace(file)
 
 
@@ -50,11 +55,13 @@ def states(folder):
 
 def sbatch(folder, script):
     """Queue the jobs of an array, each with a process that waits for its turn."""
-    found = re.search(r"^#SBATCH --array=0-(\d+)", Path(script).read_text(), re.MULTILINE)
+    array_range = re.search(r"^#SBATCH --array=0-(\d+)", Path(script).read_text(), re.MULTILINE)
     job = str(1 + max((int(name.partition("_")[0]) for name in states(folder)), default=0))
-    for own in [f"{job}_{index}" for index in range(int(found[1]) + 1)] if found else [job]:
-        _set(folder, own, state="PENDING")
-        words = [sys.executable, __file__, str(folder), "turn", script, own]
+    for job_id in (
+        [f"{job}_{index}" for index in range(int(array_range[1]) + 1)] if array_range else [job]
+    ):
+        _set(folder, job_id, state="PENDING")
+        words = [sys.executable, __file__, str(folder), "turn", script, job_id]
         subprocess.Popen(
             words,
             stdin=subprocess.DEVNULL,
@@ -65,10 +72,10 @@ def sbatch(folder, script):
     print(f"Submitted batch job {job}")
 
 
-def turn(folder, script, own):
+def turn(folder, script, job_id):
     """Run one job when there is room, and again whenever it is put back."""
-    job, _, index = own.partition("_")
-    variables = {"JOB_ID": own, "PROCID": "0", "LOCALID": "0", "NTASKS": "1", "NODEID": "0"}
+    job, _, index = job_id.partition("_")
+    variables = {"JOB_ID": job_id, "PROCID": "0", "LOCALID": "0", "NTASKS": "1", "NODEID": "0"}
     variables |= {"ARRAY_JOB_ID": job, "ARRAY_TASK_ID": index} if index else {}
     environment = {
         **os.environ,
@@ -78,16 +85,16 @@ def turn(folder, script, own):
     while True:
         while sum(state == "RUNNING" for state in states(folder).values()) >= AT_A_TIME:
             time.sleep(MOMENT)
-        if states(folder)[own] == "CANCELLED":
+        if states(folder)[job_id] == "CANCELLED":
             return
-        _set(folder, own, state="RUNNING")
+        _set(folder, job_id, state="RUNNING")
         process = subprocess.Popen(["bash", script], env=environment, start_new_session=True)
-        _set(folder, own, process=process.pid)
+        _set(folder, job_id, process=process.pid)
         code = process.wait()
-        if states(folder)[own] != "REQUEUED":
+        if states(folder)[job_id] != "REQUEUED":
             break
-    if states(folder)[own] != "CANCELLED":
-        _set(folder, own, state="COMPLETED" if code == 0 else "FAILED")
+    if states(folder)[job_id] != "CANCELLED":
+        _set(folder, job_id, state="COMPLETED" if code == 0 else "FAILED")
 
 
 def srun(folder, *words):

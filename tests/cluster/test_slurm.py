@@ -1,4 +1,6 @@
-"""SLURM jobs against the local launcher: by processes that submitit starts itself, and by a queue that answers to SLURM's commands."""
+"""SLURM jobs against the local launcher: by processes that submitit starts itself, and by a queue
+that answers to SLURM's commands.
+"""
 
 import importlib.util
 import os
@@ -33,7 +35,7 @@ def with_a_checkpoint(output, but=None):
     )
 
 
-def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, alone, tmp_path):  # noqa: F811
+def test_processes_of_this_machine_equal_the_local_launcher(folder, alone, tmp_path):  # noqa: F811
     output = with_recordings(alone["forty"], tmp_path / "out")
     Driver(
         folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2"
@@ -73,7 +75,7 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(
     assert set(states(queue).values()) <= {"COMPLETED", "FAILED"}
 
 
-def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
+def test_ctrl_c_takes_jobs_back_until_the_next_call(folder, alone, queue, tmp_path):  # noqa: F811
     output = with_recordings(alone["longer"], tmp_path / "out")
     environment = install(queue)
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)

@@ -1,4 +1,7 @@
-"""Two Ray nodes against the local launcher: the same bits, whatever dies on the way; nothing that finished is made again."""
+"""Two Ray nodes against the local launcher: the same bits, whatever dies on the way.
+
+Nothing that finished is made again.
+"""
 
 import importlib.util
 import os
@@ -60,7 +63,9 @@ def folder(tmp_path_factory):
 
 
 class Alone(dict[str, Path]):
-    """Output roots of the same sweeps by the local launcher, each made when it is first asked for."""
+    """Output roots of the same sweeps by the local launcher, each made when it is first
+    asked for.
+    """
 
     def __init__(self, folder):
         super().__init__()
@@ -220,12 +225,10 @@ def test_nodes_that_do_not_share_the_output_root_get_copies_and_send_artefacts_b
     )
 
 
-def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(
-    cluster, folder, alone, tmp_path
-):
+def test_a_group_that_ends_every_worker_fails_alone(cluster, folder, alone, tmp_path):
     output = with_recordings(alone["longer"], tmp_path / "out")
-    one_seed = (*(word for word in LONGER if not word.startswith("seed=")), "seed=0")
-    driver = swept(cluster, folder, output, *one_seed)
+    single_seed = (*(word for word in LONGER if not word.startswith("seed=")), "seed=0")
+    driver = swept(cluster, folder, output, *single_seed)
     poisoned = driver.sees(lambda: under_way(output))[0]["name"]
     killed = set()
     for _ in range(3):
@@ -240,7 +243,7 @@ def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(
     driver.ends(5)
     assert "3 times; --launcher local shows what ends it" in driver.said
     assert len(metrics(output)) == 3
-    swept(cluster, folder, output, *one_seed).ends()
+    swept(cluster, folder, output, *single_seed).ends()
     assert len(metrics(output)) == 4
     assert metrics(output).items() <= metrics(alone["longer"]).items()
 

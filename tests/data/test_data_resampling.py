@@ -45,7 +45,7 @@ def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
     np.testing.assert_array_equal(
         sinc, signal.firwin(2 * half + 1, 0.86 / max(up, down), window=("kaiser", 7.0))
     )
-    taps = Resample(new_rate)._taps(up, down)
+    taps = Resample(new_rate).taps(up, down)
     margin = -(-(half // up + 1) // down) * down
     extended = (
         np.pad(samples, margin, mode="reflect", reflect_type="odd")

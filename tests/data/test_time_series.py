@@ -2,11 +2,13 @@
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from conftest import planar_drive
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.inference.tables import write_estimate_table
 
 
 @pytest.fixture
@@ -41,5 +43,30 @@ def test_dataframe_has_the_samples_on_their_times_and_their_units(recording):
     assert frame.attrs["units"] == {"time": "s", "vx": "m/s", "ay": "m/s²"}
     frame.loc[4.0, "vx"] = 0.0
     assert recording["vx"][0] == 20.0
-    estimate = Estimate("lap", "zero", 50.0, 4.0, dict.fromkeys(("vy", "sideslip"), np.ones(3)))
-    assert estimate.to_pandas().attrs["units"] == {"time": "s", "vy": "m/s", "sideslip": "rad"}
+
+
+def test_dataframe_of_an_estimate_is_the_table_that_is_written(tmp_path):
+    angle = np.array([0.0, np.pi / 6.0, np.nan])
+    estimate = Estimate(
+        "lap",
+        "kalman",
+        50.0,
+        4.0,
+        {"vy": np.ones(3), "sideslip": angle, "band_sideslip": np.full(3, np.pi / 180.0)},
+        covariance=np.array([np.diag([variance, 4.0]) for variance in (1.0, 2.0, 3.0)]),
+        covariance_of=("vy", "yaw_rate"),
+    )
+    frame = estimate.to_pandas()
+    assert frame.index.tolist() == [4.0, 4.02, 4.04]
+    assert np.allclose(frame["sideslip_deg"], [0.0, 30.0, np.nan], equal_nan=True)
+    assert np.allclose(frame["band_sideslip_deg"], 1.0)
+    assert frame["covariance_0_0"].tolist() == [1.0, 2.0, 3.0]
+    assert frame.attrs["units"]["sideslip_deg"] == "deg"
+    assert frame.attrs["units"]["covariance_0_1"] == "m/s·rad/s"
+    write_estimate_table([estimate], tmp_path / "out.parquet")
+    table = pq.read_table(tmp_path / "out.parquet")
+    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    assert frame.attrs["units"] == units
+    assert ["time", *frame.columns] == table.column_names
+    for name in frame:
+        np.testing.assert_array_equal(frame[name], table[name].to_numpy())

@@ -9,6 +9,7 @@ import torch
 
 
 def _digest(tensors):
+    """SHA-256 of the bytes of some tensors."""
     return hashlib.sha256(
         b"".join(tensor.detach().numpy().tobytes() for tensor in tensors)
     ).hexdigest()

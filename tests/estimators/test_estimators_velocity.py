@@ -252,7 +252,7 @@ def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name, monk
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     drive = _drive(seed=5).without_references()
     undivided = estimator.estimate([drive])[0]
-    monkeypatch.setattr(velocity_recurrent, "CHUNK", 37)
+    monkeypatch.setattr(velocity_recurrent, "SAMPLES_TOGETHER", 37)
     pieces = estimator.estimate([drive])[0]
     for quantity in ("vx", "vy", "yaw_rate"):
         assert np.abs(undivided[quantity] - pieces[quantity]).max() < 1e-12

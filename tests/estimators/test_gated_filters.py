@@ -115,7 +115,7 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
     at = round(SPIKE * 100.0)
 
     def sure(inputs):
-        return pseudo_of(inputs)._replace(variance=np.full(len(inputs), 1e-4))
+        return replace(pseudo_of(inputs), variance=np.full(len(inputs), 1e-4))
 
     monkeypatch.setattr(gated, "pseudo_of", sure)
     clean = vy(gated, drive("cnn_ukf"))
@@ -124,7 +124,7 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
         pseudo = sure(inputs)
         angle = pseudo.sideslip.copy()
         angle[at] += 1.0
-        return pseudo._replace(sideslip=angle)
+        return replace(pseudo, sideslip=angle)
 
     monkeypatch.setattr(gated, "pseudo_of", wild)
     assert np.abs(vy(gated, drive("cnn_ukf")) - clean).max() < 0.1

@@ -316,8 +316,9 @@ def test_removed_variances_are_constant_over_samples(away, constant_value):
     elif away == "pseudo_measurement":
         np.testing.assert_allclose(word.variance, 1.0, rtol=1e-5)
         alone = filter_alone(estimator).estimate([DATA.validation[0].without_references()])[0]["vy"]
-        constant = word._replace(
-            process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone))
+        constant = replace(
+            word,
+            process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone)),
         )
         ((_, steps),) = estimator.filtered([DATA.validation[0]], pseudo=[constant])
         mean = steps.filtered.mean.numpy()

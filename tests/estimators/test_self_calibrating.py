@@ -1,4 +1,6 @@
-"""The self-calibrating filter against a plain filter in NumPy, the network itself, and cars whose numbers are known."""
+"""The self-calibrating filter against a plain filter in NumPy, the network itself, and cars whose
+numbers are known.
+"""
 
 import pickle
 
@@ -28,7 +30,9 @@ def drive(
     delay=0.0,
     angle=1.0,
 ):
-    """A car whose rear axle is as the filter assumes, below the limit, at a changing speed: samples (T, 4) and vy (T,)."""
+    """A car whose rear axle is as the filter assumes, below the limit, at a changing speed: samples
+    (T, 4) and vy (T,).
+    """
     fine = 10
     rng = np.random.default_rng(seed)
     dt = 1.0 / (RATE * fine)
@@ -52,7 +56,7 @@ def drive(
     ax = np.gradient(speed, dt) - yaw_rate * v
     measured = np.column_stack([yaw_rate, speed, (ay + offset) / (1.0 - leakage), ax + 0.05])
     measured = np.column_stack(
-        [np.convolve(one, np.ones(fine) / fine, mode="same") for one in measured.T]
+        [np.convolve(signal, np.ones(fine) / fine, mode="same") for signal in measured.T]
     )
     late = np.interp(t - delay, t, measured[:, 0])
     samples = np.column_stack([late, measured[:, 1:]])[::fine]
@@ -61,7 +65,10 @@ def drive(
 
 
 def plain_filter(model, samples):
-    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone."""
+    """One filter of the bank with matrices, its axle's derivatives by central differences.
+
+    The size of its error from itself alone.
+    """
     n = model.numbers()
     (mean, deviation) = model.prior
     grip = model.grips[0]
@@ -85,7 +92,7 @@ def plain_filter(model, samples):
     smooth = samples[0].copy()
     sums = np.zeros(3)
     last = samples[0]
-    found = np.empty((len(samples), 8))
+    results = np.empty((len(samples), 8))
 
     def curve(force):
         limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
@@ -154,9 +161,9 @@ def plain_filter(model, samples):
                 change[5, 5] = 0.0
             x = x + gain * residual
             p = p - change
-        found[t] = x
+        results[t] = x
         last = sample
-    return found
+    return results
 
 
 def model_of(**settings):
@@ -167,7 +174,7 @@ def model_of(**settings):
 @pytest.mark.parametrize(
     "samples", [drive(20.0)[0], slide_after(drive(20.0)[0])], ids=["steady", "slide"]
 )
-def test_filter_of_one_grip_limit_matches_plain_matrices(samples):
+def test_filter_of_a_single_grip_limit_matches_plain_matrices(samples):
     model = model_of(grips=[14.0], imu_to_rear_axle=None)
     _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
     expected = plain_filter(model, samples)
@@ -178,13 +185,13 @@ def test_filter_of_one_grip_limit_matches_plain_matrices(samples):
 def test_a_slide_is_not_taken_for_the_place_of_the_unit():
     samples = slide_after(drive(20.0)[0])
     model = model_of(imu_to_rear_axle=None)
-    _, found, _ = model.trace(samples, model.first_state(samples[0], {}))
-    places = found[-61:, kernel.REAR]
+    _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
+    places = states[-61:, kernel.REAR]
     assert places[0] == pytest.approx(1.3, abs=0.5)
     assert places.min() > 0.0  # -0.4 m where b is adapted in the slide, too
 
 
-def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing():
+def test_network_inside_is_the_pretrained_network_and_ax_may_be_missing():
     samples, _ = drive(10.0)
     recording = Recording(
         "a", "a", RATE, 0.0, dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True))
@@ -204,20 +211,20 @@ def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing(
     samples, vy = drive(60.0)
     model = model_of(measured_ax=False)
     assert model.channels == ("yaw_rate", "vx", "ay")
-    found, _, _ = model.trace(samples[:, :3], model.first_state(samples[0, :3], {}))
-    assert np.std(found[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
+    without_ax, _, _ = model.trace(samples[:, :3], model.first_state(samples[0, :3], {}))
+    assert np.std(without_ax[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
 
 
 def test_filters_do_not_depend_on_their_lanes():
     samples, _ = drive(20.0)
     grips = np.linspace(4.0, 25.0, 12)
     order = np.random.default_rng(0).permutation(12)
-    models = [model_of(grips=own.tolist()) for own in (grips, grips[order])]
-    (found, states, last), (other, of_other, permuted) = (
+    models = [model_of(grips=limits.tolist()) for limits in (grips, grips[order])]
+    (outputs, states, last), (permuted_outputs, of_other, permuted) = (
         model.trace(samples, model.first_state(samples[0], {})) for model in models
     )
     np.testing.assert_allclose(
-        np.hstack([found, states]), np.hstack([other, of_other]), rtol=1e-8, atol=1e-12
+        np.hstack([outputs, states]), np.hstack([permuted_outputs, of_other]), rtol=1e-8, atol=1e-12
     )
     np.testing.assert_allclose(last.means[:12][order], permuted.means[:12], rtol=1e-8, atol=1e-12)
     np.testing.assert_array_equal(last.covariances, last.covariances.transpose(0, 2, 1))
@@ -243,9 +250,9 @@ def test_finds_the_rear_axle_and_tells_how_well():
         _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
         last = states[-1]
         late = slice(round(30.0 * RATE), None)
-        known = {kernel.COMPLIANCE: truth["compliance"], kernel.LEAKAGE: truth["leakage"]}
+        true_values = {kernel.COMPLIANCE: truth["compliance"], kernel.LEAKAGE: truth["leakage"]}
         z_scores += [
-            (last[state] - value) / np.sqrt(last[8 + state]) for state, value in known.items()
+            (last[state] - value) / np.sqrt(last[8 + state]) for state, value in true_values.items()
         ]
         steady = samples[:, 0] * (model.rear - model.compliance * samples[:, 1] ** 2)
         shares.append(np.std(states[late, kernel.V] - vy[late]) / np.std(vy[late]))
@@ -273,16 +280,16 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     straight += np.random.default_rng(0).normal(size=straight.shape) * [0.001, 0.05, 0.03, 0.03]
     model = model_of()
     mean, deviation = model.prior
-    found, states, _ = model.trace(straight, model.first_state(straight[0], {}))
+    outputs, states, _ = model.trace(straight, model.first_state(straight[0], {}))
     for state in (kernel.LEAKAGE, kernel.REAR, kernel.COMPLIANCE):
         assert abs(states[-1, state] - mean[state]) < 0.5 * deviation[state]
         assert np.sqrt(states[-1, 8 + state]) > 0.7 * deviation[state]
-    assert np.abs(found[:, 0]).max() < np.radians(0.3) * 30.0
+    assert np.abs(outputs[:, 0]).max() < np.radians(0.3) * 30.0
     samples, _ = drive(20.0)
     parked = np.column_stack([np.zeros((400, 2)), np.full(400, 0.3), np.full(400, 0.2)])
     _, moved, state = model.trace(samples, model.first_state(samples[0], {}))
-    found, states, _ = model.trace(parked, state)
-    assert np.abs(found[40:, 0]).max() < 0.02
+    outputs, states, _ = model.trace(parked, state)
+    assert np.abs(outputs[40:, 0]).max() < 0.02
     np.testing.assert_array_equal(states[40:, kernel.COMPLIANCE], states[40, kernel.COMPLIANCE])
     assert states[-1, kernel.COMPLIANCE] == pytest.approx(moved[-1, kernel.COMPLIANCE], rel=1e-9)
     model = SelfCalibrating.from_config({"cg_to_rear_axle": 1.3})
@@ -297,37 +304,40 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
 
 
 @pytest.mark.parametrize("place", [-0.5, 0.3, 1.3, 2.4])
-def test_place_of_the_inertial_unit_is_identified_where_it_is_not_given(place):
-    """From half a metre behind the rear axle to near the front axle; v is that of the inertial unit."""
+def test_place_of_the_inertial_unit_is_identified_if_not_configured(place):
+    """From half a metre behind the rear axle to near the front axle.
+
+    The estimated v is that of the inertial unit.
+    """
     samples, vy = drive(90.0, 1, rear=place)
     model = model_of(cg_to_rear_axle=None, imu_to_rear_axle=None)
     assert model.point == "imu"
-    found, states, _ = model.trace(samples, model.first_state(samples[0], {}))
+    outputs, states, _ = model.trace(samples, model.first_state(samples[0], {}))
     deviation = np.sqrt(states[-1, kernel.STATES + kernel.REAR])
     assert deviation < 0.3 * model.prior[1][kernel.REAR]
     assert abs(states[-1, kernel.REAR] - place) < 2.0 * deviation
     late = slice(600, None)
-    assert np.std(found[late, 0] - vy[late]) < 0.4 * np.std(vy[late])
+    assert np.std(outputs[late, 0] - vy[late]) < 0.4 * np.std(vy[late])
 
 
 def test_estimates_at_other_points_differ_by_their_distance_times_the_yaw_rate():
     samples, _ = drive(30.0)
-    found = {}
+    outputs = {}
     for point in ("cg", "rear_axle", "imu"):
         model = model_of(cg_to_rear_axle=1.4, imu_to_rear_axle=-0.3, reference_point=point)
-        found[point], states, _ = model.trace(samples, model.first_state(samples[0], {}))
+        outputs[point], states, _ = model.trace(samples, model.first_state(samples[0], {}))
     yaw_rate = samples[:, 0]
     np.testing.assert_allclose(
-        found["cg"][:, 0] - found["rear_axle"][:, 0], 1.4 * yaw_rate, rtol=0.0, atol=1e-9
+        outputs["cg"][:, 0] - outputs["rear_axle"][:, 0], 1.4 * yaw_rate, rtol=0.0, atol=1e-9
     )
     place = states[:, kernel.REAR]  # as far as it is identified
     np.testing.assert_allclose(
-        found["imu"][:, 0] - found["rear_axle"][:, 0], place * yaw_rate, rtol=0.0, atol=1e-9
+        outputs["imu"][:, 0] - outputs["rear_axle"][:, 0], place * yaw_rate, rtol=0.0, atol=1e-9
     )
     assert model_of(cg_to_rear_axle=1.4).point == "cg"
 
 
-def test_a_rolling_car_is_certain_of_the_rear_axle_and_not_of_a_unit_whose_place_is_not_given():
+def test_a_rolling_car_determines_v_at_the_rear_axle_but_not_at_an_unplaced_unit():
     circle = np.tile([0.4, 2.0, 0.8, 0.0], (100, 1))  # v = b ω below 3 m/s, and no parameter learns
     shares = {"variance_share": 1.0, "error_share": 0.0, "angle_floor": 0.0}
     deviations = {}
@@ -335,20 +345,20 @@ def test_a_rolling_car_is_certain_of_the_rear_axle_and_not_of_a_unit_whose_place
         model = model_of(
             imu_to_rear_axle=None, reference_point=point, point_deviation=0.0, **shares
         )
-        found, _, _ = model.trace(circle, model.first_state(circle[0], {}))
-        deviations[point] = np.sqrt(found[-1, 1])
+        outputs, _, _ = model.trace(circle, model.first_state(circle[0], {}))
+        deviations[point] = np.sqrt(outputs[-1, 1])
     assert deviations["imu"] == pytest.approx(0.4 * model.prior[1][kernel.REAR], rel=0.05)
     assert deviations["rear_axle"] < 0.2 * deviations["imu"]
 
 
-def test_band_widens_while_motion_and_estimate_contradict_each_other_and_narrows_afterwards():
+def test_band_widens_while_motion_contradicts_the_estimate_and_narrows_after():
     samples, _ = drive(90.0)
     model = model_of(error_share=1.0, variance_share=1e-9)
     calm, _, _ = model.trace(samples, model.first_state(samples[0], {}))
     shaken = samples.copy()
     shaken[1000:1010, 2] += 8.0
-    found, _, _ = model.trace(shaken, model.first_state(shaken[0], {}))
-    deviations = np.sqrt(found[:, 1])
+    outputs, _, _ = model.trace(shaken, model.first_state(shaken[0], {}))
+    deviations = np.sqrt(outputs[:, 1])
     largest = deviations[1000:1040].max()
     assert largest > 5.0 * np.sqrt(calm[1000:1040, 1]).max()
     later = slice(1000 + round(8.0 * model.band_time * RATE), None)
@@ -374,7 +384,7 @@ def test_refuses_weights_of_another_network():
         model.load_weights({"network": np.zeros((3, 20)), "yaw_rate_max": np.ones(1)})
 
 
-def test_compiled_code_is_found_again_in_the_next_process():
+def test_compiled_code_is_reused_by_the_next_process():
     numbers = SelfCalibrating.from_config({}).numbers()
     assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), (
         "its type is in the key of the compiled code"
@@ -423,7 +433,7 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
         )
         measured = np.zeros((2, 4 * (steps + 1)))
         measured[0, 4 * k + 5] = 1.0 / n.noise_speed
-        measured[1, 4 * k + 4] = 1.0 / kernel.ROLLING
+        measured[1, 4 * k + 4] = 1.0 / kernel.ROLLING_DEVIATION
         rows.append(measured)
         values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
     stacked = np.vstack(rows)
@@ -437,7 +447,10 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
 
 
 def test_at_the_end_of_a_drive_smoother_and_filter_agree():
-    """Nothing is later than the last sample; a smoother that takes the drive twice is too sure there."""
+    """Nothing is later than the last sample.
+
+    A smoother that takes the drive twice is too sure there.
+    """
     samples, _ = drive(40.0, 0)
     alone = {"grips": [14.0], "network_odds": 1e-12, "steady_odds": 1e-12}
     last = []

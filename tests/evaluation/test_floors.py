@@ -189,7 +189,7 @@ def test_bound_of_a_long_drive_is_the_same_in_chunks(
 ):
     drive = drive_of(single_track_drive(60.0), Span("d", "track"), PROTOCOL)
     undivided = cramer_rao_floor([drive], SETS[-1])
-    monkeypatch.setattr(floors, "CHUNK", 97)
+    monkeypatch.setattr(floors, "SAMPLES_TOGETHER", 97)
     chunks = cramer_rao_floor([drive], SETS[-1])
     assert (chunks.vy, chunks.sideslip) == (
         pytest.approx(undivided.vy, rel=1e-9),

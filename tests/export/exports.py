@@ -23,6 +23,7 @@ from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
+from vehest.trust.tyre_check import tyre_check_of
 
 FAMILIES = exportable()
 STRICT = [
@@ -55,10 +56,12 @@ ill-conditioned, so that a last digit grows.
 
 @cache
 def model(name):
+    """Fitted estimator of a family, well conditioned for comparisons in single precision."""
     return fitted(name, **WELL_CONDITIONED.get(name, {}))
 
 
 def drive(estimator, seed, seconds=40.0):
+    """A drive with the channels of an estimator, at its rate."""
     rate = estimator.settings.rate_hz
     if "motor_current" in estimator.channels:
         return small_car_drive(seconds, seed)
@@ -85,6 +88,7 @@ def trust(name):
     drives = [drive(estimator, seed) for seed in (1, 2)]
     rate = estimator.settings.rate_hz
     band = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
+    check = tyre_check_of(estimator)
     about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
     bands = Bands(
         *about,
@@ -93,6 +97,7 @@ def trust(name):
         LARGEST,
         band,
         replace(band, floor=0.001),
+        tyre_check=check and check.scaled_by((1.8, 1.8)),
     )
     health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
@@ -137,11 +142,13 @@ class Export:
     trusted: bool = True
 
     def stepper(self):
+        """Python model that the exported program must agree with."""
         return GuardedStepper(
             model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz
         )
 
     def write(self):
+        """Write the files of the program into its folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, text in program_files(self.stepper(), self.precision, self.name).items():
             (self.folder / name).write_text(text)
@@ -164,9 +171,11 @@ class Export:
 
     @property
     def sources(self):
+        """C files of the program."""
         return sorted(path.name for path in self.folder.glob("vehest_*.c"))
 
     def build(self, compiler, *options, main="main.c", out="main"):
+        """Compile the program with a compiler and options."""
         flags = [*STRICT, *(["-Wdouble-promotion"] if self.precision == "float" else [])]
         command(
             [tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder

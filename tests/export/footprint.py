@@ -91,6 +91,7 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
 
 
 def _run(command: list[str], folder: Path) -> str:
+    """Output of a command that must succeed."""
     return subprocess.run(
         command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS
     ).stdout
@@ -130,6 +131,7 @@ def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tup
             calls.setdefault(source, set()).add(target)
 
     def deepest(function: str, above: tuple[str, ...]) -> int:
+        """Deepest stack of a function and of those that it calls [bytes]."""
         if function in above:
             raise RecursionError(f"{function} calls itself")
         below = (deepest(inner, (*above, function)) for inner in calls.get(function, ()))

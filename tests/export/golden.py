@@ -125,6 +125,7 @@ def differences(text, golden):
 
 
 def _lines_agree(ours_line, golden_line):
+    """Whether two lines are equal but for the last digits of their numbers."""
     if NUMBER.sub("#", ours_line) != NUMBER.sub("#", golden_line):
         return False
     numbers = [

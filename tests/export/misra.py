@@ -26,6 +26,7 @@ _ROW = re.compile(r"^\| (\d+\.\d+) \| (\d+) \|", re.MULTILINE)
 
 
 def version():
+    """Version of the installed cppcheck."""
     return subprocess.run(
         ["cppcheck", "--version"], capture_output=True, text=True, check=True
     ).stdout.strip()

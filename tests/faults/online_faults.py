@@ -1,13 +1,17 @@
-"""Every family online, under every fault of every channel it reads, sample by sample: `make online_faults`.
+"""Every family online, under every fault of every channel it reads, sample by sample: `make
+online_faults`.
 
-A row a case in results/reliability/online_faults.csv. Each drive is 16 s of a range that the estimator has not learnt from: 4 s to settle,
-4 s of fault, 8 s to come back. It is stepped through `vehest.trust.contract.GuardedStepper` once as it is and once a case, from the
-estimator's first sample on. What is asked of a case:
+A row a case in results/reliability/online_faults.csv. Each drive is 16 s of a range that the
+estimator has not learnt from: 4 s to settle, 4 s of fault, 8 s to come back. It is stepped through
+`vehest.trust.contract.GuardedStepper` once as it is and once a case, from the estimator's first
+sample on. What is asked of a case:
 
-- `finite`: no value that is not finite once the window is full (with the fault's first sample within it or not);
+- `finite`: no value that is not finite once the window is full (with the fault's first sample
+  within it or not);
 - `exceptions`: what reached the caller;
-- `recovered`: the error of the sideslip angle, from 3 s after the fault's end (or the family's window, if that is longer) to the end, is at
-  most twice its usual size: that of the whole drive without the fault, or of the same seconds without it, whichever is larger;
+- `recovered`: the error of the sideslip angle, from 3 s after the fault's end (or the family's
+  window, if that is longer) to the end, is at most twice its usual size: that of the whole drive
+  without the fault, or of the same seconds without it, whichever is larger;
 - `within_speed`: the lateral velocity never exceeded what the last believed speed allows.
 """
 
@@ -59,7 +63,10 @@ HEADER = [
 ]
 HEADER += ["usual_error_deg", "error_while_faulted_deg", "error_after_deg", "recovered"]
 
-CAR = "estimator.car={mass: 982, yaw_inertia: 1605.4145, cg_to_front_axle: 1.33, cg_to_rear_axle: 1.07, cg_height: 0.45}"
+CAR = (
+    "estimator.car={mass: 982, yaw_inertia: 1605.4145, cg_to_front_axle: 1.33, "
+    "cg_to_rear_axle: 1.07, cg_height: 0.45}"
+)
 SHORT = ("tyres_from='*'", "method=data", "restarts=1", "generations=40")
 IDENTIFIED = ("estimator.inputs=imu", CAR, *(f"training.identification.{word}" for word in SHORT))
 FERRARI = {
@@ -109,7 +116,7 @@ SMALL_CAR = {
 }
 SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
 Ground = namedtuple("Ground", "data kind train validation trial families")
-"""Where families are tried: ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
+"""Ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
 
 
 def grounds():
@@ -119,9 +126,13 @@ def grounds():
         "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"),
         "self_calibrating": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"),
     }
-    own = "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, cg_to_rear_axle: 1.423, cg_height: 0.42}"
+    bmw_car = (
+        "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, "
+        "cg_to_rear_axle: 1.423, cg_height: 0.42}"
+    )
     bmw = {
-        name: tuple(own if word == CAR else word for word in words) for name, words in bmw.items()
+        name: tuple(bmw_car if word == CAR else word for word in words)
+        for name, words in bmw.items()
     }
     yield Ground(
         "sim_quickstart",
@@ -166,35 +177,38 @@ def at_rate(recording, estimator):
 
 
 def sideslip(vy, vx):
+    """Sideslip angle [deg]."""
     return np.degrees(np.arctan2(vy, vx))
 
 
 def walk(estimator, limits, samples):
-    """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
+    """v after each sample, held for the time that it is made for, with exceptions, starts, and
+    whether the speed bounds it.
+    """
     stepper = vehest.online(estimator).stepper
     rows = [
         dict(zip(samples, row, strict=True))
         for row in zip(*(values.tolist() for values in samples.values()), strict=True)
     ]
-    said = np.full(len(rows), np.nan)
+    estimates = np.full(len(rows), np.nan)
     exceptions = 0
     starts = 0
     fastest = 1.0
     bounded = True
     for k, row in enumerate(rows):
         try:
-            said[k] = stepper.step(row)["vy"]
+            estimates[k] = stepper.step(row)["vy"]
         except Exception:  # whatever reaches the caller is what is counted
             exceptions += 1
         starts += bool(stepper.marks & STARTED)
         speed = abs(row.get("vx", math.nan))
         if speed < 140.0:
             fastest = max(fastest, speed)
-        bounded &= not abs(said[k]) > limits.largest_tan_sideslip * min(
+        bounded &= not abs(estimates[k]) > limits.largest_tan_sideslip * min(
             fastest, limits.top_speed
-        ) * (1 + 1e-9) or math.isinf(said[k])
+        ) * (1 + 1e-9) or math.isinf(estimates[k])
     return (
-        np.concatenate([np.full(estimator.horizon_steps, np.nan), said])[: len(rows)],
+        np.concatenate([np.full(estimator.horizon_steps, np.nan), estimates])[: len(rows)],
         exceptions,
         starts,
         bounded,
@@ -206,8 +220,8 @@ def try_family(ground, name):
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
     train, validation = (
-        stretch(recording(ground.data, own), start, stop)
-        for own, start, stop in (ground.train, ground.validation)
+        stretch(recording(ground.data, segment), start, stop)
+        for segment, start, stop in (ground.train, ground.validation)
     )
     estimator = vehest.train(name, [train], [validation], ground.families[name])
     rate = estimator.settings.rate_hz
@@ -223,6 +237,7 @@ def try_family(ground, name):
     back = SETTLE + LASTS + max(RECOVERS, estimator.warm_up_steps / rate)
 
     def error(vy, chosen):
+        """Root mean square of the error of the sideslip angle over chosen samples [deg]."""
         return float(
             np.sqrt(np.mean(np.square(sideslip(vy[chosen], speed[chosen]) - reference[chosen])))
         )
@@ -269,40 +284,41 @@ def main():
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", help="one estimator; all other rows stay as they are in --out")
     parser.add_argument("--data", help="one data set; all other rows stay")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     cases = [
         (ground, name)
         for ground in grounds()
-        if asked.data in (None, ground.data)
+        if options.data in (None, ground.data)
         for name in ground.families
     ]
-    cases = [case for case in cases if asked.only in (None, case[1])]
+    cases = [case for case in cases if options.only in (None, case[1])]
     cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
     started = time.monotonic()
     former = pd.DataFrame(columns=HEADER)
-    if (asked.only or asked.data) and asked.out.is_file():
-        former = pd.read_csv(asked.out, dtype=str, keep_default_na=False)
-        remade = former["estimator"].isin([asked.only] if asked.only else former["estimator"])
-        remade &= former["data"].isin([asked.data] if asked.data else former["data"])
+    if (options.only or options.data) and options.out.is_file():
+        former = pd.read_csv(options.out, dtype=str, keep_default_na=False)
+        remade = former["estimator"].isin([options.only] if options.only else former["estimator"])
+        remade &= former["data"].isin([options.data] if options.data else former["data"])
         former = former[~remade]
     tables = {}
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         for (ground, name), rows in zip(
             cases, pool.map(try_family, *zip(*cases, strict=True)), strict=True
         ):
             tables[ground.data, name] = rows
             table = pd.DataFrame([row for rows in tables.values() for row in rows], columns=HEADER)
             pd.concat([former, table]).sort_values(["data", "estimator"], kind="stable").to_csv(
-                asked.out, index=False
+                options.out, index=False
             )  # so that what is done stands there if the rest is not awaited
             print(
-                f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s",
+                f"{ground.data:16s} {name:14s} {len(rows):4d} cases, "
+                f"{time.monotonic() - started:.0f} s",
                 flush=True,
             )
     estimators = sorted(set(former["estimator"]))
     record_tables(
-        [asked.out],
+        [options.out],
         "make online_faults",
         [
             "script tests/faults/online_faults.py",
@@ -313,15 +329,18 @@ def main():
             {name: f"train {name}" for name in estimators},
         ),
     )
-    held = {
+    criteria = {
         "finite": table["finite"],
         "without an exception": table["exceptions"] == 0,
         "within the speed": table["within_speed"],
     }
-    held["back within twice the usual error"] = table["recovered"]
+    criteria["back within twice the usual error"] = table["recovered"]
     print(
         f"{len(table)} cases: "
-        + ", ".join(f"{(~own.astype(bool)).sum()} not {what}" for what, own in held.items())
+        + ", ".join(
+            f"{(~is_met.astype(bool)).sum()} not {criterion}"
+            for criterion, is_met in criteria.items()
+        )
     )
 
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from vehest.estimators.filtering.rational_model import LOST, ROLLING
+from vehest.estimators.filtering.rational_model import MAX_SIDESLIP_DEVIATION, ROLLING
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
+from vehest.filters.unscented_scan import MIN_EIGENVALUE_SHARE, Function, NonlinearFiltered
 
 
 def sigma_points(rule, mean, factor):
@@ -45,15 +45,15 @@ def factorised(covariance):
     """A covariance, its Cholesky factor L, and whether it was lifted first since it was not
     positive definite.
 
-    Lifting adds the same to every eigenvalue, as much as a margin of `MARGIN` needs; what is added
-    counts as a constant in gradients.
+    Lifting adds the same to every eigenvalue, so that the smallest is `MIN_EIGENVALUE_SHARE` of the
+    largest; what is added counts as a constant in gradients.
     """
     factor, lost = torch.linalg.cholesky_ex(covariance)
     if not lost:
         return covariance, factor, False
     with torch.no_grad():
         eigenvalues = torch.linalg.eigvalsh(covariance)
-        lift = MARGIN * eigenvalues.abs().max() - eigenvalues[0]
+        lift = MIN_EIGENVALUE_SHARE * eigenvalues.abs().max() - eigenvalues[0]
     lifted = covariance + lift * torch.eye(len(covariance), dtype=covariance.dtype)
     return lifted, torch.linalg.cholesky(lifted), True
 
@@ -252,7 +252,7 @@ def rational_model(estimator):
 
     def restart(state, inputs):
         diverged = not bool(state.mean[0].abs() < estimator.largest_sideslip)
-        if not diverged and bool(state.covariance[0, 0] < LOST**2):
+        if not diverged and bool(state.covariance[0, 0] < MAX_SIDESLIP_DEVIATION**2):
             return state
         turn = inputs[1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
         motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])

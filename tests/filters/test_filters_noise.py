@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 from point_models import covariances
 from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.noise_models import (
+    COVARIANCE_FLOOR,
     DEVIATION,
-    FLOOR,
     ConstantNoise,
     StateDependentNoise,
     compiled_noise,
@@ -50,7 +50,7 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         for parameter in noise.parameters():
             torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(2))
         covariance = noise.double()(STATE.double(), INPUTS.double())
-        assert (torch.linalg.eigvalsh(covariance) >= 0.99 * FLOOR).all()
+        assert (torch.linalg.eigvalsh(covariance) >= 0.99 * COVARIANCE_FLOOR).all()
         covariance.square().sum().backward()
         assert all(
             parameter.grad is not None and parameter.grad.abs().sum() > 0
@@ -69,7 +69,7 @@ def test_noise_covariances_match_their_formula_and_floor():
     )
     noise = ConstantNoise([1.0, 1.0])
     torch.nn.init.zeros_(noise.factor)
-    assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
+    assert torch.equal(noise(STATE, INPUTS)[0], COVARIANCE_FLOOR * torch.eye(2))
     assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
     assert (
         sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters())

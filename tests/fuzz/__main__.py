@@ -66,6 +66,7 @@ def main():
 
 
 def _options():
+    """Options of the command line."""
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=3000, help="how many")
     parser.add_argument("--seed", type=int, default=0, help="another seed makes other inputs")

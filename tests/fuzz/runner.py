@@ -242,6 +242,7 @@ def _waited(process):
 
 
 def _remove(folder):
+    """Remove a folder, also where its permissions were changed."""
     if folder.exists():
         for inside, _, _ in os.walk(folder):
             with contextlib.suppress(OSError):
@@ -259,6 +260,7 @@ def _text(path):
 
 
 def _command_text(command, case):
+    """Words of a command, long ones cut."""
     words = [os.fsdecode(word).replace(str(case.place), ".") for word in command.argv]
     cut = [word if len(word) <= 160 else f"{word[:150]}…({len(word)} characters)" for word in words]
     return printable(" ".join(shlex.quote(word) for word in cut))[:600]

@@ -53,6 +53,7 @@ def judge(case, command, outcome):
 
 
 def _findings(case, command, outcome):
+    """Verdicts on one command, each with its reason."""
     canaries = [path for path in outcome.changed if Path(path).name == CANARY]
     yield from (("executed", f"made {path}") for path in canaries)
     for verdict in ("executed", "outside"):
@@ -88,6 +89,7 @@ def _findings(case, command, outcome):
 
 
 def _about_lines(case, command, outcome):
+    """Verdicts on the lines that a command that failed has written."""
     if outcome.exit_code == 0:
         return
     if case.honest:
@@ -116,6 +118,7 @@ def last_line(text):
 
 
 def _is_allowed(path, case, command):
+    """Whether a command may write to a path."""
     place = case.place.relative_to(case.folder).as_posix()
     roots = [f"{place}/{name}" for name in ("outputs", *command.targets)] + ["tmp"]
     folder, _, name = path.rpartition("/")  # a target is first written beside it

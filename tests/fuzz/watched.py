@@ -85,6 +85,7 @@ class Watch:
         self._armed = True
 
     def _hook(self, event, arguments):
+        """Audit hook: called at each event that Python audits."""
         if not self._armed:
             return
         if event == "open":
@@ -104,6 +105,7 @@ class Watch:
                 raise OSError(101, "the network is out of reach here")
 
     def _code(self, event, arguments):
+        """Note that code of a file would be executed."""
         try:
             caller = sys._getframe(2)
         except ValueError:  # the interpreter itself, at its start
@@ -137,10 +139,12 @@ class Watch:
         self._note("executed", f"{event} of {str(code)[:80]!r} by {module}:{caller.f_lineno}")
 
     def _imported(self, name):
+        """Note an import that no command needs."""
         if name not in sys.modules and not name.startswith(HARMLESS_IMPORTS):
             self._note("executed", f"import of {name[:80]!r}")
 
     def _program(self, event, arguments):
+        """Note that a program would be started."""
         if event == "os.fork" or _called_from(sys._getframe(2), ("multiprocessing.",)):
             return
         if event == "subprocess.Popen" and [*arguments[1]][:1] + [*arguments[1]][-2:] == [
@@ -153,6 +157,7 @@ class Watch:
         raise PermissionError(1, "no program is started here")
 
     def _opened(self, path, mode, flags):
+        """Note that a file is opened for writing."""
         writes = isinstance(flags, int) and flags & (
             os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
         )
@@ -160,6 +165,7 @@ class Watch:
             self._written("open", path)
 
     def _written(self, event, path):
+        """Note a path that is written to outside the allowed folders."""
         if not isinstance(path, str | bytes):
             return
         self._armed = False
@@ -178,6 +184,7 @@ class Watch:
             raise PermissionError(1, "this is outside of the sandbox", real)
 
     def _note(self, verdict, subject):
+        """Report a verdict, at most twenty."""
         if self._noted < 20:
             self._noted += 1
             os.write(self._report, (json.dumps([verdict, subject]) + "\n").encode())
@@ -293,6 +300,7 @@ def _prepare(case, command):
 
 
 def _environment(case):
+    """Set the environment of the command."""
     for name in [
         name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))
     ]:
@@ -306,6 +314,7 @@ def _environment(case):
 
 
 def _redirect(descriptor, path, flags):
+    """Replace an open file of the process by the file at a path."""
     opened = os.open(path, flags, 0o666)
     os.dup2(opened, descriptor)
     os.close(opened)

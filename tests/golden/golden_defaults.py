@@ -1,6 +1,8 @@
-"""Defaults of every class of settings with the version that stands for them; `make golden` records anew.
+"""Defaults of every class of settings with the version that stands for them; `make golden` records
+anew.
 
-Options that have their defaults are in no key, so that a default that changes has to raise a version.
+Options that have their defaults are in no key, so that a default that changes has to raise a
+version.
 """
 
 import json
@@ -20,7 +22,9 @@ FILE = Path(__file__).with_name("defaults.json")
 
 
 def subjects():
-    """Class of settings -> its version, with the name under which it is raised, and its defaults."""
+    """Class of settings -> its version, with the name under which it is raised, and its
+    defaults.
+    """
     records = {
         "Protocol": record("VERSIONS['evaluate']", VERSIONS["evaluate"], Protocol),
         "FaultSettings": record("FAULTS", FAULTS, FaultSettings),
@@ -45,7 +49,10 @@ def record(version_name, version, kind):
 
 
 def defaults_of(kind):
-    """Dotted option -> its default, of groups inside too; those of a group that may be absent end in ``(if given)``."""
+    """Dotted option -> its default, of groups inside too.
+
+    Those of a group that may be absent end in ``(if given)``.
+    """
     hints = get_type_hints(kind)
     defaults = {}
     for option in fields(kind):
@@ -63,6 +70,7 @@ def defaults_of(kind):
 
 
 def _values(prefix, settings):
+    """Dotted option -> its default."""
     values = {}
     for option in fields(settings):
         name = f"{prefix}.{option.name}"
@@ -72,7 +80,10 @@ def _values(prefix, settings):
 
 
 def unversioned(recorded, now):
-    """Complaints about defaults that are not those recorded although the version is; an added or removed option is none."""
+    """Complaints about defaults that are not those recorded although the version is.
+
+    An added or removed option is none.
+    """
     complaints = []
     for name in sorted(recorded.keys() & now.keys()):
         if recorded[name]["version"] != now[name]["version"]:
@@ -81,7 +92,8 @@ def unversioned(recorded, now):
         today = now[name]["defaults"]
         (version,) = now[name]["version"]
         complaints += [
-            f"the default of {name}.{option} changed from {then[option]!r} to {today[option]!r}: raise {version}, then run `make golden`"
+            f"the default of {name}.{option} changed from {then[option]!r} to {today[option]!r}: "
+            f"raise {version}, then run `make golden`"
             for option in then
             if option in today and then[option] != today[option]
         ]

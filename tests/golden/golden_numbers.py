@@ -1,4 +1,6 @@
-"""Numbers of every estimator family, source and stage on small recordings, and what is recorded of them; `make golden` records anew."""
+"""Numbers of every estimator family, source and stage on small recordings, and what is recorded of
+them; `make golden` records anew.
+"""
 
 import contextlib
 import csv
@@ -66,28 +68,28 @@ class Subject:
 
 def subjects():
     """All of them, by name."""
-    found = {
+    all_subjects = {
         name: _estimator(name)
         for name in estimator_names()
         if estimator_class(name).__module__.startswith("vehest.")
     }
     for name, make in SOURCES.items():
         tolerance = SIMULATED if name == "simulated" else FIXED
-        told = source_class({"source": name})
-        found[f"source {name}"] = Subject(
-            {f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make)
+        source = source_class({"source": name})
+        all_subjects[f"source {name}"] = Subject(
+            {f"{source.__name__}.version": source.version}, tolerance, partial(in_folder, make)
         )
     for stage, numbers in STAGES.items():
         name = stage.__name__.removeprefix("vehest.run.")
         tolerance = FIXED
-        what = f"{name} in vehest.run.versions"
+        version_name = f"{name} in vehest.run.versions"
         if stage is not downsample:
-            what = f"{what}, unless numbers of {MODEL} moved too,"
+            version_name = f"{version_name}, unless numbers of {MODEL} moved too,"
             tolerance = LEARNT
-        found[f"stage {name}"] = Subject(
-            {what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
+        all_subjects[f"stage {name}"] = Subject(
+            {version_name: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers)
         )
-    return found
+    return all_subjects
 
 
 def this_machine():
@@ -101,7 +103,10 @@ def this_machine():
 
 
 def moved(name, recorded, now, tolerance):
-    """What to do about numbers that are not those recorded; empty where they are. Digests are compared where there is no tolerance."""
+    """What to do about numbers that are not those recorded.
+
+    Empty where they are. Digests are compared where there is no tolerance.
+    """
     if recorded["versions"] != now["versions"]:
         return f"a version of {name} was raised: record its numbers with `make golden`"
     if tolerance is None:
@@ -118,13 +123,16 @@ def moved(name, recorded, now, tolerance):
         ]
     if not parts:
         return ""
-    own, *training = now["versions"]
-    what = (
-        own
+    version, *training = now["versions"]
+    version_to_raise = (
+        version
         if not training or "weights" not in parts
-        else f"{own}, or {training[0]} if all that it trains moved,"
+        else f"{version}, or {training[0]} if all that it trains moved,"
     )
-    return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
+    return (
+        f"{' and '.join(parts)} of {name} moved: "
+        f"raise {version_to_raise} if that is meant, then run `make golden`"
+    )
 
 
 def digest_of(arrays, digits=DIGITS):
@@ -154,6 +162,7 @@ def _values(array):
 
 
 def _are_close(recorded, now, tolerance):
+    """Whether recorded and present numbers agree within a tolerance."""
     if set(recorded) != set(now):
         return False
     for name, values in recorded.items():
@@ -167,6 +176,7 @@ def _are_close(recorded, now, tolerance):
 
 
 def _estimator(name):
+    """Weights and estimates of a family."""
     cls = estimator_class(name)
     versions = {f"{cls.__name__}.version": cls.version}
     if hasattr(cls.training_type, "version"):
@@ -181,20 +191,24 @@ def _estimator(name):
 
 
 def in_folder(make):
+    """What a function makes of an empty folder."""
     with tempfile.TemporaryDirectory() as folder:
         return {"numbers": make(Path(folder))}
 
 
 def _channels(recording):
+    """Times and channels of a recording."""
     return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
 
 
 def _tabular(folder):
+    """Channels of a CSV table."""
     write_csv(folder / "lap.csv", 1, 5.0)
     return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
 
 
 def _text_log(folder):
+    """Channels of a table with a row of units."""
     write_csv(folder / "lap.csv", 1, 5.0)
     lines = (folder / "lap.csv").read_text().splitlines()
     (folder / "lap.csv").write_text("\n".join([lines[0], "s,km/h,deg/s,,,", *lines[1:]]) + "\n")
@@ -206,6 +220,7 @@ def _text_log(folder):
 
 
 def _vbo(folder):
+    """Channels of a VBO file."""
     from vbo_log import dataset, write_log
 
     write_log(folder / "lap.vbo")
@@ -213,22 +228,26 @@ def _vbo(folder):
 
 
 def _can(folder):
+    """Channels of a log of a CAN bus."""
     from can_drive import SIGNALS, write_log
 
     write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
-    told = {
+    can_options = {
         "files": "drive.*",
         "dbc": str(folder / "car.dbc"),
         "rate_hz": 100,
         "channels": channels,
     }
     return _channels(
-        open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive")
+        open_source({"name": "mine", "source": "can", "path": str(folder), **can_options}).read(
+            "drive"
+        )
     )
 
 
 def _rosbag(folder):
+    """Channels of a ROS bag."""
     from test_sources_rosbag import configuration, drive, write_bag
 
     write_bag(folder, drive(2.0))
@@ -236,6 +255,7 @@ def _rosbag(folder):
 
 
 def _mdf(folder):
+    """Channels of a measurement."""
     from mdf_log import write_mdf
 
     from fuzz.families.mdf import DECLARED, signals
@@ -245,6 +265,7 @@ def _mdf(folder):
 
 
 def _revs(folder):
+    """Channels of a folder of the Revs database."""
     from test_sources_revs import configuration
 
     time = np.arange(300) / 100.0
@@ -255,6 +276,7 @@ def _revs(folder):
 
 
 def simulated(folder, seconds=3.0, **car):
+    """Channels of a simulated drive."""
     drive = {
         "id": "a",
         "seed": 1,
@@ -276,6 +298,7 @@ SOURCES |= {"tabular": _tabular, "text_log": _text_log, "vbo": _vbo}
 
 
 def _downsampled(folder):
+    """Channels of a recording after the stage ``downsample``."""
     recording = planar_drive(10.0, 100.0, seed=1, noise=0.02)
     for transform in downsample.transforms_of(
         {"rate_hz": 20.0, "method": "polyphase", "transforms": []}
@@ -284,13 +307,15 @@ def _downsampled(folder):
     return _channels(recording)
 
 
-def _made(pattern):
+def _artefact_file(pattern):
+    """The one file of the study that matches a pattern."""
     (file,) = (Path(_study().name) / "outputs").glob(pattern)
     return file
 
 
 def _metrics(chosen):
-    with _made("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
+    """Metrics of the rows of chosen conditions."""
+    with _artefact_file("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
     metrics = {}
     for row in rows:
@@ -302,9 +327,11 @@ def _metrics(chosen):
 
 @cache
 def _study():
-    """A folder with a small study: one model, calibrated, evaluated without faults and under one."""
-    made = tempfile.TemporaryDirectory()
-    folder = Path(made.name)
+    """A folder with a small study: one model, calibrated, evaluated without faults and
+    under one.
+    """
+    study_folder = tempfile.TemporaryDirectory()
+    folder = Path(study_folder.name)
     Place(folder, None)
     with (
         contextlib.chdir(folder),
@@ -313,7 +340,7 @@ def _study():
     ):
         for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
             run(*words)
-    return made
+    return study_folder
 
 
 def _leaves(path, content):
@@ -330,7 +357,9 @@ def _leaves(path, content):
 STAGES = {
     downsample: _downsampled,
     calibrate: lambda _: dict(
-        _leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))
+        _leaves(
+            "", yaml.safe_load(_artefact_file("calibrate/*/trust.yaml").read_text(encoding="utf-8"))
+        )
     ),
     evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
     evaluate_faults: lambda _: _metrics(is_fault),
@@ -340,11 +369,13 @@ STAGES = {
 def main():
     """Record the numbers of this machine."""
     former = json.loads(FILE.read_text(encoding="utf-8"))["subjects"] if FILE.is_file() else {}
-    made = {}
+    records = {}
     for name, subject in subjects().items():
-        made[name] = subject.record()
-        print(f"{name}: {'as before' if made[name] == former.get(name) else 'recorded'}")
-    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(record)}" for name, record in made.items())
+        records[name] = subject.record()
+        print(f"{name}: {'as before' if records[name] == former.get(name) else 'recorded'}")
+    lines = ",\n".join(
+        f"{json.dumps(name)}: {json.dumps(record)}" for name, record in records.items()
+    )
     FILE.write_text(
         f'{{"machine": {json.dumps(this_machine())},\n"subjects": {{\n{lines}\n}}}}\n',
         encoding="utf-8",

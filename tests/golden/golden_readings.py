@@ -1,4 +1,7 @@
-"""What is recorded of every real recording as its source reads it; `make golden` records anew where VEHEST_DATA is set."""
+"""What is recorded of every real recording as its source reads it.
+
+`make golden` records anew where VEHEST_DATA is set.
+"""
 
 import json
 import os
@@ -24,10 +27,12 @@ READINGS = {name: (name,) for name in NAMES.split()} | {
 
 
 def read(name, root):
-    """Recording -> rate [Hz], start time [s], and for each channel a digest of its samples and their root mean square."""
+    """Recording -> rate [Hz], start time [s], and for each channel a digest of its samples and
+    their root mean square.
+    """
     dataset, *otherwise = READINGS[name]
     config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *otherwise])["dataset"]
-    found = {}
+    readings = {}
     for recording in open_source(config).recordings():
         channels = {}
         for channel, samples in recording.channels.items():
@@ -36,12 +41,12 @@ def read(name, root):
                 digest_of({channel: samples}, DIGITS)[:8],
                 float(f"{np.sqrt(mean_square):.12g}"),
             ]
-        found[recording.id] = {
+        readings[recording.id] = {
             "rate_hz": recording.rate_hz,
             "start_time": recording.start_time,
             "channels": channels,
         }
-    return found
+    return readings
 
 
 if __name__ == "__main__":

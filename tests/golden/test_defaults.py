@@ -1,4 +1,6 @@
-"""An option with its default is in no key: a default that changes has to raise the version of its class."""
+"""An option with its default is in no key: a default that changes has to raise the version of its
+class.
+"""
 
 import json
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ class Group:
 class Settings:
     step: float = 0.1
     group: Group = Group(width=8)
-    further: Group | None = None
+    optional_group: Group | None = None
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Longer(Settings):
 
 
 @dataclass(frozen=True)
-class Other(Settings):
+class ChangedStep(Settings):
     step: float = 0.2
     group: Group = Group()
 
@@ -42,13 +44,15 @@ def test_a_changed_default_names_the_version_to_raise():
     assert recorded["Settings"]["defaults"] == {
         "step": 0.1,
         "group.width": 8,
-        "further": None,
-        "further.width (if given)": 4,
+        "optional_group": None,
+        "optional_group.width (if given)": 4,
     }
-    changed = {"Settings": record("Settings.version", "1", Other)}
+    changed = {"Settings": record("Settings.version", "1", ChangedStep)}
     assert unversioned(recorded, changed) == [
-        "the default of Settings.step changed from 0.1 to 0.2: raise Settings.version, then run `make golden`",
-        "the default of Settings.group.width changed from 8 to 4: raise Settings.version, then run `make golden`",
+        "the default of Settings.step changed from 0.1 to 0.2: "
+        "raise Settings.version, then run `make golden`",
+        "the default of Settings.group.width changed from 8 to 4: "
+        "raise Settings.version, then run `make golden`",
     ]
-    assert not unversioned(recorded, {"Settings": record("Settings.version", "2", Other)})
+    assert not unversioned(recorded, {"Settings": record("Settings.version", "2", ChangedStep)})
     assert not unversioned(recorded, {"Settings": record("Settings.version", "1", Longer)})

@@ -1,4 +1,7 @@
-"""Numbers stay as recorded unless a version is raised; on another machine within the tolerance of golden_numbers.py."""
+"""Numbers stay as recorded unless a version is raised.
+
+On another machine within the tolerance of golden_numbers.py.
+"""
 
 import json
 from functools import cache
@@ -21,9 +24,12 @@ def test_every_family_source_and_stage_is_recorded():
 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_numbers_are_those_recorded(name):
-    here = RECORDED["machine"] == this_machine()
+    is_recording_machine = RECORDED["machine"] == this_machine()
     complaint = moved(
-        name, RECORDED["subjects"][name], now(name), None if here else SUBJECTS[name].tolerance
+        name,
+        RECORDED["subjects"][name],
+        now(name),
+        None if is_recording_machine else SUBJECTS[name].tolerance,
     )
     assert not complaint, complaint
 
@@ -33,7 +39,7 @@ def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
     from vehest.estimators import luenberger
 
     former = luenberger.Luenberger.estimate_recording
-    found = now("luenberger")  # before its estimates are shifted: `now` keeps them
+    unshifted = now("luenberger")  # before its estimates are shifted: `now` keeps them
 
     def shifted(self, recording, state):
         estimate = former(self, recording, state)
@@ -41,15 +47,15 @@ def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
         return estimate
 
     monkeypatch.setattr(luenberger.Luenberger, "estimate_recording", shifted)
-    complaint = moved("luenberger", found, SUBJECTS["luenberger"].record(), tolerance)
+    complaint = moved("luenberger", unshifted, SUBJECTS["luenberger"].record(), tolerance)
     assert complaint.startswith(
         "estimates of luenberger moved: raise Luenberger.version if that is meant"
     )
 
 
-def test_a_raised_version_asks_for_a_new_record_and_within_the_tolerance_numbers_pass_on_another_machine():
+def test_raised_versions_need_new_records_and_other_machines_have_a_tolerance():
     raised = now("luenberger") | {"versions": {"Luenberger.version": "2"}}
-    said = "a version of luenberger was raised: record its numbers with `make golden`"
-    assert moved("luenberger", now("luenberger"), raised, None) == said
+    message = "a version of luenberger was raised: record its numbers with `make golden`"
+    assert moved("luenberger", now("luenberger"), raised, None) == message
     for name in ("luenberger", "source tabular"):
         assert not moved(name, RECORDED["subjects"][name], now(name), SUBJECTS[name].tolerance)

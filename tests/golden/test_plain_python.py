@@ -1,4 +1,6 @@
-"""Without compilation, as under a debugger, trainings, estimates and simulated drives have the numbers of compiled code."""
+"""Without compilation, as under a debugger, trainings, estimates and simulated drives have the
+numbers of compiled code.
+"""
 
 import json
 import os

@@ -1,4 +1,6 @@
-"""Real recordings are read as recorded: every sample to 12 digits, on another machine each channel's root mean square to 1e-9."""
+"""Real recordings are read as recorded: every sample to 12 digits, on another machine each
+channel's root mean square to 1e-9.
+"""
 
 import json
 
@@ -20,17 +22,18 @@ def test_real_recordings_are_read_as_recorded(data_root, name):
     assert list(now) == list(recorded)
     for recording, expected in recorded.items():
         if RECORDED["machine"] == this_machine():
-            same = now[recording] == expected
+            is_unchanged = now[recording] == expected
         else:
-            same = _numbers(now[recording]) == pytest.approx(
+            is_unchanged = _numbers(now[recording]) == pytest.approx(
                 _numbers(expected), rel=FIXED, abs=FIXED
             )
-        assert same, (
-            f"{recording} moved: raise the version of its source if that is meant, then run `make golden`"
+        assert is_unchanged, (
+            f"{recording} moved: raise the version of its source if that is meant, "
+            "then run `make golden`"
         )
 
 
-def _numbers(found):
+def _numbers(reading):
     """All but the digests."""
-    sizes = {channel: size for channel, (_, size) in found["channels"].items()}
-    return {"rate_hz": found["rate_hz"], "start_time": found["start_time"]} | sizes
+    sizes = {channel: size for channel, (_, size) in reading["channels"].items()}
+    return {"rate_hz": reading["rate_hz"], "start_time": reading["start_time"]} | sizes

@@ -1,8 +1,11 @@
-"""Press Ctrl-C at random moments of a study's first seconds, while its workers start, and see that every run ends: `make interrupts`.
+"""Press Ctrl-C at random moments of a study's first seconds, while its workers start, and see that
+every run ends: `make interrupts`.
 
-The signal goes to the whole process group, as that of a terminal does, and in every other run a second time while the run ends. All runs
-share an output root, so that each goes on from what the one before has finished; once a run ends before its signal, its trainings and what
-follows are removed. The last run is not interrupted, and its artefacts must have the digests of a run in an output root of its own.
+The signal goes to the whole process group, as that of a terminal does, and in every other run a
+second time while the run ends. All runs share an output root, so that each goes on from what the
+one before has finished; once a run ends before its signal, its trainings and what follows are
+removed. The last run is not interrupted, and its artefacts must have the digests of a run in an
+output root of its own.
 """
 
 import argparse
@@ -18,7 +21,7 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-from kills import STUDY, broken, content, locks_held, strays
+from kills import STUDY, broken, busy_locks, content, strays
 from processes import end_all, start
 
 SECONDS = 5.0  # after the start of a run, up to which it is interrupted
@@ -31,7 +34,8 @@ REMADE = ("train", "calibrate", "evaluate", "report", "checkpoints", "finished")
 
 
 def interrupted(output, delay, second_delay=None):
-    """Interrupt a run after ``delay`` seconds, and again after ``second_delay``: its exit code, and what was wrong.
+    """Interrupt a run after ``delay`` seconds, and again after ``second_delay``: its exit code, and
+    what was wrong.
 
     The code is None where it hung.
     """
@@ -58,20 +62,22 @@ def interrupted(output, delay, second_delay=None):
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         return None, [f"hangs, see '{log}'"]
-    faults = strays(process.pid) + locks_held(output) + broken(output)
-    said = log.read_text(encoding="utf-8").splitlines()
-    has_begun = delay > UNTIL_VEHEST or any("vehest" in line for line in said)
+    faults = strays(process.pid) + busy_locks(output) + broken(output)
+    output_lines = log.read_text(encoding="utf-8").splitlines()
+    has_begun = delay > UNTIL_VEHEST or any("vehest" in line for line in output_lines)
     if has_begun and code not in (0, INTERRUPTED):
-        faults.append(f"exit code {code}: {said[-1:]}")
-    if has_begun and any(line.startswith(("Traceback", "Exception ignored")) for line in said):
+        faults.append(f"exit code {code}: {output_lines[-1:]}")
+    if has_begun and any(
+        line.startswith(("Traceback", "Exception ignored")) for line in output_lines
+    ):
         faults.append("it prints a traceback")
-    errors = [line for line in said if line.startswith("error: ")]
+    errors = [line for line in output_lines if line.startswith("error: ")]
     if errors not in ([], [LAST_LINE]):
         faults.append(f"it says {errors}")
     again = "" if second_delay is None else f" and {second_delay:.3f} s"
     moment = f"{delay:.3f} s{again}"
     seconds = time.monotonic() - begun
-    print(f"{moment}: exit code {code} after {seconds:.2f} s, says {said[-1:]}", flush=True)
+    print(f"{moment}: exit code {code} after {seconds:.2f} s, says {output_lines[-1:]}", flush=True)
     return code, [f"{moment}: {fault}" for fault in faults]
 
 
@@ -84,25 +90,25 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="within which they lie")
     parser.add_argument("--output", type=Path, help="an output root to copy, with its recordings")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
     signal.signal(
         signal.SIGINT, signal.default_int_handler
     )  # which a shell's background job ignores
-    draw = random.Random(asked.seed)
+    draw = random.Random(options.seed)
     codes = Counter()
     faults = []
     with tempfile.TemporaryDirectory(prefix="interrupts-") as scratch:
-        source = asked.output and asked.output.resolve()
+        source = options.output and options.output.resolve()
         os.chdir(scratch)
         output = Path(scratch) / "root"
         if source:
             shutil.copytree(source, output)
         output.mkdir(exist_ok=True)
         try:
-            while codes.total() < asked.interrupts:
+            while codes.total() < options.interrupts:
                 second = draw.uniform(0.0, MAX_SECOND_DELAY) if codes.total() % 2 else None
-                code, wrong = interrupted(output, draw.uniform(0.0, asked.seconds), second)
+                code, wrong = interrupted(output, draw.uniform(0.0, options.seconds), second)
                 faults += wrong
                 if code == 0:
                     for folder in REMADE:

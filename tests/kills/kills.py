@@ -1,11 +1,15 @@
-"""Kill a study again and again, at moments drawn from a seed, and see that every run after it ends in the same numbers: `make kills`.
+"""Kill a study again and again, at moments drawn from a seed, and see that every run after it ends
+in the same numbers: `make kills`.
 
-A round is one output root. The study is started in it and killed in its ingest, started again and killed in its downsampling, and so on
-through training, evaluation and report; the last run is left to end. So the kills of a round pile up, which is harder than one kill a
-root, and what is checked at the end of a round is said of each of its kills. Signals are SIGKILL, SIGTERM and SIGINT in turn. A moment
-is an event that can be seen from outside (an artefact is locked, begun or made, a checkpoint is there, a run of MLflow is begun or
-marked) and a delay of up to 60 ms from there; how far a run has come by then is the machine's own, and is not the same twice. A run that
-ends before its moment comes is no kill: another round makes up for it. In every fourth round jobs run side by side.
+A round is one output root. The study is started in it and killed in its ingest, started again and
+killed in its downsampling, and so on through training, evaluation and report; the last run is left
+to end. So the kills of a round pile up, which is harder than one kill a root, and what is checked
+at the end of a round is said of each of its kills. Signals are SIGKILL, SIGTERM and SIGINT in turn.
+A moment is an event that can be seen from outside (an artefact is locked, begun or made, a
+checkpoint is there, a run of MLflow is begun or marked) and a delay of up to 60 ms from there; how
+far a run has come by then is the machine's own, and is not the same twice. A run that ends before
+its moment comes is no kill: another round makes up for it. In every fourth round jobs run side by
+side.
 """
 
 import argparse
@@ -77,7 +81,9 @@ Kill = namedtuple("Kill", "stage number moment exit_code at_once")
 
 
 def started(output, jobs):
-    """Start the study in ``output``, in a process that leads a session of its own and says what it says in a log beside."""
+    """Start the study in ``output``, in a process that leads a session of its own and says what it
+    says in a log beside.
+    """
     with open(output.with_suffix(".log"), "ab") as log:
         words = ["-m", "vehest", *STUDY, f"output={output}", "--jobs", jobs]
         return start([sys.executable, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
@@ -97,13 +103,16 @@ def session(leader):
 
 
 def strays(leader, patience=20.0):
-    """Processes of a run that outlive it for more than ``patience`` seconds; they are ended here."""
+    """Processes of a run that outlive it for more than ``patience`` seconds.
+
+    They are ended here.
+    """
     end = time.monotonic() + patience
-    while (found := session(leader)) and time.monotonic() < end:
+    while (processes := session(leader)) and time.monotonic() < end:
         time.sleep(LOOK_SECONDS)
-    for process in found:
+    for process in processes:
         os.kill(process, signal.SIGKILL)
-    return [f"process {process}" for process in found]
+    return [f"process {process}" for process in processes]
 
 
 def killed(output, stage, number, jobs, draw):
@@ -125,7 +134,8 @@ def killed(output, stage, number, jobs, draw):
             strays(process.pid)
             if process.returncode != 0:
                 raise SystemExit(
-                    f"a run failed by itself with exit code {process.returncode}, see '{output.with_suffix('.log')}'"
+                    f"a run failed by itself with exit code {process.returncode}, "
+                    f"see '{output.with_suffix('.log')}'"
                 )
             return None
         time.sleep(LOOK_SECONDS)
@@ -135,7 +145,7 @@ def killed(output, stage, number, jobs, draw):
     left = strays(process.pid)
     if code == 0:
         return None
-    left += locks_held(output) + broken(output)
+    left += busy_locks(output) + broken(output)
     left += (
         [f"exit code {code} instead of {EXIT_CODES[number]}"] if code != EXIT_CODES[number] else []
     )
@@ -149,45 +159,50 @@ def artefacts(output):
 
 def broken(output):
     """Folders that are not whole."""
-    found = []
+    complaints = []
     for folder in artefacts(output):
         try:
             read_artefact(folder)
         except VehestError:
-            found.append(f"half of {folder.name}")
-    return found
+            complaints.append(f"half of {folder.name}")
+    return complaints
 
 
-def locks_held(output):
+def busy_locks(output):
     """Locks that somebody holds."""
-    held = []
+    locks = []
     for file in (output / "locks").glob("*.lock"):
         with open(file, "rb") as stream:
             try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                held.append(f"lock {file.name}")
-    return held
+                locks.append(f"lock {file.name}")
+    return locks
 
 
 def content(output):
-    """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that it publishes."""
-    found = {}
+    """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that
+    it publishes.
+    """
+    contents = {}
     for folder in artefacts(output):
         artefact = read_artefact(folder)
-        own = f"{artefact.stage}/{folder.name} {artefact.status}"
-        found[own] = artefact.digest
+        artefact_name = f"{artefact.stage}/{folder.name} {artefact.status}"
+        contents[artefact_name] = artefact.digest
         if artefact.stage == "report":
             with open(folder / "metrics.csv", newline="", encoding="utf-8") as stream:
-                found[own] = json.dumps(
+                contents[artefact_name] = json.dumps(
                     [row for row in csv.DictReader(stream) if row["metric"] not in TIMES]
                 )
-    return found
+    return contents
 
 
 def tracked(output):
-    """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
-    found = {}
+    """Finished run -> its artefact and what was logged of it, times aside.
+
+    Runs that are neither finished nor killed by that name.
+    """
+    runs = {}
     with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
         for run, name, status in store.execute(
             "select run_uuid, name, status from runs where lifecycle_stage = 'active'"
@@ -197,8 +212,8 @@ def tracked(output):
             ):  # of an interrupted training, by which it is told from the finished one
                 continue
             keys, points, parameters = (
-                store.execute(f"select {what} where run_uuid = ? {rest}", [run]).fetchall()
-                for what, rest in (
+                store.execute(f"select {columns} where run_uuid = ? {condition}", [run]).fetchall()
+                for columns, condition in (
                     ("value from tags", "and key = 'vehest.key'"),
                     ("key, step, value from metrics", "order by key, step, value"),
                     ("key, value from params", "order by key"),
@@ -208,27 +223,33 @@ def tracked(output):
                 str(file.relative_to(output / "mlartifacts" / run))
                 for file in (output / "mlartifacts" / run).rglob("*.*")
             )
-            own = f"{name} {status} {keys[0][0] if keys else ''}"
+            run_name = f"{name} {status} {keys[0][0] if keys else ''}"
             logged = [[point for point in points if "_seconds" not in point[0]], parameters, files]
-            found[own + (f" again {run}" if own in found else "")] = json.dumps(logged)
-    return found
+            runs[run_name + (f" again {run}" if run_name in runs else "")] = json.dumps(logged)
+    return runs
 
 
 def leftovers(output):
     """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
-    found = [
+    paths = [
         str(path.relative_to(output))
         for path in output.rglob(".*")
         if path.name.startswith((".writing-", ".parts-"))
     ]
-    return [*found, *glob("checkpoints/*", root_dir=output), *locks_held(output)]
+    return [*paths, *glob("checkpoints/*", root_dir=output), *busy_locks(output)]
 
 
-def one_round(position, wanted, output, reference, draw):
-    """Kill runs in one output root, let the last one end, and look at what there is: kills, and a row of the table for each, unnumbered."""
+def kill_round(position, planned_kills, output, reference, draw):
+    """Kill runs in one output root, let the last one end, and look at what there is: kills, and a
+    row of the table for each, unnumbered.
+    """
     jobs = 2 if position % 4 == 3 else 1
     kills = [
-        kill for kill in (killed(output, *each, jobs, draw) for each in wanted) if kill is not None
+        kill
+        for kill in (
+            killed(output, *stage_and_signal, jobs, draw) for stage_and_signal in planned_kills
+        )
+        if kill is not None
     ]
     last = started(output, jobs)
     code = last.wait(RUN_SECONDS)
@@ -239,13 +260,15 @@ def one_round(position, wanted, output, reference, draw):
     metrics = []
     tracking = []
     for of, differing in () if failed else ((content, metrics), (tracked, tracking)):
-        found = of(output)
-        known = of(reference)
+        actual = of(output)
+        expected = of(reference)
         differing += [
-            name for name in sorted({*found, *known}) if found.get(name) != known.get(name)
+            name for name in sorted({*actual, *expected}) if actual.get(name) != expected.get(name)
         ]
     left += [] if failed else leftovers(output)
-    equal, complete = ("no" if failed or found else "yes" for found in (metrics, tracking))
+    equal, complete = (
+        "no" if failed or differences else "yes" for differences in (metrics, tracking)
+    )
     rows = []
     for place, kill in enumerate(kills):
         remains = "; ".join([*left, *kill.at_once])
@@ -285,20 +308,25 @@ def rounds(missing, draw, scratch, out):
         while missing.total() > 0:
             if position > limit:
                 raise SystemExit("moments are missed again and again")
-            wanted = [
+            planned_kills = [
                 (
                     stage,
                     max(
                         SIGNALS,
-                        key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)),
+                        key=lambda signal_name, stage=stage: (
+                            missing[stage, signal_name],
+                            -SIGNALS.index(signal_name),
+                        ),
                     ),
                 )
                 for stage in STAGES
             ]
-            wanted = [
-                kill for kill in wanted if missing[kill] > 0
+            planned_kills = [
+                kill for kill in planned_kills if missing[kill] > 0
             ]  # of each stage one that is missing most
-            kills, rows = one_round(position, wanted, scratch / f"round{position}", reference, draw)
+            kills, rows = kill_round(
+                position, planned_kills, scratch / f"round{position}", reference, draw
+            )
             missing -= Counter((kill.stage, kill.number) for kill in kills)
             writer.writerows([number + place, *row] for place, row in enumerate(rows))
             stream.flush()
@@ -306,7 +334,8 @@ def rounds(missing, draw, scratch, out):
             bad = bad + worse
             number = number + len(rows)
             print(
-                f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s",
+                f"round {position}: {len(rows)} kills, {bad} bad so far, "
+                f"{time.monotonic() - begun:.0f} s",
                 flush=True,
             )
             if not worse:
@@ -333,22 +362,22 @@ def main():
         default=Path("results/reliability/kills.csv"),
         help="table, a row a kill",
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
     os.environ.pop("MLFLOW_TRACKING_URI", None)
-    out = given.out.resolve()
+    out = options.out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     missing = Counter(
         (STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)])
-        for k in range(given.kills)
+        for k in range(options.kills)
     )
     with tempfile.TemporaryDirectory(prefix="kills-") as scratch:
         try:
-            bad = rounds(missing, random.Random(given.seed), Path(scratch), out)
+            bad = rounds(missing, random.Random(options.seed), Path(scratch), out)
         finally:
             end_all()
     record_tables([out], "make kills", ["script tests/kills/kills.py"])
-    print(f"{given.kills} kills, {bad} of them bad: {out}")
+    print(f"{options.kills} kills, {bad} of them bad: {out}")
     sys.exit(1 if bad else 0)
 
 

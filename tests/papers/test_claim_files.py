@@ -1,4 +1,6 @@
-"""claims.yaml, blocks.csv and training.csv: read as they are, or refused in one line that names the fault."""
+"""claims.yaml, blocks.csv and training.csv: read as they are, or refused in one line that names the
+fault.
+"""
 
 from pathlib import Path
 
@@ -107,7 +109,7 @@ def test_a_paper_is_read(tmp_path):
         ),
     ],
 )
-def test_a_fault_is_one_line_with_file_claim_and_key(tmp_path, changes, message):
+def test_a_faulty_claim_is_refused_in_a_line_with_file_claim_and_key(tmp_path, changes, message):
     entry = {key: value for key, value in (ORDER | changes).items() if value is not None}
     with pytest.raises(DataError) as caught:
         read_paper(written(tmp_path, entry))
@@ -124,6 +126,13 @@ def test_ids_are_unique_and_tables_name_declared_candidates(tmp_path):
     }
     with pytest.raises(DataError, match="table 'Table I': 'x' is not among the candidates"):
         read_paper(written(tmp_path, tables=[table]))
+
+
+def test_a_recommendation_rests_on_claims_of_the_file(tmp_path):
+    rests_on = {"a_below_b": ["reproduced"]}
+    assert read_paper(written(tmp_path, ORDER, rests_on=rests_on)).rests_on == rests_on
+    with pytest.raises(DataError, match="rests_on: no claim has the id 'a_above_b'"):
+        read_paper(written(tmp_path, ORDER, rests_on={"a_above_b": []}))
 
 
 def test_the_papers_that_come_with_vehest_are_read():

@@ -1,4 +1,6 @@
-"""The claims of the papers as data: claims.yaml of each paper, and the record of the claims that they replaced."""
+"""The claims of the papers as data: claims.yaml of each paper, and the record of the claims that
+they replaced.
+"""
 
 from __future__ import annotations
 
@@ -101,12 +103,12 @@ def test_ids_are_unique(paper: str):
 @pytest.mark.parametrize("paper", PAPERS)
 def test_every_candidate_is_declared_and_used(paper: str):
     content = read_claims(paper)
-    used = {
+    used_candidates = {
         claim[key] for claim in content["claims"] for key in ("candidate", "other") if key in claim
     }
-    used |= {row["candidate"] for table in content["tables"] for row in table["rows"]}
-    assert used <= set(content["candidates"])
-    assert set(content["candidates"]) - used <= {"zero", "static_map"}
+    used_candidates |= {row["candidate"] for table in content["tables"] for row in table["rows"]}
+    assert used_candidates <= set(content["candidates"])
+    assert set(content["candidates"]) - used_candidates <= {"zero", "static_map"}
 
 
 @pytest.mark.parametrize("paper", PAPERS)
@@ -229,7 +231,10 @@ def test_tables_of_ksnn_are_those_of_the_report(table: str, constants: Any, test
 )
 def test_structures_of_ksnn_are_those_of_the_report(table: str, constants: Any):
     rows = [
-        row for own in read_claims("ksnn")["tables"] if own["table"] == table for row in own["rows"]
+        row
+        for table_entry in read_claims("ksnn")["tables"]
+        if table_entry["table"] == table
+        for row in table_entry["rows"]
     ]
     for row in rows:
         published = constants[row["candidate"]]

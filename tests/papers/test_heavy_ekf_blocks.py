@@ -1,4 +1,6 @@
-"""Errors by block of the heavy vehicle's study: they add up to the figures that the report shows."""
+"""Errors by block of the heavy vehicle's study: they add up to the figures that the report
+shows.
+"""
 
 import math
 from dataclasses import replace
@@ -30,7 +32,9 @@ ERRORS = {"zero": 0.01, "ratte": 0.002, "lint": 0.005, "ratmu": 0.004}
 
 @pytest.fixture(scope="module")
 def part(tmp_path_factory):
-    """Estimates of one drive that err by noise of the given deviation [rad], scored as an evaluation does."""
+    """Estimates of one drive that err by noise of the given deviation [rad], scored as an
+    evaluation does.
+    """
     folder = tmp_path_factory.mktemp("heavy")
     drive = short_drive(120.0)
     models = []
@@ -42,7 +46,9 @@ def part(tmp_path_factory):
         channels = {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip}
         estimate = Estimate("short", variant, RATE, 0.0, channels)
         write_estimate(estimate, home / "laps" / "0.parquet")
-        scored = score_all(lambda _, own=estimate: own, [SPAN], lambda _: drive, PROTOCOL)
+        scored = score_all(
+            lambda _, drive_estimate=estimate: drive_estimate, [SPAN], lambda _: drive, PROTOCOL
+        )
         write_segments(home / "blocks.csv", {"laps": segments_of(scored, RATE)})
         family = "zero" if variant == "zero" else "rational_ekf"
         models.append(EvaluatedModel(family, variant, variant, 0, home, home))
@@ -53,11 +59,11 @@ def part(tmp_path_factory):
 
 def of_metric(rows, metric):
     """Candidate -> block -> (value, size)."""
-    found = {}
+    by_candidate = {}
     for row in rows:
         if row.metric == metric:
-            found.setdefault(row.candidate, {})[row.block] = (row.value, row.size)
-    return found
+            by_candidate.setdefault(row.candidate, {})[row.block] = (row.value, row.size)
+    return by_candidate
 
 
 def test_blocks_add_up_to_the_rmse(part):
@@ -70,7 +76,9 @@ def test_blocks_add_up_to_the_rmse(part):
     for candidate, variant in (("zero", "zero"), ("RATTE", "ratte"), ("LINT", "lint")):
         assert list(squares[candidate]) == blocks, "the same for all candidates"
         values, sizes = np.array(list(squares[candidate].values())).T
-        (scored,) = part.scored(next(own for own in part.models if own.variant == variant), "laps")
+        (scored,) = part.scored(
+            next(model for model in part.models if model.variant == variant), "laps"
+        )
         rmse = math.sqrt(values.sum() / sizes.sum())
         assert rmse == pytest.approx(accuracy([scored])["rmse_sideslip"], rel=1e-9)
 
@@ -93,14 +101,14 @@ def test_the_twins_cells_give_the_rmse_of_its_map():
         "slip_8_stiffness_minus_20",
         "slip_5_stiffness_0",
     }
-    (known,) = (cell for cell in cells if (cell.slip, cell.mismatch) == (5.0, 0.0))
+    (mapped_cell,) = (cell for cell in cells if (cell.slip, cell.mismatch) == (5.0, 0.0))
     errors = of_metric(
         [row for row in rows if row.test_set == "slip_5_stiffness_0"], "rmse_sideslip"
     )
     for name in names:
         values, sizes = np.array(list(errors[name.replace(" ", "_")].values())).T
         assert len(values) == factorial.SEEDS
-        assert math.sqrt(values.sum() / sizes.sum()) == pytest.approx(known.rmse(name))
+        assert math.sqrt(values.sum() / sizes.sum()) == pytest.approx(mapped_cell.rmse(name))
 
 
 def test_wheel_speeds_of_a_drive_in_bends_come_together(tmp_path):
@@ -113,9 +121,9 @@ def test_wheel_speeds_of_a_drive_in_bends_come_together(tmp_path):
     part = part_of(
         split, PROTOCOL, [], [], references=stored(tmp_path, "car", {"short": fast, "learnt": fast})
     )
-    found = of_metric(block_errors.wheel_rows("av21", part), "rmse_wheel_speed_spread")
+    by_candidate = of_metric(block_errors.wheel_rows("av21", part), "rmse_wheel_speed_spread")
     (measured, corrected) = (
-        found[name] for name in ("measured wheel speeds", "corrected wheel speeds")
+        by_candidate[name] for name in ("measured wheel speeds", "corrected wheel speeds")
     )
     assert list(measured) == [f"short 0.00 s, block {k}" for k in range(1, 7)]
     spread = np.var(

@@ -1,4 +1,6 @@
-"""The drawn trucks, the Ferrari's folds and the search for noise levels, on drives whose answer is known."""
+"""The drawn trucks, the Ferrari's folds and the search for noise levels, on drives whose answer is
+known.
+"""
 
 import math
 from dataclasses import replace
@@ -116,11 +118,14 @@ def test_rear_slip_and_gain_of_a_lap():
     assert drawn.bend_gain(recording, 0.7 * recording["sideslip_ref"]) == pytest.approx(0.7)
 
 
-def test_search_finds_levels_that_are_as_good_as_those_that_made_the_noise():
+def test_search_finds_levels_as_good_as_the_simulated_noise_levels():
     recordings = [drive(Conditions(3.0), seed, 30.0).recording for seed in (50, 51)]
     drives = [measured_drive(recording, CURVES) for recording in recordings]
-    made_with = Levels(ay=0.1, steer=0.002)
-    errors = [each.rmse(sideslip_of(paper.RATT, made_with, each)) for each in drives]
+    simulated_levels = Levels(ay=0.1, steer=0.002)
+    errors = [
+        tuning_drive.rmse(sideslip_of(paper.RATT, simulated_levels, tuning_drive))
+        for tuning_drive in drives
+    ]
     result = tuned(paper.RATT, drives)
     assert result.cost <= 1.02 * math.exp(np.mean(np.log(errors)))
 
@@ -151,7 +156,9 @@ def test_every_fold_is_scored_by_levels_and_curves_of_the_others(monkeypatch):
     outcome = cross_validation.cross_validated("ferrari", part)
     fold = seconds / cross_validation.N_FOLDS
     of_ratt = [drives for name, drives in trained if name == paper.RATT]
-    lengths = [sum(len(each.samples) for each in drives) / 20.0 for drives in of_ratt]
+    lengths = [
+        sum(len(tuning_drive.samples) for tuning_drive in drives) / 20.0 for drives in of_ratt
+    ]
     gaps = [1, 2, 2, 2, 1]
     expected = [seconds - fold - 2.0 * number for number in gaps]
     assert lengths == pytest.approx(expected, abs=0.2)
@@ -163,7 +170,7 @@ def test_every_fold_is_scored_by_levels_and_curves_of_the_others(monkeypatch):
     assert errors.sums.sum() == pytest.approx(squared[30:].sum())
 
 
-def test_orders_have_a_row_a_claim_and_print_the_power_of_what_is_not_significant():
+def test_orders_have_a_row_per_claim_and_print_the_power_if_not_significant():
     generator = np.random.default_rng(0)
     ratios = {"LINT": 1.0, "RATT": 1.0, "RATTE": 0.5}
     rows = []

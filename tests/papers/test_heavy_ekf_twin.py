@@ -1,4 +1,6 @@
-"""The twin of the heavy vehicle: plant, tyres, driver, the filter with a crossfall state, and how cells are compared."""
+"""The twin of the heavy vehicle: plant, tyres, driver, the filter with a crossfall state, and how
+cells are compared.
+"""
 
 import math
 from dataclasses import replace
@@ -50,11 +52,13 @@ def dry():
     [Conditions(3.0), Conditions(8.0, payload=True, wet_patches=True, crossfall=True)],
     ids=str,
 )
-def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditions):
-    """Steered as it was: SciPy's Dormand and Prince at 1e-10, with slips and forces written out here."""
+def test_the_plant_agrees_with_another_integrator_of_equations_1_to_6(conditions):
+    """Steered as it was: SciPy's Dormand and Prince at 1e-10, with slips and forces written out
+    here.
+    """
     plant = Plant.of(payload=conditions.payload)
-    own = course(conditions, np.random.default_rng(3), 12.0)
-    states, steer, lateral = driven(plant, own)
+    planned = course(conditions, np.random.default_rng(3), 12.0)
+    states, steer, lateral = driven(plant, planned)
     car = plant.car
     step = 1.0 / (RATE * SUBSTEPS)
     front_load = plant.load_front
@@ -62,8 +66,8 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
 
     def slope(time, state, k):
         beta, r = state
-        u = own.speed[k]
-        mu = own.friction[k]
+        u = planned.speed[k]
+        mu = planned.friction[k]
         slips = steer[k] - beta - car.cg_to_front_axle * r / u, -beta + car.cg_to_rear_axle * r / u
         front, rear = (
             c2 * mu * load * slip * c1 * (mu + 1.0) / (slip**2 + c1 * (mu + 1.0))
@@ -72,7 +76,7 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
             )
         )
         turning = (car.cg_to_front_axle * front - car.cg_to_rear_axle * rear) / car.yaw_inertia
-        return [(front + rear) / (car.mass * u) - r + own.road[k] / u, turning]
+        return [(front + rear) / (car.mass * u) - r + planned.road[k] / u, turning]
 
     state = np.zeros(2)
     for k in range(len(steer) - 1):
@@ -80,12 +84,12 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
             np.testing.assert_allclose(states[k], state, rtol=0.0, atol=2e-7)
             beta_rate = slope(0.0, states[k], k)[0]
             assert lateral[k] == pytest.approx(
-                own.speed[k] * (beta_rate + states[k, 1]) - own.road[k], abs=1e-9
+                planned.speed[k] * (beta_rate + states[k, 1]) - planned.road[k], abs=1e-9
             )
-        found = integrate.solve_ivp(
+        solution = integrate.solve_ivp(
             slope, (0.0, step), state, method="DOP853", rtol=1e-10, atol=1e-13, args=(k,)
         )
-        state = found.y[:, -1]
+        state = solution.y[:, -1]
 
 
 def test_axles_loads_and_curves_of_the_truck_are_the_papers():
@@ -106,27 +110,33 @@ def test_axles_loads_and_curves_of_the_truck_are_the_papers():
 @pytest.mark.parametrize("slip", factorial.SLIPS)
 def test_the_driver_reaches_the_slip_and_does_not_spin(slip):
     for seed in range(3):
-        own = drive(Conditions(slip), seed)
-        assert np.degrees(np.abs(own.rear_slip)).max() == pytest.approx(slip, rel=0.05)
-        assert np.degrees(np.abs(own.sideslip)).max() < 15.0
+        steered_drive = drive(Conditions(slip), seed)
+        assert np.degrees(np.abs(steered_drive.rear_slip)).max() == pytest.approx(slip, rel=0.05)
+        assert np.degrees(np.abs(steered_drive.sideslip)).max() < 15.0
 
 
-def test_seeds_decide_course_and_sensors_and_tuning_has_seeds_and_cells_of_its_own():
-    one = drive(Conditions(4.0), 5, SECONDS)
-    other = drive(Conditions(4.0, crossfall=True), 5, SECONDS)
-    np.testing.assert_array_equal(one.samples[:, 1], other.samples[:, 1])
-    noise = [own.samples[:, 0] - own.yaw_rate for own in (one, other)]
+def test_seeds_decide_course_and_sensors_and_tuning_shares_no_seed_or_cell():
+    level_drive = drive(Conditions(4.0), 5, SECONDS)
+    crossfall_drive = drive(Conditions(4.0, crossfall=True), 5, SECONDS)
+    np.testing.assert_array_equal(level_drive.samples[:, 1], crossfall_drive.samples[:, 1])
+    noise = [
+        noisy_drive.samples[:, 0] - noisy_drive.yaw_rate
+        for noisy_drive in (level_drive, crossfall_drive)
+    ]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
     assert not set(TUNED_SLIPS) & set(factorial.SLIPS)
     assert not set(TUNED_MISMATCHES) & set(factorial.MISMATCHES)
     assert factorial.SEEDS <= FIRST_TUNING_SEED
-    starts = {round(float(each.curves[1] / CURVES[1]) - 1.0, 9) for each in tuning_drives()}
+    starts = {
+        round(float(tuning_drive.curves[1] / CURVES[1]) - 1.0, 9)
+        for tuning_drive in tuning_drives()
+    }
     assert starts == set(TUNED_MISMATCHES)
     assert all(high - low >= 8.0 for low, high in BOX.values())
 
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
-def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name, dry):
+def test_a_crossfall_fixed_at_zero_leaves_the_papers_filter(name, dry):
     """Also where it restarts: a limit of 1.5° on a drive that goes beyond."""
     estimator = estimator_of(name, LEVELS, mistaken(-0.2))
     for limit in (estimator.largest_sideslip, math.radians(1.5)):
@@ -140,7 +150,7 @@ def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name,
 
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
-def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobians(name):
+def test_crossfall_filter_agrees_with_the_readable_filter_with_automatic_jacobians(name):
     estimator = estimator_of(name, LEVELS, mistaken(-0.2))
     samples = drive(Conditions(5.0, crossfall=True), 1, 6.0).samples
     plain = rational_model(estimator)
@@ -222,7 +232,7 @@ def test_regions_count_every_cell_of_the_map():
     }
 
 
-def test_tracks_are_found_from_rolling_wheels():
+def test_tracks_are_identified_from_rolling_wheels():
     time = np.arange(2000) / 20.0
     turn = 0.3 * np.sin(0.3 * time)
     u = np.full(2000, 20.0)

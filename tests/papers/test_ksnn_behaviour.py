@@ -1,4 +1,6 @@
-"""How estimators behave: biases taken off, the start of a window, low yaw rates and spectra, on drives whose truth is known."""
+"""How estimators behave: biases taken off, the start of a window, low yaw rates and spectra, on
+drives whose truth is known.
+"""
 
 import math
 from dataclasses import replace
@@ -25,7 +27,9 @@ SECONDS = 240.0
 
 
 def scheme(folder, *, bias=False):
-    """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
+    """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too
+    little.
+    """
     drives = {
         name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))
     }
@@ -75,10 +79,10 @@ def scheme(folder, *, bias=False):
 
 
 def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(tmp_path):
-    own = scheme(tmp_path)
-    biases = behaviour.mean_biases(own)
-    corrected = behaviour.without_biases(own, paper.LINEAR, biases, "f2")
-    measured = [model.segments("f2") for model in own.models(paper.LINEAR)]
+    planted_scheme = scheme(tmp_path)
+    biases = behaviour.mean_biases(planted_scheme)
+    corrected = behaviour.without_biases(planted_scheme, paper.LINEAR, biases, "f2")
+    measured = [model.segments("f2") for model in planted_scheme.models(paper.LINEAR)]
     errors = SegmentErrors({"corrected": corrected, "as measured": measured})
     assert biases["own"] == pytest.approx(0.0, abs=2e-3)
     assert biases["other"] == pytest.approx(OFFSET, abs=2e-3)
@@ -94,8 +98,10 @@ def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(t
 
 
 def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp_path):
-    own = scheme(tmp_path)
-    segments, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
+    planted_scheme = scheme(tmp_path)
+    segments, share = behaviour.at_low_yaw_rate(
+        planted_scheme, 0.1, [paper.ZERO, paper.LINEAR], "c2"
+    )
     errors = SegmentErrors(segments)
     drive = planar_drive(SECONDS, seed=1)
     scored = np.arange(len(drive)) >= 30
@@ -105,18 +111,21 @@ def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp
         math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6
     )
     for threshold in (0.0, 100.0):
-        assert paper.ZERO not in behaviour.at_low_yaw_rate(own, threshold, [paper.ZERO], "c2")[0]
+        assert (
+            paper.ZERO
+            not in behaviour.at_low_yaw_rate(planted_scheme, threshold, [paper.ZERO], "c2")[0]
+        )
 
 
 def test_band_levels_are_the_density_of_the_error(tmp_path):
-    own = scheme(tmp_path)
-    model = own.model(paper.ZERO)
+    planted_scheme = scheme(tmp_path)
+    model = planted_scheme.model(paper.ZERO)
     drive = planar_drive(SECONDS, seed=1, name="c2")
     noise = np.random.default_rng(0).normal(0.0, 0.1, len(drive))
     estimate = estimator_class("zero").from_config({"rate_hz": 20.0}).estimate([drive])[0]
     noisy = replace(estimate, channels={**estimate.channels, "vy": drive["vy_ref"] + noise})
     write_estimate(noisy, model.evaluation_folder / "c2" / "0.parquet")
-    names, powers = measures.band_powers(own, model, "c2")
+    names, powers = measures.band_powers(planted_scheme, model, "c2")
     assert names[:2] == ["c2 1.50 s", "c2 27.10 s"]
     densities = powers[:, 3:].mean(axis=0)
     assert np.mean(densities) == pytest.approx(0.1**2 / 10.0, rel=0.1), (

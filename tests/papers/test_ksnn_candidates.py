@@ -73,7 +73,7 @@ def part(figures=FIGURES, drop=""):
     )
 
 
-def test_runs_have_a_row_a_model_with_all_metrics_and_missing_ones_are_said():
+def test_runs_have_a_row_per_model_and_missing_metrics_are_named():
     runs = runs_of(part())
     assert len(runs) == len(FIGURES)
     row = runs[(runs["variant"] == "states_3") & (runs["seed"] == 1)].iloc[0]

@@ -1,4 +1,6 @@
-"""Errors by block and verdicts on the paper's claims: where our errors are the paper's own figures they come out."""
+"""Errors by block and verdicts on the paper's claims: where our errors are the paper's own figures
+they come out.
+"""
 
 import math
 from dataclasses import replace
@@ -46,12 +48,14 @@ N_PARAMETERS = {name: row.n_parameters for name, row in ksnn_tables.TABLE_IV.ite
 
 
 def planted_segments(fvu, test, seed):
-    """Segments of a drive in which so much of v is left, errors large where those of every other candidate are."""
+    """Segments of a drive in which so much of v is left, errors large where those of every other
+    candidate are.
+    """
     common = np.random.default_rng(len(test) + ord(test[0]))
     hard = common.lognormal(0.0, 0.4, SEGMENTS)
-    own = np.random.default_rng(seed).lognormal(0.0, 0.1, SEGMENTS)
+    noise = np.random.default_rng(seed).lognormal(0.0, 0.1, SEGMENTS)
     variance = DEVIATION[test] ** 2
-    share = hard * own / np.mean(hard * own)
+    share = hard * noise / np.mean(hard * noise)
     return Segments(
         piece=np.repeat([0.0, 1.0], SEGMENTS // 2),
         start=np.tile(np.arange(SEGMENTS // 2, dtype=float), 2),
@@ -66,35 +70,37 @@ def planted_segments(fvu, test, seed):
 
 
 def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2"), names=NAMES):
-    """A comparison whose candidates leave this FVU, category -> test set -> FVU, whose logarithm has a spread from seed to seed."""
+    """A comparison whose candidates leave this FVU, category -> test set -> FVU, whose logarithm
+    has a spread from seed to seed.
+    """
     generator = np.random.default_rng(1)
     rows = []
     models = []
-    other = "f" if train == "c" else "c"
+    other_car = "f" if train == "c" else "c"
     for category, by_test in fvus.items():
         estimator, variant = names[category]
         for seed in range(seeds if estimator in ("gru", "lstm", "ksnn") else 1):
             at = folder / f"{train}-{estimator}-{variant}-{seed}"
             at.mkdir(parents=True)
-            own = {
+            seed_fvus = {
                 test: by_test[test] * math.exp(spread * generator.standard_normal())
                 for test in tests
             }
             write_segments(
                 at / "blocks.csv",
-                {test: planted_segments(own[test], test, seed + 10) for test in tests},
+                {test: planted_segments(seed_fvus[test], test, seed + 10) for test in tests},
             )
             trained = {"max_epochs": 1000} if estimator in ("gru", "lstm", "ksnn") else {}
             models.append(EvaluatedModel(estimator, variant, category, seed, at, at, trained))
-            validation = own[f"{other}2"]
+            validation = seed_fvus[f"{other_car}2"]
             values = {
                 ("validation", "fvu"): validation,
                 ("validation", "rmse_vy"): math.sqrt(validation),
             }
             for test in tests:
                 values |= {
-                    (test, "fvu"): own[test],
-                    (test, "rmse_vy"): math.sqrt(own[test]) * DEVIATION[test],
+                    (test, "fvu"): seed_fvus[test],
+                    (test, "rmse_vy"): math.sqrt(seed_fvus[test]) * DEVIATION[test],
                 }
                 values |= {(test, "n_parameters"): N_PARAMETERS[category], (test, "epochs"): 10}
             for test in ("validation", *tests):
@@ -109,10 +115,10 @@ def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2"
             ]
     spans = {
         name: tuple(Span("cars", f"{name}_{place}", -math.inf, math.inf) for place in (1, 2))
-        for name in (f"{train}1", f"{other}1", *tests)
+        for name in (f"{train}1", f"{other_car}1", *tests)
     }
     split = Split(
-        "scheme", spans[f"{train}1"], spans[f"{other}1"], {test: spans[test] for test in tests}
+        "scheme", spans[f"{train}1"], spans[f"{other_car}1"], {test: spans[test] for test in tests}
     )
     return part_of(
         split, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"}
@@ -131,18 +137,24 @@ def of_the_paper(table, static_map=0.6):
 
 def schemes(folder, fvus=None, **options):
     """Both schemes, with the paper's figures if no others are given."""
-    made = []
-    for name, (table, train, own, other) in PUBLISHED.items():
+    scheme_list = []
+    for name, (table, train, same_car_test, other_test) in PUBLISHED.items():
         part = planted_part(folder / name, (fvus or of_the_paper)(table), train=train, **options)
-        made.append(Scheme(name, name.replace("_", " ").capitalize(), part, own, other))
-    return made
+        scheme_list.append(
+            Scheme(name, name.replace("_", " ").capitalize(), part, same_car_test, other_test)
+        )
+    return scheme_list
 
 
 def judged(parts):
-    """Verdicts of the engine on the errors by block of some parts, without networks to run again."""
+    """Verdicts of the engine on the errors by block of some parts, without networks to run
+    again.
+    """
     claimed = claims_of("ksnn")
     parts = with_common_blocks({scheme.name: scheme for scheme in parts})
-    without_estimates = [own for own in claimed.claims if not own.metric.startswith("band_power")]
+    without_estimates = [
+        claim for claim in claimed.claims if not claim.metric.startswith("band_power")
+    ]
     rows = block_errors.error_rows(replace(claimed, claims=without_estimates), parts, {})
     of_errors = {"smallest_car_ratio", "relative_car_ratios", "parameter_rank_correlations"}
     of_errors |= {"specialised_over_others", "regularisation_loss_ratios", "operation_ratios"}
@@ -155,13 +167,13 @@ def judged(parts):
         and (claim.part in parts or "scheme_1" in parts)
     ]
     rows += block_errors.measured_rows(replace(claimed, claims=chosen), parts)
-    artefacts = {name: own.part for name, own in parts.items()}
+    artefacts = {name: scheme.part for name, scheme in parts.items()}
     training = block_errors.training_rows(claimed, artefacts, parts)
     return judge_paper(claimed, blocks_of(rows), training_of(training)), rows, training
 
 
-def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
-    found, rows, _ = judged(schemes(tmp_path))
+def test_the_published_figures_give_the_papers_verdicts(tmp_path):
+    verdicts, rows, _ = judged(schemes(tmp_path))
     for claim in (
         "luenberger_about_a_quarter_own_scheme_1",
         "gru_above_luenberger_other_scheme_2",
@@ -175,21 +187,21 @@ def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
         "most_specialised_is_nonlinear_bias",
         "few_operations",
     ):
-        assert found[claim].verdict == "reproduced", (claim, found[claim])
+        assert verdicts[claim].verdict == "reproduced", (claim, verdicts[claim])
     # the paper's text rounds its Table IV
-    assert found["gru_explains_over_90_percent_own_scheme_1"].verdict == "contradicted"
-    assert found["early_stopping_at_about_200_epochs_scheme_1"].verdict == "contradicted"
-    assert found["nonlinear_below_gru_f1tenth_dart"].verdict == "not assessed"
-    alike = found["no_bias_cars_more_alike_linear_scheme_1"].values["KS-NN linear no bias"]
-    assert alike.value == pytest.approx((0.152 / 0.133) / (0.241 / 0.082), rel=0.05)
-    least = found["all_structures_above_diagonal_scheme_1"].values["measured"]
-    assert least.value == pytest.approx(0.253 / 0.235, rel=0.05), "Luenberger's"
-    own = next(claim for claim in found if claim == "luenberger_about_a_quarter_own_scheme_1")
-    assert found[own].values["Luenberger"].value == pytest.approx(0.235, rel=0.05)
+    assert verdicts["gru_explains_over_90_percent_own_scheme_1"].verdict == "contradicted"
+    assert verdicts["early_stopping_at_about_200_epochs_scheme_1"].verdict == "contradicted"
+    assert verdicts["nonlinear_below_gru_f1tenth_dart"].verdict == "not assessed"
+    alikeness = verdicts["no_bias_cars_more_alike_linear_scheme_1"].values["KS-NN linear no bias"]
+    assert alikeness.value == pytest.approx((0.152 / 0.133) / (0.241 / 0.082), rel=0.05)
+    smallest_ratio = verdicts["all_structures_above_diagonal_scheme_1"].values["measured"]
+    assert smallest_ratio.value == pytest.approx(0.253 / 0.235, rel=0.05), "Luenberger's"
+    luenberger = verdicts["luenberger_about_a_quarter_own_scheme_1"].values["Luenberger"]
+    assert luenberger.value == pytest.approx(0.235, rel=0.05)
     assert {row.candidate for row in rows if row.metric == "fvu"} >= {"zero", "static_map", "GRU"}
 
 
-def test_networks_that_were_not_checked_are_said_to_be_so(tmp_path):
+def test_networks_that_were_not_checked_are_reported_as_such(tmp_path):
     _, _, training = judged(schemes(tmp_path))
     rows = {row.candidate: row for row in training}
     assert rows["Luenberger"].training == rows["zero"].training == "not applicable"
@@ -211,7 +223,7 @@ def test_regularisation_is_compared_on_the_same_structures_and_blocks(tmp_path):
     )
     table = {paper.LSTM: {"c2": 0.84, "f2": 0.042}, paper.NONLINEAR: {"c2": 0.197, "f2": 0.059}}
     without = planted_part(tmp_path / "without", table, train="f", names=names)
-    found, rows, _ = judged(
+    verdicts, rows, _ = judged(
         [
             Scheme("scheme_2", "With", with_it, "f2", "c2"),
             Scheme("one_vehicle", "Without", without, "f2", "c2"),
@@ -221,11 +233,11 @@ def test_regularisation_is_compared_on_the_same_structures_and_blocks(tmp_path):
         "lstm_without_regularisation_lower_own",
         "nonlinear_loses_less_without_regularisation",
     ):
-        assert found[claim].verdict == "reproduced", (claim, found[claim])
-    higher = found["lstm_without_regularisation_higher_other"]
+        assert verdicts[claim].verdict == "reproduced", (claim, verdicts[claim])
+    higher = verdicts["lstm_without_regularisation_higher_other"]
     assert higher.size.value == pytest.approx(0.84 / 0.483, rel=0.05)
     assert higher.verdict == "reproduced", "a weakness is not checked against baselines"
-    assert found["lstm_without_regularisation_lower_own"].size.value == pytest.approx(
+    assert verdicts["lstm_without_regularisation_lower_own"].size.value == pytest.approx(
         0.042 / 0.098, rel=0.05
     )
     blocks = {
@@ -247,28 +259,30 @@ def test_linearised_logarithms_have_the_ratio_as_their_mean_and_its_spread():
     sums = rng.lognormal(0.0, 0.3, (2, 60))
     sizes = rng.lognormal(0.0, 0.3, 60)
     logs = measures.log_values(sums, sizes)
-    whole = np.log(sums.sum(axis=1) / sizes.sum())
-    assert logs.mean(axis=1) == pytest.approx(whole)
+    log_rmse = np.log(sums.sum(axis=1) / sizes.sum())
+    assert logs.mean(axis=1) == pytest.approx(log_rmse)
     left_out = np.log((sums.sum(axis=1, keepdims=True) - sums) / (sizes.sum() - sizes))
     jackknife = 59 / 60 * np.square(left_out - left_out.mean(axis=1, keepdims=True)).sum(axis=1)
     assert logs.var(axis=1, ddof=1) / 60 == pytest.approx(jackknife, rel=0.05)
     ratio = measures.as_ratio(logs)
-    assert ratio.mean() == pytest.approx(np.exp(whole.mean()))
+    assert ratio.mean() == pytest.approx(np.exp(log_rmse.mean()))
 
 
 def test_stretches_of_two_tests_have_the_variance_of_both(tmp_path):
     """With the ratio of the FVUs on both cars as their mean."""
     scheme = with_common_blocks({"scheme_1": schemes(tmp_path)[0]})["scheme_1"]
     claim = next(
-        own
-        for own in claims_of("ksnn").claims
-        if own.id == "all_structures_above_diagonal_scheme_1"
+        claim
+        for claim in claims_of("ksnn").claims
+        if claim.id == "all_structures_above_diagonal_scheme_1"
     )
     values = measures.smallest_car_ratio(claim, {"scheme_1": scheme}).values
-    own, other = (
+    c2_errors, f2_errors = (
         scheme.errors(test).block_errors("luenberger/luenberger", "fvu") for test in ("c2", "f2")
     )
-    expected = (other.sums.sum() / other.sizes.sum()) / (own.sums.sum() / own.sizes.sum())
+    expected = (f2_errors.sums.sum() / f2_errors.sizes.sum()) / (
+        c2_errors.sums.sum() / c2_errors.sizes.sum()
+    )
     assert values.mean() == pytest.approx(expected, rel=1e-6)
 
 
@@ -300,16 +314,16 @@ def test_figures_are_those_of_the_samples_and_infinite_errors_left_out():
     assert errors.in_words("broken", "fvu") == "–"
 
 
-def test_masked_segments_without_a_mask_are_the_evaluations_own():
+def test_masked_segments_without_a_mask_equal_the_evaluations_segments():
     generator = np.random.default_rng(2)
     time = np.arange(90) / 20.0
     vy = generator.normal(size=90)
     reference = generator.normal(size=90)
     is_scored = time >= 1.0
     part = Scored(time, vy, reference, vy / 20.0, reference / 20.0, np.zeros(90), is_scored)
-    own = masked_segments([part], [np.ones(90)], 20.0)
+    unmasked = masked_segments([part], [np.ones(90)], 20.0)
     plain = segments_of([part], 20.0)
-    assert all(np.allclose(getattr(own, name), getattr(plain, name)) for name in vars(plain))
+    assert all(np.allclose(getattr(unmasked, name), getattr(plain, name)) for name in vars(plain))
     half = masked_segments([part], [(time < 2.0).astype(float)], 20.0)
     assert (half.samples.sum(), half.sideslip_samples.sum()) == (40, 20)
     assert half.squared_error_vy.sum() == pytest.approx(np.sum((vy - reference)[:40] ** 2))
@@ -320,7 +334,9 @@ def test_masked_segments_without_a_mask_are_the_evaluations_own():
     [(0, False, 36), (0, True, 40), (2, False, 60), (3, True, 88)],
 )
 def test_operations_of_a_ksnn_are_those_of_its_equations(n_hidden, bias, products_and_sums):
-    """Counted by hand in Eqs. 7 to 9: 32 without the four f, and of each f 1, 1 more for a bias, 3 a neuron and 1 more for its bias."""
+    """Counted by hand in Eqs. 7 to 9: 32 without the four f, and of each f 1, 1 more for a bias, 3
+    a neuron and 1 more for its bias.
+    """
     assert cost.ksnn_operations(2, n_hidden, bias=bias) == (products_and_sums, 4 * n_hidden)
     assert cost.ksnn_operations(6, n_hidden, bias=bias) == (products_and_sums, 4 * n_hidden), (
         "two modules at most are active"

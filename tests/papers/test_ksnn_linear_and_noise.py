@@ -1,4 +1,6 @@
-"""A KS-NN's linear forms, sub-models and noise sensitivities against the network, Eqs. 11 and 12, impulse responses and injected noise."""
+"""A KS-NN's linear forms, sub-models and noise sensitivities against the network, Eqs. 11 and 12,
+impulse responses and injected noise.
+"""
 
 import math
 
@@ -49,14 +51,14 @@ def test_local_models_have_the_activations_and_feedback_of_the_network(structure
 def test_gains_are_those_of_the_nearest_models_and_linearisation_the_tangent():
     model = LocalModels.of(ksnn_with_weights(3, 0, True)).linearised()
     for position, centre in enumerate(model.centres.tolist()):
-        own = model.gains(-centre)
-        for found, table in (
-            (own.gamma, model.gamma),
-            (own.beta, model.beta),
-            (own.weight, model.weight),
-            (own.bias, model.bias),
+        gains = model.gains(-centre)
+        for gain, table in (
+            (gains.gamma, model.gamma),
+            (gains.beta, model.beta),
+            (gains.weight, model.weight),
+            (gains.bias, model.bias),
         ):
-            np.testing.assert_allclose(found, table[position], rtol=1e-12)
+            np.testing.assert_allclose(gain, table[position], rtol=1e-12)
     np.testing.assert_allclose(
         model.gains(0.5 * model.centres[1]).gamma, model.gamma[:2].mean(axis=0), rtol=1e-12
     )
@@ -98,8 +100,8 @@ def test_sub_models_add_up_to_the_network_along_a_drive(structure):
     assert np.isnan(parts.total[:30]).all()
     np.testing.assert_allclose(parts.total[30:], expected[30:], rtol=0, atol=1e-9)
     share = [
-        float(np.abs(own[30:]).max())
-        for own in (parts.slip_rate, parts.pseudo_measurement, parts.speed)
+        float(np.abs(contribution[30:]).max())
+        for contribution in (parts.slip_rate, parts.pseudo_measurement, parts.speed)
     ]
     assert min(share) > 0.01
     assert bool(np.abs(parts.bias[30:]).max() > 0.0) is structure[2]
@@ -107,14 +109,16 @@ def test_sub_models_add_up_to_the_network_along_a_drive(structure):
 
 @pytest.mark.parametrize("yaw_rate", [0.25, -0.4])
 def test_sub_models_at_constant_yaw_rate_are_the_terms_of_eq_11(yaw_rate):
-    """Eqs. 11 and 12 filtered from rest, the bias as a step, and what the start at û = u_m adds to the second and third."""
+    """Eqs. 11 and 12 filtered from rest, the bias as a step, and what the start at û = u_m adds to
+    the second and third.
+    """
     models = LocalModels.of(ksnn_with_weights(2, 0, True, window=200))
-    own = models.linearised().gains(yaw_rate)
+    gains = models.linearised().gains(yaw_rate)
     tau = models.step
-    (g1, g2) = own.gamma
-    (b1, b2) = own.beta
-    (w1, w2) = own.weight
-    (bias_1, bias_2) = own.bias
+    (g1, g2) = gains.gamma
+    (b1, b2) = gains.beta
+    (w1, w2) = gains.weight
+    (bias_1, bias_2) = gains.bias
     measurements = _constant_turn(yaw_rate, 200)
     _, speed, ay, ax = measurements[0].T
     denominator = np.array([1.0, w2 - g1 - g2, w1 * b2 * tau * yaw_rate**2 - w2 * g1 + g1 * g2])
@@ -213,10 +217,12 @@ def test_closed_form_of_the_ksnn_is_that_of_its_state_space(yaw_rate):
     expected = np.linalg.solve(
         z[:, None, None] * np.eye(2) - _state_matrix(model, yaw_rate), inputs.astype(complex)
     )[:, 0]
-    found = ksnn_sensitivity(model, yaw_rate)
-    np.testing.assert_allclose(np.stack(found.response(FREQUENCY), axis=1), expected, rtol=1e-9)
+    sensitivity = ksnn_sensitivity(model, yaw_rate)
     np.testing.assert_allclose(
-        np.sort_complex(np.roots(found.denominator)),
+        np.stack(sensitivity.response(FREQUENCY), axis=1), expected, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.sort_complex(np.roots(sensitivity.denominator)),
         np.sort_complex(np.linalg.eigvals(_state_matrix(model, yaw_rate))),
         rtol=1e-9,
     )
@@ -230,17 +236,19 @@ def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_respon
     estimator = _luenberger(rate_hz=rate_hz)
     closed = luenberger_sensitivity(estimator, yaw_rate)
     turn = _turn(yaw_rate, 3000)
-    still = observe(turn, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0]
+    undisturbed = observe(turn, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0]
     for channel, response in zip((AY, AX), closed.response(FREQUENCY), strict=True):
         struck = turn.copy()
         struck[0, channel] += 1.0
-        measured = observe(struck, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0] - still
+        measured = (
+            observe(struck, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0] - undisturbed
+        )
         np.testing.assert_allclose(
             response, _transform(measured, rate_hz), rtol=0, atol=1e-8
         )  # 3000 rounded differences add up
 
 
-def test_variance_is_the_integral_of_the_squared_magnitude_and_a_reset_observer_passes_nothing():
+def test_variance_is_the_band_integral_and_a_reset_observer_passes_nothing():
     model = LocalModels.of(ksnn_with_weights(2, 0, False)).linearised()
     for closed in (
         ksnn_sensitivity(model, 0.3),

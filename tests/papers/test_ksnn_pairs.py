@@ -1,4 +1,6 @@
-"""Pairs of cars: errors raw and after the best gain, complete pairs, intervals and shares of the sub-models."""
+"""Pairs of cars: errors raw and after the best gain, complete pairs, intervals and shares of the
+sub-models.
+"""
 
 import math
 from pathlib import Path
@@ -28,7 +30,7 @@ def test_residuals_are_those_of_a_hand_calculation():
     assert sums["squares"] == pytest.approx(4 * 9.0 + 2.5)
 
 
-def test_best_gain_leaves_what_the_correlation_does_not_explain():
+def test_best_gain_leaves_the_variance_unexplained_by_the_correlation():
     generator = np.random.default_rng(0)
     reference = generator.standard_normal(500)
     estimate = 0.3 * reference + generator.standard_normal(500)
@@ -84,14 +86,14 @@ def complete(n_pairs, ratio=2.0):
 def test_pairs_without_all_trainings_and_seeds_of_some_pairs_are_left_out():
     fvus = complete(3)
     errors = pd.concat([errors_of(fvus), errors_of(complete(2)).assign(seed=1)])
-    kept = pairs._complete(errors)
-    assert set(kept["pair"]) == {"pair 01", "pair 02", "pair 03"}
-    assert set(kept["seed"]) == {0}
+    rows_of_complete_pairs = pairs.complete_pairs(errors)
+    assert set(rows_of_complete_pairs["pair"]) == {"pair 01", "pair 02", "pair 03"}
+    assert set(rows_of_complete_pairs["seed"]) == {0}
     del fvus["pair 03", "stop", paper.GRU]
-    assert set(pairs._complete(errors_of(fvus))["pair"]) == {"pair 01", "pair 02"}
+    assert set(pairs.complete_pairs(errors_of(fvus))["pair"]) == {"pair 01", "pair 02"}
 
 
-def test_ratio_over_pairs_is_the_planted_one_and_its_power_that_of_the_spread():
+def test_ratio_over_pairs_equals_the_planted_ratio_with_power_from_the_spread():
     errors = errors_of(complete(8))
     table = pairs.ratios_table(errors).set_index("over")
     assert table.loc[paper.GRU, "other_stop_raw"].startswith("0.5 [") or table.loc[
@@ -113,19 +115,23 @@ def test_geometric_mean_has_the_interval_of_the_pairs():
 
 def test_rows_of_blocks_are_a_block_each_pair():
     rows = pairs.pair_rows(errors_of(complete(2)))
-    row = next(own for own in rows if own.metric == "fvu_best_gain" and own.block == "pair 02")
+    row = next(
+        block_row
+        for block_row in rows
+        if block_row.metric == "fvu_best_gain" and block_row.block == "pair 02"
+    )
     assert (row.part, row.test_set, row.size) == ("pairs_stop", "own", 4.0)
     assert row.value == pytest.approx(2.0 * 0.2)
-    assert {own.part for own in rows} == {"pairs_stop", "pairs_converged"}
+    assert {block_row.part for block_row in rows} == {"pairs_stop", "pairs_converged"}
 
 
-def test_networks_with_kinematic_gains_are_a_candidate_of_their_own():
+def test_networks_with_kinematic_gains_are_a_separate_candidate():
     variant = "nonlinear_no_bias_p2_q2_kinematic_0.95"
     assert category_of("ksnn", variant) == paper.KINEMATIC_GAIN
 
 
 @pytest.mark.parametrize(("n_hidden", "bias"), [(0, False), (2, True)])
-def test_shares_of_the_sub_models_add_up_to_one(n_hidden, bias):
+def test_shares_of_the_sub_models_add_up_to_unity(n_hidden, bias):
     estimator = ksnn_with_weights(n_local=2, n_hidden=n_hidden, bias=bias)
     shares = variance_shares(estimator, [planar_drive(20.0, seed=1), planar_drive(20.0, seed=2)])
     assert sum(shares.values()) == pytest.approx(1.0)
@@ -140,7 +146,7 @@ def test_ratio_of_v_over_ay_is_that_of_the_quantiles():
         return Recording("drive", "car", 20.0, 0.0, channels, "simulated")
 
     assert velocity_ratio([drive(0.6)], [drive(1.2)]) == pytest.approx(0.5)
-    published = {name: own.velocity_over_ay for name, own in PUBLISHED.items()}
+    published = {name: drive_set.velocity_over_ay for name, drive_set in PUBLISHED.items()}
     assert published["C-1"] / published["F-2"] == pytest.approx(0.66, abs=0.005)
     assert published["C-2"] / published["F-1"] == pytest.approx(0.71, abs=0.005)
 
@@ -153,7 +159,7 @@ def test_published_gates_on_the_ratio_are_met():
     assert np.all(np.abs(table["ours"] / table["published"] - 1.0) <= 0.05)
 
 
-def test_wins_in_leave_one_out_tests_are_those_of_the_published_study():
+def test_stated_leave_out_wins_equal_those_of_the_published_study():
     results = Path(__file__).parents[2] / "results"
     table = pd.read_csv(results / "leave_one_out" / "tables" / "overview.csv", index_col=0)
     row = table.loc[f"{paper.NONLINEAR}, P = 2, Q = 2"]
@@ -176,8 +182,8 @@ def test_report_shows_complete_pairs_of_a_study_that_is_not_finished(place):
         ("converged", {"recording": "one", "start": 50, "stop": 60}),
         ("stop", {"recording": "two", "stop": 50}),
     ):
-        own = {"name": name, "validation": [validation], **ranges}
-        place.change(f"conf/split/{name}.yaml", **split | own)
+        pair_split = {"name": name, "validation": [validation], **ranges}
+        place.change(f"conf/split/{name}.yaml", **split | pair_split)
     networks = [
         [
             "estimator=ksnn",

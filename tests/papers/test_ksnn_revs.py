@@ -1,7 +1,8 @@
 """The study `ksnn_revs` from files of the official form to the rows of its tables.
 
-The recordings are made here in the layout of the Revs database (tests/revs_files.py), a drive each under the file names of the paper's
-Table I. Splits, parts and evaluation are those of pipelines/ksnn_revs.yaml; one seed of one structure of each family trains for two epochs.
+The recordings are made here in the layout of the Revs database (tests/revs_files.py), a drive each
+under the file names of the paper's Table I. Splits, parts and evaluation are those of
+pipelines/ksnn_revs.yaml; one seed of one structure of each family trains for two epochs.
 """
 
 from pathlib import Path
@@ -71,9 +72,7 @@ def study(elsewhere, monkeypatch):
 
 
 @pytest.mark.slow
-def test_official_files_go_through_ingest_training_and_evaluation_to_the_papers_tables(
-    study, capsys
-):
+def test_official_files_are_ingested_trained_and_evaluated_to_the_papers_tables(study, capsys):
     words = ("run", "revs_short", "tracking=none", "training.max_epochs=2")
     code, _, err = run_vehest(capsys, *words)
     assert code == 0, err
@@ -89,7 +88,9 @@ def test_official_files_go_through_ingest_training_and_evaluation_to_the_papers_
     blocks = read_blocks(report / "tables" / "blocks.csv")
     training = read_training(report / "tables" / "training.csv")
     verdicts = judge_paper(paper, blocks, training)
-    assessed = {name for name, own in verdicts.items() if own.verdict != "not assessed"}
+    assessed = {
+        name for name, claim_verdict in verdicts.items() if claim_verdict.verdict != "not assessed"
+    }
     assert {
         "gru_above_luenberger_other_scheme_1",
         "linear_12_parameters_below_gru_other_scheme_2",

@@ -1,4 +1,6 @@
-"""What is said of real recordings: statistics against closed forms, the report on recordings made here, and planted faults."""
+"""What is said of real recordings: statistics against closed forms, the report on recordings made
+here, and planted faults.
+"""
 
 import math
 
@@ -16,7 +18,10 @@ from vehest_papers.real_cars.statistics import statistics_of
 
 
 def drive(seconds=120.0, size=1.0, noise=0.0, name="lap"):
-    """At 20 m/s in a sinusoidal course; v = size·(static part + a part that no static map has) and white noise on its reference."""
+    """At 20 m/s in a sinusoidal course.
+
+    v = size·(static part + a part that no static map has) and white noise on its reference.
+    """
     time = np.arange(round(100.0 * seconds)) / 100.0
     yaw_rate = 0.3 * np.sin(0.4 * time)
     vx = np.full_like(time, 20.0)
@@ -36,17 +41,19 @@ def drive(seconds=120.0, size=1.0, noise=0.0, name="lap"):
 
 
 def test_statistics_are_those_of_the_closed_form():
-    """At constant speed a static map is one factor of the yaw rate, and the cosine that it leaves has 1/√2 of its amplitude."""
-    found = statistics_of([drive()])
+    """At constant speed a static map is one factor of the yaw rate, and the cosine that it leaves
+    has 1/√2 of its amplitude.
+    """
+    statistics = statistics_of([drive()])
     level = math.degrees(0.2 / math.sqrt(2.0) / 20.0)
-    assert found.static_map == pytest.approx(level, rel=0.02)
-    assert found.rms == pytest.approx(
+    assert statistics.static_map == pytest.approx(level, rel=0.02)
+    assert statistics.rms == pytest.approx(
         math.degrees(math.sqrt(0.6**2 / 2.0 + 0.2**2 / 2.0) / 20.0), rel=0.02
     )
-    assert found.speed == pytest.approx((20.0, 20.0))
-    assert found.driven == pytest.approx(120.0, abs=0.1)
-    assert found.point == "at a point that is not known"
-    assert found.reasons == []
+    assert statistics.speed == pytest.approx((20.0, 20.0))
+    assert statistics.driven == pytest.approx(120.0, abs=0.1)
+    assert statistics.point == "at a point that is not known"
+    assert statistics.reasons == []
 
 
 @pytest.mark.parametrize(
@@ -117,31 +124,31 @@ def noise():
 
 
 def fault(name, channel, size):
-    (found,) = [
-        one
-        for one in planted_faults()
-        if (one.name, one.channels[0], one.size) == (name, channel, size)
+    (named_fault,) = [
+        planted
+        for planted in planted_faults()
+        if (planted.name, planted.channels[0], planted.size) == (name, channel, size)
     ]
-    return found
+    return named_fault
 
 
-def test_faults_change_their_channels_alone_and_are_what_they_are_called():
-    whole = noise()
-    for one in planted_faults():
-        changed = one(whole)
+def test_faults_change_only_their_channels_and_as_named():
+    healthy = noise()
+    for planted in planted_faults():
+        changed = planted(healthy)
         assert {
-            name for name in whole.channels if not np.array_equal(whole[name], changed[name])
-        } == set(one.channels)
+            name for name in healthy.channels if not np.array_equal(healthy[name], changed[name])
+        } == set(planted.channels)
     np.testing.assert_allclose(
-        fault("late", "ay", "40 ms")(whole)["ay"][4:], whole["ay"][:-4], atol=1e-9
+        fault("late", "ay", "40 ms")(healthy)["ay"][4:], healthy["ay"][:-4], atol=1e-9
     )
     np.testing.assert_allclose(
-        fault("held", "ay", "10 Hz")(whole)["ay"], np.repeat(whole["ay"][::10], 10)
+        fault("held", "ay", "10 Hz")(healthy)["ay"], np.repeat(healthy["ay"][::10], 10)
     )
-    slow = fault("low-passed", "ax", "0.4 s")(whole)["ax"]
-    state = whole["ax"][0]
+    slow = fault("low-passed", "ax", "0.4 s")(healthy)["ax"]
+    state = healthy["ax"][0]
     for sample in range(1, 50):
-        state += (1.0 - np.exp(-0.01 / 0.4)) * (whole["ax"][sample] - state)
+        state += (1.0 - np.exp(-0.01 / 0.4)) * (healthy["ax"][sample] - state)
         assert slow[sample] == pytest.approx(state)
     assert set(detections(noise().select(["vx", "ay"]))["channel"]) == {"vx", "ay"}
 
@@ -150,7 +157,7 @@ def test_faults_change_their_channels_alone_and_are_what_they_are_called():
     ("start", "stop", "missed"),
     [(150.0, 450.0, {20}), (450.0, 550.0, {20, 40}), (550.0, 700.0, {20})],
 )
-def test_all_but_the_shortest_delays_of_the_reference_are_found_in_the_ferrari_without_a_false_alarm(
+def test_all_faults_but_the_shortest_reference_delays_are_detected_in_the_ferrari(
     data_root, start, stop, missed
 ):
     """Its accelerometers are late by some 15 ms themselves, which a late reference makes good."""

@@ -1,4 +1,6 @@
-"""From simulated cars to a real one: what is learnt on, what is chosen by, and what the report says of it."""
+"""From simulated cars to a real one: what is learnt on, what is chosen by, and what the report says
+of it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -33,7 +35,7 @@ LEARNT = (
     "sim_fleet_more",
     "sim_fleet_level",
 )
-HELD_OUT = "sim_fleet_held_out"
+UNSEEN_FLEET = "sim_fleet_held_out"
 
 
 def dataset(name):
@@ -53,7 +55,7 @@ def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
     split = compose_config("train", [f"split={name}"])["split"]
     for entry in (*split["train"], *split["validation"]):
         assert kind_of(dataset(entry["dataset"])) == "simulated"
-    assert [entry["dataset"] for entry in split["validation"]] == [HELD_OUT]
+    assert [entry["dataset"] for entry in split["validation"]] == [UNSEEN_FLEET]
     assert split["tests"]["ferrari"] == [
         {"dataset": "ferrari_250lm", "recording": "20140222_01_01_03_250lm"}
     ]
@@ -64,13 +66,13 @@ def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
 
 @pytest.mark.parametrize("name", LEARNT)
 def test_validation_cars_are_other_cars_on_other_courses(name):
-    assert not courses(name) & courses(HELD_OUT)
-    fleets = [open_source(dataset(of)) for of in (name, HELD_OUT)]
+    assert not courses(name) & courses(UNSEEN_FLEET)
+    fleets = [open_source(dataset(of)) for of in (name, UNSEEN_FLEET)]
     seeds = [{fleet.seed_of(drive_id) for drive_id in fleet.drives} for fleet in fleets]
     assert not seeds[0] & seeds[1]
 
 
-@pytest.mark.parametrize("name", [*LEARNT, HELD_OUT])
+@pytest.mark.parametrize("name", [*LEARNT, UNSEEN_FLEET])
 def test_fleets_take_nothing_that_was_read_off_the_real_recording(name):
     described = dataset(name)
     preset = (
@@ -86,7 +88,9 @@ def test_fleets_take_nothing_that_was_read_off_the_real_recording(name):
     }
 
 
-ERRORS = {  # part -> (on validation, on race cars, on another simulation's car, on the real car) of every seed
+# Part -> errors of every seed on validation, on race cars, on the car of another simulation and on
+# the real car.
+ERRORS = {
     "one": [(0.30, 0.20, 0.0, 0.10), (0.31, 0.21, 0.0, 0.11)],
     "rough": [(0.20, 0.30, 4.00, 0.40), (0.10, 0.32, 4.10, 0.60), (0.16, 0.31, 4.20, 0.50)],
     "level": [(0.05, 0.25, 0.31, 0.05), (0.05, 0.26, 0.30, 0.06)],
@@ -94,7 +98,9 @@ ERRORS = {  # part -> (on validation, on race cars, on another simulation's car,
 
 
 def part(folder, name):
-    """A part whose seeds err by given sizes on a drive of 60 s, which stands for validation and tests."""
+    """A part whose seeds err by given sizes on a drive of 60 s, which stands for validation and
+    tests.
+    """
     recording = planar_drive(60.0, 20.0, seed=3)
     file = folder / "lap.parquet"
     write_recording(recording, file)
@@ -121,7 +127,7 @@ def part(folder, name):
         }
         fitted.load_weights(weights)
         save_model(fitted, model.model_folder)
-        for (where, span), size in zip(spans.items(), sizes or [0.0] * 4, strict=True):
+        for (test_set, span), size in zip(spans.items(), sizes or [0.0] * 4, strict=True):
             vy = recording["vy_ref"] * (sizes is not None) + size * np.sin(3.0 * recording.time)
             estimate = Estimate(
                 recording.id,
@@ -130,9 +136,9 @@ def part(folder, name):
                 recording.start_time,
                 {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])},
             )
-            write_estimate(estimate, home / where / "0.parquet")
-            found = accuracy([score(estimate, recording, span, PROTOCOL)])
-            rows += metric_rows(model, where, found, dataset=span.dataset)
+            write_estimate(estimate, home / test_set / "0.parquet")
+            metrics = accuracy([score(estimate, recording, span, PROTOCOL)])
+            rows += metric_rows(model, test_set, metrics, dataset=span.dataset)
     tests = {
         test: (span,)
         for test, span in spans.items()
@@ -187,7 +193,7 @@ def test_validation_race_cars_and_another_simulation_choose_in_turn_and_ship_a_s
     assert table["model_fvu"].notna().sum() == 1
 
 
-def test_report_lists_baselines_and_counts_the_candidates_that_are_worse_on_the_car_of_the_third_choice(
+def test_report_lists_baselines_and_counts_candidates_worse_on_the_third_choice(
     artefacts,
 ):
     document = documents(artefacts)["report"]
@@ -204,7 +210,7 @@ def test_report_lists_baselines_and_counts_the_candidates_that_are_worse_on_the_
     assert any("1 of 2 candidates of the third choice are worse" in str(b) for b in document.blocks)
 
 
-def test_report_states_the_errors_of_each_choice_and_whether_the_first_met_the_required_value(
+def test_report_states_errors_of_each_choice_and_whether_the_first_suffices(
     artefacts, tmp_path, monkeypatch
 ):
     undrawn(monkeypatch)
@@ -222,13 +228,17 @@ def test_report_states_the_errors_of_each_choice_and_whether_the_first_met_the_r
 
 
 def test_study_refuses_a_part_that_learns_on_the_real_car_or_stops_on_other_ranges(artefacts):
-    one = artefacts.parts["one"]
-    real = replace(one, split=replace(one.split, train=(Span("ferrari", "other"),)))
+    simulated_part = artefacts.parts["one"]
+    real = replace(
+        simulated_part, split=replace(simulated_part.split, train=(Span("ferrari", "other"),))
+    )
     with pytest.raises(
         DataError, match="part 'one' trains or chooses on 'ferrari', which is not simulated"
     ):
         documents(replace(artefacts, parts={**artefacts.parts, "one": real}))
-    other = replace(one, split=replace(one.split, validation=(Span("sim", "elsewhere"),)))
+    moved_validation = replace(
+        simulated_part, split=replace(simulated_part.split, validation=(Span("sim", "elsewhere"),))
+    )
     assert "validated or chosen on different ranges" in refusal(
-        lambda: documents(replace(artefacts, parts={**artefacts.parts, "one": other}))
+        lambda: documents(replace(artefacts, parts={**artefacts.parts, "one": moved_validation}))
     )

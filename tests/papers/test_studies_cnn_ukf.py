@@ -76,25 +76,25 @@ SAMPLES = SampleSettings(PhaseSettings(learning_rate=1e-3, max_epochs=1))
 
 def fitted_models(data):
     """Candidate -> a small model and its seeds."""
-    given = {"tyres": TYRES, "noise": LEVELS}
-    made = {
-        paper.MODEL: (estimator_class("dugoff_ukf").from_config(given), [0]),
+    car_settings = {"tyres": TYRES, "noise": LEVELS}
+    models = {
+        paper.MODEL: (estimator_class("dugoff_ukf").from_config(car_settings), [0]),
         paper.SMOOTH: (
-            estimator_class("dugoff_ukf").from_config({**given, "curve": "smooth"}),
+            estimator_class("dugoff_ukf").from_config({**car_settings, "curve": "smooth"}),
             [0],
         ),
     }
     network = estimator_class("sideslip_ffnn").from_config({"hidden": [10, 6]})
     network.seed(0)
     network.fit(data, SAMPLES)
-    made[paper.DATA] = network, [0, 1]
+    models[paper.DATA] = network, [0, 1]
     for candidate, name in ((paper.DEEP, "ensemble_ukf"), (paper.CNN, "cnn_ukf")):
         hybrid = estimator_of(name)
         hybrid.fit(data, TRAININGS[name])
-        made[candidate] = hybrid, [0, 1]
-    made[paper.ZERO] = estimator_class("zero").from_config({"rate_hz": 100}), [0]
-    made |= further_networks(data)
-    return made
+        models[candidate] = hybrid, [0, 1]
+    models[paper.ZERO] = estimator_class("zero").from_config({"rate_hz": 100}), [0]
+    models |= further_networks(data)
+    return models
 
 
 def further_networks(data):
@@ -111,7 +111,9 @@ def further_networks(data):
 
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
-    """The four methods, the smooth filter, baselines and further networks on four test manoeuvres of six seconds."""
+    """The four methods, the smooth filter, baselines and further networks on four test manoeuvres
+    of six seconds.
+    """
     folder = tmp_path_factory.mktemp("study")
     recordings = {
         name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)
@@ -140,18 +142,21 @@ def everything(tmp_path_factory):
                 )
             )
             for test, spans in {"validation": SPLIT.validation, **SPLIT.tests}.items():
-                seen = [
+                drives = [
                     recordings[span.recording]
                     .cut(span.start - PROTOCOL.warm_up_seconds, span.stop)
                     .without_references()
                     for span in spans
                 ]
-                own = estimator.estimate(seen)
-                for position, estimate in enumerate(own):
+                estimates = estimator.estimate(drives)
+                for position, estimate in enumerate(estimates):
                     write_estimate(estimate, home / test / f"{position}.parquet")
                 figures = accuracy(
                     score_all(
-                        own.__getitem__, spans, lambda span: recordings[span.recording], PROTOCOL
+                        estimates.__getitem__,
+                        spans,
+                        lambda span: recordings[span.recording],
+                        PROTOCOL,
                     )
                 )
                 rows += metric_rows(
@@ -175,7 +180,7 @@ def everything(tmp_path_factory):
 @pytest.fixture(scope="module")
 def part(everything):
     """What Table II needs."""
-    of_table = [own for own in everything.models if own.estimator != "velocity_gru"]
+    of_table = [model for model in everything.models if model.estimator != "velocity_gru"]
     return replace(everything, models=of_table)
 
 
@@ -188,24 +193,24 @@ def runs(part):
 def report(part, everything):
     """Of a study whose parts are all made from the same small models."""
     of_estimator = {
-        name: [own for own in part.models if own.estimator == name]
+        name: [model for model in part.models if model.estimator == name]
         for name in ("cnn_ukf", "ensemble_ukf", "sideslip_ffnn")
     }
-    smooth = [own for own in part.models if own.variant.endswith("_smooth")]
+    smooth = [model for model in part.models if model.variant.endswith("_smooth")]
     removed = ("adaptive_process", "adaptive_distrust", "pseudo_measurement")
     models = {
         "full": part.models,
         "before": of_estimator["cnn_ukf"],
         "free": [*smooth, *of_estimator["cnn_ukf"]],
         "ablation": [
-            replace(own, variant=f"full_no_{element}")
+            replace(cnn_model, variant=f"full_no_{element}")
             for element in removed
-            for own in of_estimator["cnn_ukf"]
+            for cnn_model in of_estimator["cnn_ukf"]
         ],
         "z_scores": [*of_estimator["sideslip_ffnn"], *of_estimator["cnn_ukf"]],
-        "limited": [own for models in of_estimator.values() for own in models],
-        "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
-        "factorial_plain_paper": [own for own in part.models if own.variant == "dugoff_full"],
+        "limited": [model for models in of_estimator.values() for model in models],
+        "recurrent": [model for model in everything.models if model.estimator == "velocity_gru"],
+        "factorial_plain_paper": [model for model in part.models if model.variant == "dugoff_full"],
         "factorial_smooth_paper": [*smooth, *of_estimator["cnn_ukf"]],
         "floor_1e-8": of_estimator["ensemble_ukf"],
     }
@@ -225,16 +230,16 @@ def text_of(report):
 
 
 def table_of(report, name):
-    (table,) = (own for own in report.blocks if isinstance(own, Table) and own.name == name)
+    (table,) = (block for block in report.blocks if isinstance(block, Table) and block.name == name)
     return table.frame
 
 
-def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict_with_an_interval(
+def test_report_has_every_table_figure_and_claim_of_the_paper_with_intervals(
     report,
 ):
     text = text_of(report)
-    shown = {block.name for block in report.blocks if isinstance(block, Figure)}
-    assert {*(f"figure_{number}" for number in range(4, 15)), "loss_curves"} == shown
+    figure_names = {block.name for block in report.blocks if isinstance(block, Figure)}
+    assert {*(f"figure_{number}" for number in range(4, 15)), "loss_curves"} == figure_names
     of_tables = {block.name for block in report.blocks if isinstance(block, Table)}
     assert of_tables == {
         "table_2",
@@ -274,7 +279,7 @@ def test_first_screen_and_report_are_short(report, tmp_path):
     assert "{% if" not in document.TEMPLATE.read_text(encoding="utf-8")
 
 
-def test_factorial_has_a_ratio_for_each_effect_with_cells_and_names_what_is_not_trained(report):
+def test_factorial_has_a_ratio_per_effect_and_names_untrained_cells(report):
     cells = table_of(report, "factorial").set_index(["curve", "noise"])
     assert cells.loc[("plain", "free")].tolist() == ["not trained yet"] * 3
     assert cells.loc[("smooth", "paper's"), "ensemble"] == "not trained yet"
@@ -296,13 +301,13 @@ def test_factorial_has_a_ratio_for_each_effect_with_cells_and_names_what_is_not_
 def test_effects_are_geometric_means_over_manoeuvres_and_cells():
     levels = {("plain", "paper"): 2.0, ("smooth", "paper"): 1.0, ("plain", "free"): 1.0}
     levels[("smooth", "free")] = 0.25
-    made = {
+    cell_runs = {
         factorial.cell_name((curve, noise, "none")): [
-            made_run("any", [size * WAVE * level for size in (1.0, 2.0, 3.0)])
+            planted_run("any", [size * WAVE * level for size in (1.0, 2.0, 3.0)])
         ]
         for (curve, noise), level in levels.items()
     }
-    effects = factorial.effects_of(ManoeuvreErrors(made))
+    effects = factorial.effects_of(ManoeuvreErrors(cell_runs))
     figure, cells = effects["smooth over plain tyres"]
     assert cells == 2
     assert figure.value == pytest.approx(np.sqrt(0.5**2 * 0.25**2))
@@ -310,19 +315,19 @@ def test_effects_are_geometric_means_over_manoeuvres_and_cells():
 
 
 def test_raw_coverage_is_that_of_the_filters_normal_distribution():
-    class Given:
+    class FilterDrives:
         def with_covariances(self, model, test):
             zero = np.zeros(4)
             errors = np.array([0.5, -0.9, 1.5, -3.0])
             variance = np.ones((4, 1, 1))
             yield Scored(zero, errors, zero, zero, zero, zero, zero > -1, {}, variance, ("vy",))
 
-    run = made_run("any", [WAVE])
-    assert calibration.raw_coverages(run, Given()).tolist() == [0.5, 0.75]
+    run = planted_run("any", [WAVE])
+    assert calibration.raw_coverages(run, FilterDrives()).tolist() == [0.5, 0.75]
 
 
-def test_a_partial_study_names_what_is_not_trained(part):
-    models = [own for own in part.models if own.estimator in ("zero", "sideslip_ffnn")]
+def test_a_partial_study_names_untrained_candidates(part):
+    models = [model for model in part.models if model.estimator in ("zero", "sideslip_ffnn")]
     report = report_of(part, {"full": models}, {"full": ["cnn_ukf-seed0"], "ablation": ["a", "b"]})
     text = text_of(report)
     assert "3 planned trainings are not done, of the parts `full`, `ablation`" in text
@@ -333,7 +338,7 @@ def test_a_partial_study_names_what_is_not_trained(part):
     assert states[paper.CNN] == states[paper.MODEL] == "not trained"
 
 
-def test_errors_are_given_by_car():
+def test_recordings_are_grouped_by_car():
     names = ("soft_lap_on_001", "standard_lap_on_001", "laden_lap_on_001", "test_lap_1")
     assert [car_of(name) for name in names] == [
         "softer tyres",
@@ -349,8 +354,8 @@ def test_report_writes_the_errors_of_every_manoeuvre_and_seed(report, part, runs
     assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
     content = claims_of("cnn_ukf")
     assert set(blocks["candidate"]) == {*content.candidates, "-"} - {"static_map"}
-    own = blocks[(blocks["part"] == "full") & (blocks["test_set"] == "test")]
-    own = own.groupby(["candidate", "seed", "metric"])[["value", "size"]].sum()
+    test_blocks = blocks[(blocks["part"] == "full") & (blocks["test_set"] == "test")]
+    test_blocks = test_blocks.groupby(["candidate", "seed", "metric"])[["value", "size"]].sum()
     for candidate in (*paper.OF_FOUR, paper.SMOOTH, paper.ZERO):
         for run in runs[candidate]:
             figures = {
@@ -360,7 +365,7 @@ def test_report_writes_the_errors_of_every_manoeuvre_and_seed(report, part, runs
                 "max_error_sideslip_nonlinear": run.kpis.max_error_nonlinear,
             }
             for metric, figure in figures.items():
-                value, size = own.loc[(candidate, run.model.seed, metric)]
+                value, size = test_blocks.loc[(candidate, run.model.seed, metric)]
                 assert value / size == pytest.approx(figure, rel=1e-12)
     limited_set = blocks[(blocks["part"] == "limited") & (blocks["metric"] == "mse_sideslip")]
     pd.testing.assert_series_equal(
@@ -390,7 +395,7 @@ def test_candidates_have_the_papers_names_and_lines(part):
         candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
 
 
-def made_run(candidate, errors, seed=0, validation=None, ay=5.0):
+def planted_run(candidate, errors, seed=0, validation=None, ay=5.0):
     """A run whose manoeuvres, a slalom and J-turns, have these errors [deg]."""
 
     def scored(error):
@@ -409,40 +414,40 @@ WAVE = np.tile([1.0, -1.0], 50)
 
 
 def noisy(level, generator, count=12):
-    return [level * own * WAVE for own in generator.uniform(0.8, 1.2, count)]
+    return [level * amplitude * WAVE for amplitude in generator.uniform(0.8, 1.2, count)]
 
 
 def test_indicators_and_ratios_are_those_of_the_paper(runs):
-    own = ManoeuvreErrors(runs)
+    errors = ManoeuvreErrors(runs)
     for candidate, seeds in runs.items():
         for indicator in ("mse", "mse_nonlinear", "max_error", "max_error_nonlinear"):
             expected = np.mean([getattr(run.kpis, indicator) for run in seeds])
-            assert own.figure(candidate, indicator).value == pytest.approx(expected)
+            assert errors.figure(candidate, indicator).value == pytest.approx(expected)
     generator = np.random.default_rng(0)
     levels = {"a": 1.0, "b": 1.5, "c": 1.0}
-    made = {
-        name: [made_run(name, noisy(level, generator), seed) for seed in range(3)]
+    planted_runs = {
+        name: [planted_run(name, noisy(level, generator), seed) for seed in range(3)]
         for name, level in levels.items()
     }
-    own = ManoeuvreErrors(made)
-    ratio = own.ratio("a", "b", MSE)
+    errors = ManoeuvreErrors(planted_runs)
+    ratio = errors.ratio("a", "b", MSE)
     assert ratio.low < 1.0 / 2.25 < ratio.high < 0.7
-    same = own.ratio("a", "c", MSE)
-    assert same.low < 1.0 < same.high
+    equal_ratio = errors.ratio("a", "c", MSE)
+    assert equal_ratio.low < 1.0 < equal_ratio.high
 
 
 def test_losses_of_a_manoeuvre_are_those_of_a_hand_calculation():
-    run = made_run("a", [np.array([1.0, -3.0]), np.array([2.0, 4.0, 0.0])])
+    run = planted_run("a", [np.array([1.0, -3.0]), np.array([2.0, 4.0, 0.0])])
     np.testing.assert_allclose(sums_of(run.test, MSE), [[10.0, 20.0], [2.0, 3.0]])
     np.testing.assert_allclose(sums_of(run.test, "max_error"), [[3.0, 4.0], [1.0, 1.0]])
     spread, sizes = sums_of(run.test, "variance_nonlinear")
     np.testing.assert_allclose(spread, [0.2**2 + 3.8**2, 1.2**2 + 3.2**2 + 0.8**2])
     assert sizes.tolist() == [2.0, 3.0]
-    slow = made_run("a", [np.array([1.0, -3.0])], ay=3.0)
+    slow = planted_run("a", [np.array([1.0, -3.0])], ay=3.0)
     for indicator in (MSE_NL, "max_error_nonlinear"):
-        assert [own.tolist() for own in sums_of(slow.test, indicator)] == [[0.0], [0.0]]
+        assert [sums.tolist() for sums in sums_of(slow.test, indicator)] == [[0.0], [0.0]]
     error = np.arange(50.0)
-    peaked = made_run("a", [error])
+    peaked = planted_run("a", [error])
     part = peaked.test["slalom_0"][0]
     part.sideslip_ref[30] = 0.1
     peaked.test["slalom_0"][0] = replace(part, sideslip=part.sideslip_ref + np.radians(error))
@@ -490,21 +495,21 @@ def test_measured_values_are_those_of_a_hand_calculation():
     )
 
 
-def test_contributions_of_manoeuvres_add_up_to_what_is_claimed():
-    own = ManoeuvreErrors(
+def test_contributions_of_manoeuvres_add_up_to_the_claimed_value():
+    planted_errors = ManoeuvreErrors(
         {
             "a": [
-                made_run("a", [np.array([-1.0, -1.0]), np.array([0.5, 0.5])], seed)
+                planted_run("a", [np.array([-1.0, -1.0]), np.array([0.5, 0.5])], seed)
                 for seed in (0, 1)
             ],
-            "b": [made_run("b", [np.array([2.0, 2.0]), np.array([0.0, 0.0])])],
-            "c": [made_run("c", [np.array([-3.0, -3.0]), np.array([-5.0, -5.0])])],
+            "b": [planted_run("b", [np.array([2.0, 2.0]), np.array([0.0, 0.0])])],
+            "c": [planted_run("c", [np.array([-3.0, -3.0]), np.array([-5.0, -5.0])])],
         }
     )
-    values = measures.mean_error_over_least_of_others(own, "a", ["b", "c"])
+    values = measures.mean_error_over_least_of_others(planted_errors, "a", ["b", "c"])
     assert values.shape == (2, 2)
     np.testing.assert_allclose(values.mean(axis=1), 0.25 - 1.0)
-    groups, best = measures.is_best_in_group(own, "a", ["b", "c"])
+    groups, best = measures.is_best_in_group(planted_errors, "a", ["b", "c"])
     assert groups == ["J-turn", "slalom"] or groups == ["slalom", "J-turn"]
     assert dict(zip(groups, best.T.tolist(), strict=True)) == {
         "slalom": [1.0, 1.0],
@@ -514,8 +519,8 @@ def test_contributions_of_manoeuvres_add_up_to_what_is_claimed():
     def with_errors(a, b):
         return ManoeuvreErrors(
             {
-                "a": [made_run("a", [np.array(error) for error in a])],
-                "b": [made_run("b", [np.array(error) for error in b])],
+                "a": [planted_run("a", [np.array(error) for error in a])],
+                "b": [planted_run("b", [np.array(error) for error in b])],
             }
         )
 
@@ -530,11 +535,13 @@ def test_contributions_of_manoeuvres_add_up_to_what_is_claimed():
 
 
 def test_validation_chooses_the_seed():
-    one = made_run(paper.MODEL, [np.full(10, 1.0)], 0, validation=np.full(10, 2.0))
-    other = made_run(paper.MODEL, [np.full(10, 2.0)], 1, validation=np.full(10, 1.0))
-    assert chosen([one, other]).model.seed == 1
-    quiet = made_run("a", [WAVE] * 9 + [4.0 * WAVE], 0)
-    wild = made_run("a", [1.35 * WAVE] * 10, 1)
+    better_on_test = planted_run(paper.MODEL, [np.full(10, 1.0)], 0, validation=np.full(10, 2.0))
+    better_on_validation = planted_run(
+        paper.MODEL, [np.full(10, 2.0)], 1, validation=np.full(10, 1.0)
+    )
+    assert chosen([better_on_test, better_on_validation]).model.seed == 1
+    quiet = planted_run("a", [WAVE] * 9 + [4.0 * WAVE], 0)
+    wild = planted_run("a", [1.35 * WAVE] * 10, 1)
     assert quiet.kpis.mse > wild.kpis.mse
     assert chosen([quiet, wild]).model.seed == 0
 
@@ -542,9 +549,9 @@ def test_validation_chooses_the_seed():
 def test_twice_the_epochs_check_the_full_set():
     content = claims_of("cnn_ukf")
     trained = {"phase": {"max_epochs": 40}}
-    first = made_run(paper.DATA, [WAVE], 0)
+    first = planted_run(paper.DATA, [WAVE], 0)
     first = replace(first, model=replace(first.model, training=trained))
-    better = made_run(paper.DATA, [0.5 * WAVE], 0)
+    better = planted_run(paper.DATA, [0.5 * WAVE], 0)
     parts = {"full": {paper.DATA: [first]}, "doubled": {paper.DATA: [better]}}
     (row,) = block_errors.training_rows(parts, content)
     assert (row.epochs, row.epochs_paper) == ("40", "not stated, early stopping")
@@ -552,7 +559,7 @@ def test_twice_the_epochs_check_the_full_set():
     assert "by -75.0 %" in row.reason
 
 
-def test_a_drive_is_scored_whole_or_until_it_slides_and_the_report_counts_those_that_slide():
+def test_a_drive_is_scored_until_it_slides_and_sliding_drives_are_counted():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
     part = Scored(np.arange(4.0), angle, angle, angle, angle, angle, np.ones(4, dtype=bool))
     assert len(until(part, 0.21).time) == 2
@@ -565,33 +572,36 @@ def test_a_drive_is_scored_whole_or_until_it_slides_and_the_report_counts_those_
         }
         return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
 
-    assert document._number_beyond(driven(3.0, 43.0, 11.9, 180.0), 0.21) == 2
-    assert document._number_beyond(driven(3.0), 0.21) == 0
+    assert document.number_beyond(driven(3.0, 43.0, 11.9, 180.0), 0.21) == 2
+    assert document.number_beyond(driven(3.0), 0.21) == 0
 
 
-def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, runs, monkeypatch):
+def test_network_outputs_are_compared_with_the_reference_of_the_same_time(part, runs, monkeypatch):
     prepared = Prepared(part)
 
     def knowing(run, drives):
-        whole = [
+        prepared_drives = [
             prepared.recording("car", drive.id).cut(drive.start_time, drive.end_time + 0.005)
             for drive in drives
         ]
-        true = [np.arctan2(own["vy_ref"], own["vx"]) for own in whole]
+        true = [
+            np.arctan2(prepared_drive["vy_ref"], prepared_drive["vx"])
+            for prepared_drive in prepared_drives
+        ]
         return [
             PseudoMeasurement(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true
         ]
 
     monkeypatch.setattr(networks, "pseudo_measurements_of", knowing)
     outputs = networks.outputs_of(runs[paper.CNN][0], prepared)
-    for own in outputs:
-        np.testing.assert_allclose(own.error, 0.0, atol=1e-9)
-        np.testing.assert_allclose(own.distrust, 2.0)
+    for output in outputs:
+        np.testing.assert_allclose(output.error, 0.0, atol=1e-9)
+        np.testing.assert_allclose(output.distrust, 2.0)
 
 
 def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(part, runs):
-    heard = networks.shift_of(runs[paper.CNN][0], Prepared(part))
-    assert 0.0 < heard < 1.0
+    shift_ratio = networks.shift_of(runs[paper.CNN][0], Prepared(part))
+    assert 0.0 < shift_ratio < 1.0
     perfect = networks.with_perfect_distrust(runs[paper.CNN][0], Prepared(part), "oracle")
     assert list(perfect.test) == list(runs[paper.CNN][0].test)
     assert perfect.kpis.mse < max(runs[paper.CNN][0].kpis.mse, 1e-3)
@@ -602,14 +612,21 @@ def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, run
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
         changed = perturbed.with_stiffness(fitted, 0.1, -0.1)
         heavy = perturbed.with_body(fitted, 1.1, 0.9)
-        before, after, other = (
-            (own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy)
+        before, after, heavier = (
+            (
+                filter_or_hybrid
+                if isinstance(filter_or_hybrid, DugoffUkf)
+                else filter_or_hybrid.model
+            )
+            for filter_or_hybrid in (fitted, changed, heavy)
         )
         np.testing.assert_allclose(
             after.axle_tyres / before.axle_tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0]
         )
-        assert other.track().car.mass == pytest.approx(1.1 * before.track().car.mass)
-        assert other.track().car.yaw_inertia == pytest.approx(0.9 * before.track().car.yaw_inertia)
+        assert heavier.track().car.mass == pytest.approx(1.1 * before.track().car.mass)
+        assert heavier.track().car.yaw_inertia == pytest.approx(
+            0.9 * before.track().car.yaw_inertia
+        )
     for change in (perturbed.with_stiffness, perturbed.with_body):
         with pytest.raises(DataError, match=r"has no cornering stiffness|knows no mass"):
             change(estimator_class("sideslip_ffnn").from_config({}), 0.1, 0.1)
@@ -621,13 +638,13 @@ def test_the_model_is_observable_straight_ahead_as_well():
     estimator = estimator_class("dugoff_ukf").from_config(
         {"tyres": TYRES, "noise": LEVELS, "curve": "smooth"}
     )
-    found = observability.local(estimator)
-    straight = found[(found["steer"] == 0.0) & (found["measured"] == "ay, yaw rate, both forces")]
+    ranks = observability.local(estimator)
+    straight = ranks[(ranks["steer"] == 0.0) & (ranks["measured"] == "ay, yaw rate, both forces")]
     assert set(straight["rank"]) == {2}
-    names, steady = measures.ranks(found, is_straight=False)
+    names, steady = measures.ranks(ranks, is_straight=False)
     assert (steady == 2.0).all()
     assert steady.shape == (1, len(names))
-    names, straights = measures.ranks(found, is_straight=True)
+    names, straights = measures.ranks(ranks, is_straight=True)
     assert names == [f"{speed:g} m/s, 0°" for speed in observability.SPEEDS]
     assert (straights == 2.0).all()
 
@@ -635,13 +652,13 @@ def test_the_model_is_observable_straight_ahead_as_well():
 def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(part, runs, tmp_path):
     prepared = Prepared(part)
     learnt = {name: runs[name] for name in (paper.DATA, *paper.HYBRIDS)}
-    same = limited(runs, learnt, prepared)
+    limitations = limited(runs, learnt, prepared)
     as_tuned = [run.kpis.mse for run in runs[paper.DEEP]]
-    rescaled = [run.kpis.mse for run in same.compared[paper.FULL_SCALING]]
+    rescaled = [run.kpis.mse for run in limitations.compared[paper.FULL_SCALING]]
     assert rescaled == pytest.approx(as_tuned, rel=2e-3)  # estimated on raw drives
-    other = load_model(runs[paper.DEEP][0].model.model_folder)
-    other.scaling = other.scaling + np.array([4.0, 0.0])  # DE-UKF
-    save_model(other, tmp_path)
+    rescaled_model = load_model(runs[paper.DEEP][0].model.model_folder)
+    rescaled_model.scaling = rescaled_model.scaling + np.array([4.0, 0.0])  # DE-UKF
+    save_model(rescaled_model, tmp_path)
     of_full = [
         replace(run, model=replace(run.model, model_folder=tmp_path)) for run in runs[paper.DEEP]
     ]
@@ -670,9 +687,14 @@ def test_recordings_are_prepared_as_the_pipeline_does(part):
         for sweep in part["sweeps"]
         for override in sweep
     }
-    (told,) = {override for override in offline if override.startswith("downsample.transforms=")}
+    (transforms_override,) = {
+        override for override in offline if override.startswith("downsample.transforms=")
+    }
     assert (
-        tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2]))
+        tuple(
+            transform_from_config(entry)
+            for entry in yaml.safe_load(transforms_override.partition("=")[2])
+        )
         == OFFLINE
     )
     prepared = Prepared(part)

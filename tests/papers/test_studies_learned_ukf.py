@@ -155,15 +155,15 @@ def part(tmp_path_factory):
                 pieces = sequences([span], lambda span: recordings[span.recording], PROTOCOL)
                 cut = [recordings[span.recording].cut(piece.start, piece.stop) for piece in pieces]
                 states = [reference_state(recordings[span.recording], piece) for piece in pieces]
-                own = (
-                    estimator.estimate([one.without_references() for one in cut], states)
+                estimates = (
+                    estimator.estimate([segment.without_references() for segment in cut], states)
                     if estimator
-                    else [constant(one) for one in cut]
+                    else [constant(segment) for segment in cut]
                 )
-                for position, estimate in enumerate(own):
+                for position, estimate in enumerate(estimates):
                     write_estimate(estimate, home / test / f"{position}.parquet")
                 scored = score_all(
-                    own.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL
+                    estimates.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL
                 )
                 figures = accuracy(scored) | {"n_parameters": 100, "epochs": 4, "n_sequences": 3}
                 rows += metric_rows(models[-1], test, figures)
@@ -197,14 +197,16 @@ def part(tmp_path_factory):
     )
 
 
-def constant(own):
+def constant(segment):
     """An estimate without covariance that stays at the start."""
-    channels = {name: np.full(len(own), own[f"{name}_ref"][0]) for name in ("vx", "vy", "yaw_rate")}
+    channels = {
+        name: np.full(len(segment), segment[f"{name}_ref"][0]) for name in ("vx", "vy", "yaw_rate")
+    }
     return Estimate(
-        own.id,
+        segment.id,
         "velocity_gru",
         100.0,
-        own.start_time,
+        segment.start_time,
         {**channels, "sideslip": channels["vy"] / channels["vx"]},
     )
 
@@ -218,7 +220,7 @@ def model(part, candidate, seed=0):
     [({"dynamics": "pacejka", "noise": "constant", "through_filter": False}, "PC")]
     + [({"dynamics": "residual", "noise": "constant", "through_filter": False}, "PCR")]
     + [({"dynamics": "neural", "noise": "constant"}, "NN_U")]
-    + [(own, candidate) for candidate, own in CANDIDATES.items()],
+    + [(settings, candidate) for candidate, settings in CANDIDATES.items()],
 )
 def test_candidates_have_the_papers_names(settings, candidate):
     estimator = LearnedUkf(LearnedUkf.settings_type(width=4, **settings))
@@ -232,7 +234,7 @@ def test_candidates_have_the_papers_names(settings, candidate):
     )
 
 
-def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets_are_refused(part):
+def test_candidates_keep_their_names_and_studies_without_test_sets_are_refused(part):
     twice = replace(part, models=[part.models[0], part.models[0]])
     assert "NNT was trained twice with one seed" in refusal(lambda: models_by_candidate(twice))
     (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
@@ -250,15 +252,15 @@ def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets
     assert "needs the part 'real'" in refusal(
         lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
     )
-    other = replace(
+    wet_part = replace(
         part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})
     )
     assert "must be called tyre_a and tyre_d" in refusal(
-        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
+        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": wet_part}, []))
     )
 
 
-def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(
+def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
     part, tmp_path, monkeypatch
 ):
     undrawn(monkeypatch)
@@ -350,18 +352,18 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     answer = text[text.index("**Answer.**") : text.index("**Recommendation.**")]
     errors = blocks[(blocks["part"] == "real") & (blocks["metric"] == "mse_weighted")]
     mse = errors.groupby(["candidate", "test_set"])["value"].mean()
-    for other, test in product(("GRU", "NNTF"), ("tyre_a", "tyre_d")):
-        assert f" {mse['NNTF_UH', test] / mse[other, test]:.2f} [" in answer, (other, test)
+    for rival, test in product(("GRU", "NNTF"), ("tyre_a", "tyre_d")):
+        assert f" {mse['NNTF_UH', test] / mse[rival, test]:.2f} [" in answer, (rival, test)
     assert not blocks.duplicated(["part", "candidate", "seed", "test_set", "metric", "block"]).any()
     keys = ["candidate", "seed", "metric"]
     ours = blocks[(blocks["part"] == "real") & (blocks["test_set"] == "tyre_a")]
     ours = ours.groupby(keys)[["value", "size"]].sum()
-    known = metric_values(part)
+    values = metric_values(part)
     for candidate, models in models_by_candidate(part).items():
-        for own in models:
+        for model in models:
             for metric, power in (("mse_weighted", 1.0), ("rmse_vy", 0.5), ("rmse_sideslip", 0.5)):
-                value, size = ours.loc[(candidate, own.seed, metric)]
-                figure = known[own.estimator, own.variant, own.seed, "tyre_a", metric]
+                value, size = ours.loc[(candidate, model.seed, metric)]
+                figure = values[model.estimator, model.variant, model.seed, "tyre_a", metric]
                 assert (value / size) ** power == pytest.approx(figure, rel=1e-9)
     swaps = document.data["figure_6_real"].set_index(["test_set", "seed", "predicts", "observes"])[
         "mse"
@@ -369,10 +371,10 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     value, size = ours.loc[("NNTF_U predicting, NNTF observing", 1, "mse_weighted")]
     assert value / size == pytest.approx(swaps["tyre_a", 1, "NNTF_U", "NNTF"])
     assert size == ours.loc[("NNTF", 1, "mse_weighted"), "size"]
-    one_step = document.data["figure_5_real"].set_index(["test_set", "seed", "task", "state"])
+    single_step = document.data["figure_5_real"].set_index(["test_set", "seed", "task", "state"])
     value, size = ours.loc[("NNTF", 0, "one_step_rmse_wheel_speed")]
     assert value / size == pytest.approx(
-        one_step.loc[("tyre_a", 0, "one_step", "rim_speed"), "before"]
+        single_step.loc[("tyre_a", 0, "one_step", "rim_speed"), "before"]
     )
     measured = blocks[blocks["metric"] == "friction_settles_within_2_s"]
     assert (measured["size"] == 1).all()
@@ -415,11 +417,11 @@ def gru_trials():
 
 def only(part, candidate, training=None):
     """The part with one candidate, trained in another way."""
-    own = [
-        replace(one, training={**one.training, **(training or {})})
-        for one in models_by_candidate(part)[candidate]
+    retrained = [
+        replace(model, training={**model.training, **(training or {})})
+        for model in models_by_candidate(part)[candidate]
     ]
-    return replace(part, models=own)
+    return replace(part, models=retrained)
 
 
 def of_length(part, steps):
@@ -427,7 +429,7 @@ def of_length(part, steps):
 
 
 @pytest.mark.parametrize("candidate", ["NNT", "NNTF_U", "NNTF_UH", "NNTF_UH*"])
-def test_filters_put_to_work_again_give_what_was_evaluated(part, candidate):
+def test_filters_that_run_again_reproduce_the_evaluated_estimates(part, candidate):
     estimator = loaded(model(part, candidate))
     means = filtered(estimator, drives_of(part, estimator, "tyre_d")).steps.filtered.mean
     stored = read_estimate(model(part, candidate).evaluation_folder / "tyre_d" / "1.parquet")
@@ -443,9 +445,9 @@ def test_swapping_a_model_for_itself_changes_nothing_and_for_another_both_halves
     def means(result):
         return result.steps.filtered.mean
 
-    own = means(filtered(first, drives))
-    assert torch.equal(means(swapped(first, first, drives)), own)
-    assert not torch.allclose(means(swapped(first, second, drives)), own)
+    unswapped = means(filtered(first, drives))
+    assert torch.equal(means(swapped(first, first, drives)), unswapped)
+    assert not torch.allclose(means(swapped(first, second, drives)), unswapped)
     assert not torch.allclose(
         means(swapped(second, first, drives)), means(filtered(second, drives))
     )
@@ -463,7 +465,7 @@ def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
     assert estimator.filter.repair
 
 
-def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
+def test_single_step_error_of_a_model_on_its_simulated_motion_is_zero(part):
     estimator = loaded(model(part, "NNTF_U"))
     inputs = torch.tensor([[0.1, 10.0]]).expand(6, 2)
     states = [torch.tensor([2.5, 0.1, 0.5, 2.6, 0.6])]
@@ -529,11 +531,11 @@ def test_starts_agree_as_soon_as_all_of_them_stay_within_the_limit():
     )
     covered = tracks([0.9, 0.40, 0.50, 0.60, 0.44], deviation=0.1).covered(0.45, 0.1)
     assert covered == pytest.approx(np.array([[0.75]])), "three of the four after 0.1 s"
-    apart = {0.3: tracks([0.3] * 4), 0.6: tracks([0.6] * 4), 0.9: tracks([0.9] * 4)}
-    assert measures.agreement_times(apart) == pytest.approx(np.array([[0.4]])), "never"
+    persistent_tracks = {0.3: tracks([0.3] * 4), 0.6: tracks([0.6] * 4), 0.9: tracks([0.9] * 4)}
+    assert measures.agreement_times(persistent_tracks) == pytest.approx(np.array([[0.4]])), "never"
 
 
-def test_rise_is_held_against_the_smallest_rise_of_the_models_without_friction():
+def test_rise_is_compared_with_the_smallest_rise_without_friction():
     without = dict.fromkeys(measures.WITHOUT_FRICTION)
     trained = {name: [[1.0, 3.0]] for name in without} | {"NNTF_UH": [[1.0, 1.0], [2.0, 2.0]]}
     unseen = {name: [[9.0, 9.0, 9.0]] for name in without}
@@ -541,13 +543,14 @@ def test_rise_is_held_against_the_smallest_rise_of_the_models_without_friction()
     blocks = planted_blocks("tyre_a", **trained) | planted_blocks("tyre_d", **unseen)
     values = measures.rise_over_least_rise_of_others(blocks, "real")
     assert values.mean() == pytest.approx(1.0 / 3.0)
-    rises, others = np.array([[1.0, 0.0, 2.0], [1.0, 1.0, 1.0]]), np.array([2.0, 3.0, 4.0])
-    np.testing.assert_allclose(values, 1.0 / 3.0 + (rises - others / 3.0) / 3.0)
+    rises = np.array([[1.0, 0.0, 2.0], [1.0, 1.0, 1.0]])
+    smallest_rises = np.array([2.0, 3.0, 4.0])
+    np.testing.assert_allclose(values, 1.0 / 3.0 + (rises - smallest_rises / 3.0) / 3.0)
     del blocks[Key("real", "LSTM", "tyre_d", "mse_weighted")]
     assert measures.rise_over_least_rise_of_others(blocks, "real") is None
 
 
-def test_validation_losses_from_scratch_are_held_against_the_worst_pre_trained_seed():
+def test_validation_from_scratch_is_compared_with_the_worst_pre_trained_seed():
     pre_trained = np.array([[1.0, 1.0], [2.0, 4.0]])
     scratch = np.array([[6.0, 6.0], [3.0, 0.0]])
     values = measures.validation_over_worst_pre_trained(scratch, pre_trained)
@@ -555,7 +558,7 @@ def test_validation_losses_from_scratch_are_held_against_the_worst_pre_trained_s
     np.testing.assert_allclose(values[0], 2.0 + np.array([6.0 - 4.0, 6.0 - 8.0]) / 3.0)
 
 
-def test_report_is_drawn_with_one_candidate_alone(part, tmp_path, monkeypatch):
+def test_report_is_drawn_with_a_single_candidate(part, tmp_path, monkeypatch):
     undrawn(monkeypatch)
     not_trained = {
         "real": [
@@ -580,13 +583,14 @@ def test_report_is_drawn_with_one_candidate_alone(part, tmp_path, monkeypatch):
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
-    said = " ".join(text.split())
-    assert "**Not complete:** 6 planned trainings are not done." in said
-    assert "where fewer than planned: GRU 2 of 3." in said
+    report_text = " ".join(text.split())
+    assert "**Not complete:** 6 planned trainings are not done." in report_text
+    assert "where fewer than planned: GRU 2 of 3." in report_text
     assert (
-        "not assessed: NNTF_UH; NNTF_U; NNTF_UH from scratch; NNTF_U, 250 steps, constant" in said
+        "not assessed: NNTF_UH; NNTF_U; NNTF_UH from scratch; NNTF_U, 250 steps, constant"
+        in report_text
     )
-    assert "3 parts of the pipeline have no training." in said
+    assert "3 parts of the pipeline have no training." in report_text
     claims = pd.read_csv(tmp_path / "tables" / "claims.csv").set_index("id")
     assert set(claims["verdict"]) == {"not assessed", "not testable"}
     assert claims.loc["nntf_uh_below_gru_tyre_a", "why"] == "NNTF_UH is not trained"
@@ -608,11 +612,11 @@ def test_every_measure_that_the_claims_name_exists(name):
             assert callable(getattr(importlib.import_module(module), function))
 
 
-def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
-    own = model(part, "GRU")
+def test_baselines_take_their_other_velocities_from_measured_channels(part, tmp_path):
+    gru_model = model(part, "GRU")
     for test in ("tyre_a",):
         for position in range(3):
-            estimate = own.estimate(test, position)
+            estimate = gru_model.estimate(test, position)
             channels = {
                 "vy": np.zeros(len(estimate.channels["vy"])),
                 "sideslip": np.zeros(len(estimate.channels["vy"])),
@@ -629,8 +633,8 @@ def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_p
 
 
 def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
-    own = replace(part, models=[model(part, "NNTF_U")])
-    (row,) = lengths({"length_500": own})
+    single_part = replace(part, models=[model(part, "NNTF_U")])
+    (row,) = lengths({"length_500": single_part})
     assert (row.steps, row.epochs) == (500, 1000)
     (row,) = lengths({"length_50": of_length(part, 50)})
     assert (row.sequences, row.batches) == (6, 3), "a drive of 3.2 s"
@@ -642,14 +646,14 @@ def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
         "through": {**PHASE, "max_epochs": 3},
         "steps": 50,
     }
-    own = only(part, "NNTF_UH", training)
-    assert samples_trained_on(own, own.models[0]) == 10 * 319 + 3 * 300
-    assert validation_losses(own, own.models).shape == (2,)
+    single_part = only(part, "NNTF_UH", training)
+    assert samples_trained_on(single_part, single_part.models[0]) == 10 * 319 + 3 * 300
+    assert validation_losses(single_part, single_part.models).shape == (2,)
     alone = only(part, "NNTF", {**training, "noise": {**PHASE, "max_epochs": 5}})
     assert samples_trained_on(alone, alone.models[0]) == 10 * 319 + 5 * 300
 
 
-def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand_calculation():
+def test_published_figures_agree_with_text_and_friction_and_slip_with_a_calculation():
     first = paper.TABLE_I
     second = paper.TABLE_II
     for name, gain in (("mse", 17), ("mae", 6), ("ae99", 33)):
@@ -676,16 +680,19 @@ def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand
         "vy_ref": [1.0, 0.0, 1.0],
         "yaw_rate_ref": [0.0, 10.0, 0.0],
     }
-    own = Recording(
+    slipping = Recording(
         "r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real"
     )
-    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
+    np.testing.assert_allclose(rear_slip([slipping], 0.1), [45.0, -45.0])
     assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
 
 
 def test_losses_of_a_sequence_are_those_of_a_hand_calculation():
     rate = np.array([0.1, 0.3])
-    others = {"vx": (np.array([1.0, 3.0]), np.array([1.0, 1.0])), "yaw_rate": (rate, rate - 0.1)}
+    other_states = {
+        "vx": (np.array([1.0, 3.0]), np.array([1.0, 1.0])),
+        "yaw_rate": (rate, rate - 0.1),
+    }
     scored = Scored(
         time=np.array([0.0, 0.01]),
         vy=np.array([0.5, 0.0]),
@@ -694,17 +701,17 @@ def test_losses_of_a_sequence_are_those_of_a_hand_calculation():
         sideslip_ref=np.radians([0.0, -179.0]),
         ay=np.zeros(2),
         is_sideslip_scored=np.array([False, True]),
-        other_states=others,
+        other_states=other_states,
     )
-    found = {name: (value, size) for name, value, size in block_errors.losses_of(scored)}
+    losses = {name: (value, size) for name, value, size in block_errors.losses_of(scored)}
     weighted = 0.2225 * 4.0 + 0.5064 * 0.25 + 0.1566 * 0.02
-    assert found["mse_weighted"] == pytest.approx((weighted, 2))
-    assert found["mae_weighted"] == pytest.approx((0.2225 * 2 + 0.5064 * 0.5 + 0.1566 * 0.2, 2))
+    assert losses["mse_weighted"] == pytest.approx((weighted, 2))
+    assert losses["mae_weighted"] == pytest.approx((0.2225 * 2 + 0.5064 * 0.5 + 0.1566 * 0.2, 2))
     first, second = 0.5064 * 0.5 + 0.1566 * 0.1, 0.2225 * 2.0 + 0.1566 * 0.1
-    assert found["ae99_weighted"] == pytest.approx((2 * (first + 0.99 * (second - first)), 2))
-    assert found["rmse_vy"] == pytest.approx((0.25, 2))
-    assert found["rmse_vx"] == pytest.approx((4.0, 2))
-    assert found["rmse_sideslip"] == pytest.approx((4.0, 1)), "2 degrees, across the half turn"
+    assert losses["ae99_weighted"] == pytest.approx((2 * (first + 0.99 * (second - first)), 2))
+    assert losses["rmse_vy"] == pytest.approx((0.25, 2))
+    assert losses["rmse_vx"] == pytest.approx((4.0, 2))
+    assert losses["rmse_sideslip"] == pytest.approx((4.0, 1)), "2 degrees, across the half turn"
 
 
 @pytest.mark.parametrize(
@@ -716,7 +723,7 @@ def test_losses_of_a_sequence_are_those_of_a_hand_calculation():
         ({}, "not checked", "not trained with twice the epochs"),
     ],
 )
-def test_a_training_is_long_enough_where_twice_the_epochs_improve_it_by_3_percent_at_most(
+def test_a_training_suffices_if_twice_the_epochs_improve_it_by_3_percent_at_most(
     doubled, state, words
 ):
     row = checked_training("GRU", "1000", "not stated", {0: 1.0, 1: 2.0, 2: 9.0}, doubled)
@@ -736,7 +743,7 @@ def test_parts_and_candidates_have_the_names_of_the_claims():
     assert {key: block_errors.candidate_name(*key) for key in named} == named
 
 
-def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
+def test_twice_the_epochs_check_the_main_part_and_folds_form_a_single_part(part):
     def with_validation(factor):
         metrics = part.metrics.copy()
         rows = (metrics["test_set"] == VALIDATION) & (metrics["metric"] == "mse_weighted")
@@ -751,16 +758,16 @@ def test_twice_the_epochs_check_the_main_part_and_folds_are_one_part(part):
     assert rows["NNT"].training == "not checked"
     moved = replace(part, split=replace(part.split, tests={"tyre_a": SPLIT.tests["tyre_d"]}))
     folds = {
-        f"tyre_a_fold_{fold}": replace(own, models=[model(part, "GRU")])
-        for fold, own in ((1, part), (2, moved))
+        f"tyre_a_fold_{fold}": replace(fold_part, models=[model(part, "GRU")])
+        for fold, fold_part in ((1, part), (2, moved))
     }
-    found = block_errors.error_rows(folds)
-    vy = [row for row in found if row.metric == "rmse_vy" and row.test_set == "tyre_a"]
+    fold_rows = block_errors.error_rows(folds)
+    vy = [row for row in fold_rows if row.metric == "rmse_vy" and row.test_set == "tyre_a"]
     assert {row.part for row in vy} == {"tyre_a_folds"}
     assert [row.block for row in vy] == [f"{name} {k}.00 s" for name in "ad" for k in range(3)]
 
 
-def test_order_of_methods_trained_anew_is_compared_with_the_published_one(tmp_path):
+def test_order_of_retrained_methods_is_compared_with_the_published_order(tmp_path):
     published = tmp_path / "overview.csv"
     rows = ["candidate,ours_tyre_a,ours_tyre_d", "NNTF_UH,0.009,0.018", "PC,0.03,0.06"]
     published.write_text("\n".join([*rows, "zero,0.12,0.14"]) + "\n", encoding="utf-8")

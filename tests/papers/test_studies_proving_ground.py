@@ -1,4 +1,6 @@
-"""The study of the simulated cars: its statistics against plain ones, its report, and pipelines of data sets alone."""
+"""The study of the simulated cars: its statistics against plain ones, its report, and pipelines of
+data sets alone.
+"""
 
 import json
 import re
@@ -45,7 +47,9 @@ REAL = AbsentDataset("ferrari_250lm", "The real car", "somebody's licence", "som
 
 
 def _drive(name="f1_001", seed=0, seconds=60.0, rate_hz=20.0, *, steered=0.0):
-    """A drive with a steering angle: that of the curvature, and ``steered`` rad more in left turns, less in right ones."""
+    """A drive with a steering angle: that of the curvature, and ``steered`` rad more in left turns,
+    less in right ones.
+    """
     plain = planar_drive(seconds, rate_hz, seed=seed, name=name)
     steer = np.arctan(2.4 * plain["yaw_rate"] / plain["vx"]) + steered * np.sign(plain["yaw_rate"])
     return replace(plain, vehicle="ferrari_250_lm", channels={**plain.channels, "steer": steer})
@@ -144,18 +148,18 @@ def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     )
 
 
-def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_papers_bins():
+def test_tallies_merge_count_slow_samples_as_duration_and_have_the_papers_bins():
     first = Tally()
     second = Tally()
-    both = Tally()
-    one = _simulated(_drive("a", 1), spun=True)
+    combined = Tally()
+    spun_drive = _simulated(_drive("a", 1), spun=True)
     two = _drive("b", 2)
-    first.add(one)
+    first.add(spun_drive)
     second.add(two)
-    both.add(one)
-    both.add(two)
+    combined.add(spun_drive)
+    combined.add(two)
     first.merge(second)
-    assert first.values() == both.values()
+    assert first.values() == combined.values()
     assert first.flags["spun"] == 1
     drive = _drive(seconds=30.0)
     tally = Tally()
@@ -197,22 +201,22 @@ def test_medians_recover_the_steering_that_was_added():
 
 def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
     vehicle = Vehicle("ferrari_250_lm", FERRARI["parameter_set"], FERRARI["overrides"])
-    own = characteristic(vehicle, 1.0, "dry")
+    dry = characteristic(vehicle, 1.0, "dry")
     # m (b/Cf - a/Cr)/L with the axle stiffnesses that the published study of the same car gives
     expected = np.degrees(982.0 / 2.4 * (1.07 / 0.7e5 - 1.33 / 1.2e5))
     assert single_track_gradient(vehicle) == pytest.approx(
         expected, rel=0.01
     )  # p_ky1 is rounded to three digits
     for low, high in ((0.5, 2.5), (-2.5, -0.5)):
-        inside = (own.ay > low) & (own.ay < high)
-        slope = np.polyfit(own.ay[inside], own.angle[inside], 1)[0]
+        inside = (dry.ay > low) & (dry.ay < high)
+        slope = np.polyfit(dry.ay[inside], dry.angle[inside], 1)[0]
         assert slope == pytest.approx(
-            own.gradient, rel=0.15
+            dry.gradient, rel=0.15
         )  # roll and load transfer are in the plant, not in the single track
-    assert own.ay.max() == pytest.approx(11.3, abs=0.5)
-    assert own.angle[-1] > 3 * own.gradient * own.ay[-1], "understeer rises towards the limit"
+    assert dry.ay.max() == pytest.approx(11.3, abs=0.5)
+    assert dry.angle[-1] > 3 * dry.gradient * dry.ay[-1], "understeer rises towards the limit"
     wet = characteristic(vehicle, 0.7, "wet")
-    assert wet.ay.max() == pytest.approx(0.7 * own.ay.max(), rel=0.05)
+    assert wet.ay.max() == pytest.approx(0.7 * dry.ay.max(), rel=0.05)
 
 
 def test_profiles_and_sets_follow_names_and_segments_the_busiest_drive():
@@ -233,19 +237,19 @@ def test_profiles_and_sets_follow_names_and_segments_the_busiest_drive():
     assert share_beyond(distributions, 20.0) == pytest.approx(2.5)
 
 
-def test_table_i_is_what_the_paper_prints():
+def test_table_i_equals_the_papers_figures():
     rows = [
-        own.values
+        drive_set.values
         for profile in PROFILES.values()
-        for own in profile.sets
-        if "ay_abs_q99" in own.values
+        for drive_set in profile.sets
+        if "ay_abs_q99" in drive_set.values
     ]
     assert [row["ay_abs_q99"] for row in rows] == [11.33, 11.60, 10.55, 10.78]
     assert sum(row["duration"] for row in rows) / 60.0 == pytest.approx(19.0 + 12.6 + 25.7 + 18.1)
     assert sum(row["distance"] for row in rows) / 1000.0 == pytest.approx(35.4 + 24.1 + 45.8 + 33.6)
 
 
-def test_accidents_are_kept_flagged_and_counted(study, report):
+def test_accidents_are_flagged_and_counted(study, report):
     vehicles = survey(study.datasets)
     vehicle = vehicles["ferrari_250_lm"]
     assert list(vehicles) == ["ferrari_250_lm"], "the real recording belongs to the simulated car"
@@ -294,7 +298,7 @@ def test_report_states_data_ratios_and_the_papers_figures(study, report):
     assert all("SIMULATED" in figure.caption for figure in figures)
 
 
-def test_template_of_the_report_has_at_most_3000_words_and_its_answer_in_the_first_300():
+def test_report_template_is_short_and_begins_with_its_answer():
     words = TEMPLATE.read_text(encoding="utf-8").split()
     assert len(words) < 1200
     assert "**Recommendation.**" in words[:300]
@@ -312,11 +316,13 @@ def test_without_the_real_recording_the_report_says_how_to_get_it(study):
 
 @pytest.fixture
 def survey_place(place, monkeypatch):
-    """A pipeline of three recordings that say they are simulated, and of a data set whose files may be missing."""
+    """A pipeline of three recordings that say they are simulated, and of a data set whose files may
+    be missing.
+    """
     monkeypatch.delenv("VEHEST_DATA")
     place.change("conf/dataset/mine.yaml", path=str(place.folder / "raw"))
-    other = {"name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
-    place.change("conf/dataset/other.yaml", **DATASET | other)
+    other_dataset = {"name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
+    place.change("conf/dataset/other.yaml", **DATASET | other_dataset)
     pipeline = {
         "report": "proving_ground",
         "datasets": ["mine"],
@@ -343,14 +349,14 @@ def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
             assert (results / target).is_file(), f"{page.name} links to {target}"
         assert str(place.folder) not in page.read_text(encoding="utf-8")
 
-    made = place.files()
+    published_files = place.files()
     code, again, err = place("run", "ground", "--jobs", "1")
     assert {status for status, _ in _statuses(err)} == {"reused"}
-    assert (again, place.files()) == (out, made)
+    assert (again, place.files()) == (out, published_files)
     assert place("report", "ground")[0] == 0
 
-    here = ("root=raw", "--jobs", "1")  # the real recording is there now
-    _, out, err = place("run", "ground", *here, "--json")
+    with_real_data = ("root=raw", "--jobs", "1")  # the real recording is there now
+    _, out, err = place("run", "ground", *with_real_data, "--json")
     assert [line.split()[1] for line in err.splitlines() if line.startswith("done")] == [
         "ingest",
         "report",
@@ -384,15 +390,15 @@ def _set(name, seed, seconds=60.0):
     return replace(_simulated(_drive(f"{name}_001", seed, seconds)), vehicle=f"car {name[0]}")
 
 
-def test_a_static_map_explains_all_of_a_car_that_is_one():
-    own = _set("f1", 1)
-    exact = own["yaw_rate"] * (1.07 - 0.005 * own["vx"] ** 2)
-    mapped = replace(own, channels={**own.channels, "vy_ref": exact})
+def test_a_static_map_explains_all_of_a_car_that_follows_a_static_map():
+    recording = _set("f1", 1)
+    exact = recording["yaw_rate"] * (1.07 - 0.005 * recording["vx"] ** 2)
+    mapped = replace(recording, channels={**recording.channels, "vy_ref": exact})
     assert gates.fvu_of_map(gates.fit_static_map([mapped]), [mapped]) < 1e-20
     noisy = replace(
-        own,
+        recording,
         channels={
-            **own.channels,
+            **recording.channels,
             "vy_ref": exact
             + 0.3 * np.std(exact) * np.random.default_rng(0).standard_normal(len(exact)),
         },
@@ -408,8 +414,8 @@ def test_a_gate_is_met_within_its_range_and_named_where_it_is_not():
     assert {gate.subject for gate in judged} == {"C-1", "C-2", "F-1", "F-2"} | cars
     lengths = [g for g in judged if g.subject == "C-1" and g.quantity == "duration [min]"]
     assert [gate.is_met(gates.AFTER) for gate in lengths] == [False]  # a minute, not nineteen
-    absent = [gate for gate in judged if gate.subject == "C-2"]
-    assert not any(gate.is_met(gates.AFTER) for gate in absent)  # no such drives
+    c2_gates = [gate for gate in judged if gate.subject == "C-2"]
+    assert not any(gate.is_met(gates.AFTER) for gate in c2_gates)  # no such drives
     (counts,) = gates.counts(judged)
     assert "C-1: duration [min] (1)" in counts["missed"]
     assert not counts["has_real"]
@@ -419,27 +425,27 @@ def test_a_gate_is_met_within_its_range_and_named_where_it_is_not():
 
 
 def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels():
-    own = _set("f1", 3, 120.0)
-    rate = np.gradient(own["vy_ref"]) * own.rate_hz
+    recording = _set("f1", 3, 120.0)
+    rate = np.gradient(recording["vy_ref"]) * recording.rate_hz
     twice = replace(
-        own,
+        recording,
         channels={
-            **own.channels,
-            "ay": own["vx"] * own["yaw_rate"]
+            **recording.channels,
+            "ay": recording["vx"] * recording["yaw_rate"]
             + rate
-            - 2.0 * (rate - own["ay"] + own["vx"] * own["yaw_rate"]),
+            - 2.0 * (rate - recording["ay"] + recording["vx"] * recording["yaw_rate"]),
         },
     )
-    found = [
+    band_gates = [
         gate
-        for gate in gates.gates({gates.AFTER: {"f1": [own]}}, [own])
+        for gate in gates.gates({gates.AFTER: {"f1": [recording]}}, [recording])
         if "process noise" in gate.quantity
     ]
-    assert len(found) == len(gates.BANDS_HZ)
-    assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in found)
+    assert len(band_gates) == len(gates.BANDS_HZ)
+    assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in band_gates)
     doubled = [
         gate
-        for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own])
+        for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [recording])
         if "process noise" in gate.quantity
     ]
     np.testing.assert_allclose(

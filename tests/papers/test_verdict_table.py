@@ -28,7 +28,7 @@ def test_rows_in_memory_are_judged_as_their_file(tmp_path):
         assert (errors.seeds, errors.blocks) == (memory[key].seeds, memory[key].blocks)
 
 
-def test_verdict_training_and_kind_of_data_have_columns_of_their_own():
+def test_verdict_training_and_kind_of_data_have_separate_columns():
     training = [TrainingRow("NNTF_UH", "100 + 100", "1000 + 1000", "insufficient", "")]
     table = claims_table(claims_of("learned_ukf"), planted(), training, {"real": "simulated"})
     rows = table.frame.set_index("id")

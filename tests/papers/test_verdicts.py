@@ -61,15 +61,15 @@ def ratio(value, spread=SPREAD):
 
 
 def test_order_is_student_s_test_of_log_ratios_over_blocks():
-    found = judged(claim_of(ratio=0.6), studied(a=ratio(0.6), b=LEVELS))
+    verdict = judged(claim_of(ratio=0.6), studied(a=ratio(0.6), b=LEVELS))
     expected = stats.ttest_1samp(math.log(0.6) + SPREAD, 0.0)
-    assert found.p_value == pytest.approx(expected.pvalue, rel=1e-9)
+    assert verdict.p_value == pytest.approx(expected.pvalue, rel=1e-9)
     low, high = expected.confidence_interval(0.95)
-    assert found.order.value == pytest.approx(0.6)
-    assert found.order.low == pytest.approx(math.exp(low), rel=1e-9)
-    assert found.order.high == pytest.approx(math.exp(high), rel=1e-9)
-    assert found.verdict == "reproduced"
-    assert found.size.value == pytest.approx(ratio(0.6).sum() / LEVELS.sum())
+    assert verdict.order.value == pytest.approx(0.6)
+    assert verdict.order.low == pytest.approx(math.exp(low), rel=1e-9)
+    assert verdict.order.high == pytest.approx(math.exp(high), rel=1e-9)
+    assert verdict.verdict == "reproduced"
+    assert verdict.size.value == pytest.approx(ratio(0.6).sum() / LEVELS.sum())
 
 
 def test_root_metrics_have_the_root_of_both_ratios():
@@ -98,27 +98,27 @@ def test_significant_in_the_other_direction_is_contradicted():
 
 def test_no_significant_difference_states_power_and_blocks_needed():
     spread = 8.0 * SPREAD
-    found = judged(claim_of(ratio=0.6), studied(a=ratio(0.9, spread), b=LEVELS))
-    assert found.verdict == "no significant difference"
+    verdict = judged(claim_of(ratio=0.6), studied(a=ratio(0.9, spread), b=LEVELS))
+    assert verdict.verdict == "no significant difference"
     error = spread.std(ddof=1) / math.sqrt(N)
     critical = stats.t.ppf(0.975, N - 1)
     noncentrality = abs(math.log(0.6)) / error
-    assert found.power == pytest.approx(stats.nct.sf(critical, N - 1, noncentrality), rel=1e-6)
+    assert verdict.power == pytest.approx(stats.nct.sf(critical, N - 1, noncentrality), rel=1e-6)
 
     def power_with(n):
         shift = abs(math.log(0.6)) / (spread.std(ddof=1) / math.sqrt(n))
         return stats.nct.sf(stats.t.ppf(0.975, n - 1), n - 1, shift)
 
-    assert power_with(found.blocks_needed) >= 0.8 > power_with(found.blocks_needed - 1)
+    assert power_with(verdict.blocks_needed) >= 0.8 > power_with(verdict.blocks_needed - 1)
 
 
-def test_seeds_that_differ_cannot_be_made_up_for_by_blocks():
+def test_more_blocks_cannot_compensate_for_seeds_that_differ():
     rng = np.random.default_rng(0)
     seeds = np.exp(np.array([[-1.0], [1.0]]) + 0.01 * rng.normal(size=(2, N))) * LEVELS
-    found = judged(claim_of(ratio=0.8), studied(a=seeds, b=LEVELS))
-    assert found.verdict == "no significant difference"
-    assert found.blocks_needed is None
-    assert "more seeds" in found.reason
+    verdict = judged(claim_of(ratio=0.8), studied(a=seeds, b=LEVELS))
+    assert verdict.verdict == "no significant difference"
+    assert verdict.blocks_needed is None
+    assert "more seeds" in verdict.reason
 
 
 def test_blocks_and_pooled_errors_that_disagree_are_no_significant_difference():
@@ -126,18 +126,18 @@ def test_blocks_and_pooled_errors_that_disagree_are_no_significant_difference():
     sums[-1] = 100.0 * LEVELS[-1]
     values = np.log(sums / LEVELS)
     values[:-1] += 0.001 * np.arange(N - 1)
-    many = np.concatenate([np.exp(values)[:-1].repeat(4), [60.0]])
-    found = judged(claim_of(), studied(a=many, b=np.ones(len(many))))
-    assert stats.ttest_1samp(np.log(many), 0.0).pvalue < 0.05
-    assert found.order.value < 1.0 < found.size.value
-    assert found.verdict == "no significant difference"
+    block_errors = np.concatenate([np.exp(values)[:-1].repeat(4), [60.0]])
+    verdict = judged(claim_of(), studied(a=block_errors, b=np.ones(len(block_errors))))
+    assert stats.ttest_1samp(np.log(block_errors), 0.0).pvalue < 0.05
+    assert verdict.order.value < 1.0 < verdict.size.value
+    assert verdict.verdict == "no significant difference"
 
 
 def test_claim_that_zero_meets_too_is_met_by_a_trivial_baseline():
     blocks = studied(a=ratio(0.5), b=LEVELS, zero=ratio(0.7))
-    found = judged(claim_of(ratio=0.5), blocks)
-    assert found.verdict == "met by a trivial baseline"
-    assert "zero" in found.reason
+    verdict = judged(claim_of(ratio=0.5), blocks)
+    assert verdict.verdict == "met by a trivial baseline"
+    assert "zero" in verdict.reason
     worse = studied(a=ratio(0.5), b=LEVELS, zero=ratio(1.3), static_map=ratio(1.0))
     assert judged(claim_of(ratio=0.5), worse).verdict == "reproduced"
 
@@ -177,9 +177,9 @@ def test_holm_corrects_within_a_family_only():
 )
 def test_equality_by_its_90_percent_interval(value, spread, verdict):
     blocks = studied(a=ratio(value, spread * SPREAD), b=LEVELS)
-    found = judged(claim_of("equal", other="b"), blocks)
-    assert found.verdict == verdict
-    assert (found.blocks_needed is not None) == (verdict == "inconclusive")
+    judgement = judged(claim_of("equal", other="b"), blocks)
+    assert judgement.verdict == verdict
+    assert (judgement.blocks_needed is not None) == (verdict == "inconclusive")
 
 
 @pytest.mark.parametrize(
@@ -188,13 +188,13 @@ def test_equality_by_its_90_percent_interval(value, spread, verdict):
 def test_limit_by_the_95_percent_interval_of_the_value(limit, verdict):
     sums = 100.0 * ratio(1.0, 0.0 * SPREAD) / LEVELS.mean()
     claim = claim_of("limit", direction="lower", limit=limit)
-    found = judged(claim, studied(a=sums))
-    assert found.values["a"].value == pytest.approx(1.0)
+    judgement = judged(claim, studied(a=sums))
+    assert judgement.values["a"].value == pytest.approx(1.0)
     relative = LEVELS / LEVELS.mean()
     # by the delta method: error of the logarithm of a mean is its relative error
     half = stats.t.ppf(0.975, N - 1) * relative.std(ddof=1) / math.sqrt(N)
-    assert found.values["a"].high == pytest.approx(math.exp(half), rel=0.02)
-    assert found.verdict == verdict
+    assert judgement.values["a"].high == pytest.approx(math.exp(half), rel=0.02)
+    assert judgement.verdict == verdict
     trivial = judged(claim, studied(a=sums, zero=0.9 * sums))
     assert trivial.verdict == (verdict if limit < 1.5 else "met by a trivial baseline")
 
@@ -214,10 +214,10 @@ def test_measured_values_are_judged_by_student_s_interval_of_their_mean():
     sums = errors_of(values, np.ones(N))
     blocks = studied("it", a=sums)
     claim = claim_of("measured", metric="", direction="lower", limit=2.0, measure="m:f", unit="s")
-    found = judged(claim, blocks)
+    judgement = judged(claim, blocks)
     low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    assert (found.values["a"].low, found.values["a"].high) == pytest.approx((low, high))
-    assert found.verdict == "reproduced"
+    assert (judgement.values["a"].low, judgement.values["a"].high) == pytest.approx((low, high))
+    assert judgement.verdict == "reproduced"
     for limit, verdict in ((1.0, "contradicted"), (1.5, "inconclusive")):
         turned = claim_of("measured", metric="", direction="lower", limit=limit, measure="m:f")
         assert judged(turned, blocks).verdict == verdict
@@ -228,25 +228,25 @@ def test_diverged_blocks_are_left_out_and_counted():
     first = np.stack([ratio(0.5), ratio(0.5)])
     second = np.stack([LEVELS, LEVELS])
     second[1, 3] = np.inf
-    found = judged(claim_of(), studied(a=first, b=second))
-    assert found.verdict == "reproduced"
-    assert found.n_blocks == N - 1
-    assert found.diverged == {"a": 0, "b": 1}
-    assert "b diverged in 1 of the pairs" in found.reason
+    verdict = judged(claim_of(), studied(a=first, b=second))
+    assert verdict.verdict == "reproduced"
+    assert verdict.n_blocks == N - 1
+    assert verdict.diverged == {"a": 0, "b": 1}
+    assert "b diverged in 1 of the pairs" in verdict.reason
     # whoever wins where it survives, but diverges more often, has not won
     first[0, :2] = np.nan
-    found = judged(claim_of(), studied(a=first, b=second))
-    assert found.verdict == "no significant difference"
-    assert "diverges in more" in found.reason
+    verdict = judged(claim_of(), studied(a=first, b=second))
+    assert verdict.verdict == "no significant difference"
+    assert "diverges in more" in verdict.reason
 
 
-def test_one_block_gives_values_and_no_test():
+def test_a_single_block_gives_values_but_no_significance_test():
     blocks = studied(a=[[1.0]], b=[[2.0]])
-    found = judged(claim_of(), blocks)
-    assert found.verdict == "no significant difference"
-    assert "1 block" in found.reason
-    assert found.values["a"].value == pytest.approx(0.01)
-    assert math.isnan(found.values["a"].low)
+    verdict = judged(claim_of(), blocks)
+    assert verdict.verdict == "no significant difference"
+    assert "1 block" in verdict.reason
+    assert verdict.values["a"].value == pytest.approx(0.01)
+    assert math.isnan(verdict.values["a"].low)
     limit = claim_of("limit", direction="lower", limit=1.0)
     assert judged(limit, blocks).verdict == "inconclusive"
 
@@ -256,9 +256,9 @@ def test_candidate_that_was_trained_once_gets_no_verdict():
         "a": Training("10", "1000", "insufficient", ""),
         "b": Training("", "", "not applicable", ""),
     }
-    found = judged(claim_of(), studied(a=ratio(0.5), b=LEVELS), trained)
-    assert found.verdict == "no significant difference"
-    assert "a trained once" in found.reason
+    verdict = judged(claim_of(), studied(a=ratio(0.5), b=LEVELS), trained)
+    assert verdict.verdict == "no significant difference"
+    assert "a trained once" in verdict.reason
     twice = studied(a=[ratio(0.5), ratio(0.5)], b=LEVELS)
     assert judged(claim_of(), twice, trained).verdict == "reproduced"
     limit = claim_of("limit", direction="lower", limit=1.0)
@@ -266,19 +266,19 @@ def test_candidate_that_was_trained_once_gets_no_verdict():
     assert judged(limit, studied(a=LEVELS), {}).verdict == "reproduced"
 
 
-def test_candidates_that_are_not_trained_are_named_and_fewer_seeds_than_planned_counted():
+def test_untrained_candidates_are_named_and_missing_seeds_counted():
     trained = {
         "a": Training("10", "1000", "not checked", "", 5),
         "b": Training("", "1000", "not trained", "", 5),
     }
     twice = studied(a=[ratio(0.5), ratio(0.5)])
-    found = judged(claim_of(), twice, trained)
-    assert (found.verdict, found.reason) == ("not assessed", "b is not trained")
+    verdict = judged(claim_of(), twice, trained)
+    assert (verdict.verdict, verdict.reason) == ("not assessed", "b is not trained")
     assert judged(claim_of(), {}, trained).reason == "b is not trained"
     trained["b"] = Training("10", "1000", "not checked", "", 0)
-    found = judged(claim_of(), studied(a=[ratio(0.5), ratio(0.5)], b=[LEVELS] * 5), trained)
-    assert found.verdict == "reproduced"
-    assert found.reason.endswith("; a with 2 of 5 seeds")
+    verdict = judged(claim_of(), studied(a=[ratio(0.5), ratio(0.5)], b=[LEVELS] * 5), trained)
+    assert verdict.verdict == "reproduced"
+    assert verdict.reason.endswith("; a with 2 of 5 seeds")
     assert "no per-block errors of b" in judged(claim_of(), twice, {}).reason
 
 
@@ -315,9 +315,9 @@ def test_measured_weights_have_an_interval_over_their_trainings():
         "measured", id="leak", metric="", direction="lower", limit=1.0, measure="weights:leak"
     )
     blocks = {Key("real", "a", "test", "leak"): errors_of(values[:, None], [1.0])}
-    found = judged(claim, blocks)
+    verdict = judged(claim, blocks)
     low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
-    assert found.verdict == "reproduced"
-    assert (found.values["a"].low, found.values["a"].high) == pytest.approx((low, high))
-    few = {Key("real", "a", "test", "leak"): errors_of(values[:2, None], [1.0])}
-    assert judged(claim, few).verdict == "inconclusive"
+    assert verdict.verdict == "reproduced"
+    assert (verdict.values["a"].low, verdict.values["a"].high) == pytest.approx((low, high))
+    two_trainings = {Key("real", "a", "test", "leak"): errors_of(values[:2, None], [1.0])}
+    assert judged(claim, two_trainings).verdict == "inconclusive"

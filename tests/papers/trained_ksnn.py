@@ -1,4 +1,6 @@
-"""KS-NNs as training leaves them, without the training: weights drawn around typical ones, so that tests know them."""
+"""KS-NNs as training leaves them, without the training: weights drawn around typical ones, so that
+tests know them.
+"""
 
 import torch
 

@@ -1,6 +1,8 @@
-"""Runs every study on small budgets and keeps the tables of its report, which say whether a change moved numbers; README.md says more.
+"""Runs every study on small budgets and keeps the tables of its report, which say whether a change
+moved numbers; README.md says more.
 
-pipelines/STUDY.yaml -> reduced pipeline -> `vehest run` -> report's metrics.csv and tables/*.csv -> rounded, in OUT/STUDY/ -> `compare`
+pipelines/STUDY.yaml -> reduced pipeline -> `vehest run` -> report's metrics.csv and tables/*.csv ->
+rounded, in OUT/STUDY/ -> `compare`
 """
 
 import argparse
@@ -22,7 +24,7 @@ import yaml
 from vehest.configuration.composition import compose_config, expand, key_of
 
 ROOT = Path(__file__).resolve().parents[2]
-ABSENT = {"ksnn_revs"}  # needs the official files of the Revs database
+WITHOUT_PILOT = {"ksnn_revs"}  # needs the official files of the Revs database
 BUDGETS = {
     "max_epochs": 2,
     "max_evaluations": 6,
@@ -35,12 +37,14 @@ BUDGETS = {
 MOST_DRIVES = 3
 MOST_SECONDS = 100  # of each kind in a simulated data set; of a drive
 DIGITS = 6
-SHOWN = 5
+MAX_DIFFERENCES = 5
 _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
 
 
 def reduced(pipeline):
-    """A pipeline with all parts and candidates, but one seed and at most the `BUDGETS` for each training."""
+    """A pipeline with all parts and candidates, but one seed and at most the `BUDGETS` for each
+    training.
+    """
     parts = {
         name: {**part, "sweeps": _reduced_sweeps(part["sweeps"])}
         for name, part in pipeline.get("parts", {}).items()
@@ -78,10 +82,10 @@ def _budgets_of(overrides):
         f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)
     }
     return [
-        f"{phase}.{name}={most}"
+        f"{phase}.{name}={budget}"
         for phase, values in phases.items()
-        for name, most in BUDGETS.items()
-        if values.get(name, most) > most
+        for name, budget in BUDGETS.items()
+        if values.get(name, budget) > budget
     ]
 
 
@@ -140,6 +144,7 @@ def collect(report, folder):
 
 
 def _rounded(cell):
+    """A number at the digits that are compared; text as it is."""
     try:
         return f"{float(cell):.{DIGITS}g}"
     except ValueError:
@@ -155,35 +160,39 @@ def differences(first, second):
             for file in side.rglob("*.csv")
         }
     ):
-        absent = [side for side in (first, second) if not (side / name).is_file()]
-        if absent:
-            yield f"{name}: not in {absent[0]}"
+        without_file = [side for side in (first, second) if not (side / name).is_file()]
+        if without_file:
+            yield f"{name}: not in {without_file[0]}"
             continue
         table = _texts(first / name)
-        other = _texts(second / name)
-        if list(table) != list(other) or len(table) != len(other):
-            yield f"{name}: {len(table)} rows of {','.join(table)} | {len(other)} rows of {','.join(other)}"
+        other_table = _texts(second / name)
+        if list(table) != list(other_table) or len(table) != len(other_table):
+            shapes = (f"{len(rows)} rows of {','.join(rows)}" for rows in (table, other_table))
+            yield f"{name}: {' | '.join(shapes)}"
             continue
-        for row, column in np.argwhere((table != other).to_numpy()):
-            yield f"{name}, row {row + 1}, {table.columns[column]}: {table.iat[row, column]} | {other.iat[row, column]}"
+        for row, column in np.argwhere((table != other_table).to_numpy()):
+            cells = f"{table.iat[row, column]} | {other_table.iat[row, column]}"
+            yield f"{name}, row {row + 1}, {table.columns[column]}: {cells}"
 
 
 def compare(first, second):
-    """Print of every study whether its tables are equal, else the first differences and their number; returns how many studies differ."""
+    """Print of every study whether its tables are equal, else the first differences and their
+    number; returns how many studies differ.
+    """
     differing = 0
     for study in sorted(
         {folder.name for side in (first, second) for folder in side.iterdir() if folder.is_dir()}
     ):
         alone = [side for side in (first, second) if not (side / study).is_dir()]
-        found = (
+        study_differences = (
             [f"not in {alone[0]}"] if alone else list(differences(first / study, second / study))
         )
         print(
-            f"{study}: {f'{len(found)} differences' if found else 'equal'}",
-            *found[:SHOWN],
+            f"{study}: {f'{len(study_differences)} differences' if study_differences else 'equal'}",
+            *study_differences[:MAX_DIFFERENCES],
             sep="\n  ",
         )
-        differing += bool(found)
+        differing += bool(study_differences)
     return differing
 
 
@@ -200,23 +209,27 @@ def main():
     parser.add_argument(
         "--compare", nargs=2, type=Path, metavar="OUT", help="compare two folders of tables instead"
     )
-    given = parser.parse_args()
-    if given.compare:
-        absent = [str(folder) for folder in given.compare if not folder.is_dir()]
+    options = parser.parse_args()
+    if options.compare:
+        missing_folders = [str(folder) for folder in options.compare if not folder.is_dir()]
         sys.exit(
-            f"there is no folder {' or '.join(absent)}" if absent else compare(*given.compare) > 0
+            f"there is no folder {' or '.join(missing_folders)}"
+            if missing_folders
+            else compare(*options.compare) > 0
         )
-    known = {file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - ABSENT
-    if set(given.studies) - known:
-        sys.exit(
-            f"no pilot of {', '.join(sorted(set(given.studies) - known))}; there are: {', '.join(sorted(known))}"
-        )
-    studies = given.studies or sorted(known)
+    studies_with_pilot = {file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - WITHOUT_PILOT
+    unknown_studies = sorted(set(options.studies) - studies_with_pilot)
+    if unknown_studies:
+        available = ", ".join(sorted(studies_with_pilot))
+        sys.exit(f"no pilot of {', '.join(unknown_studies)}; there are: {available}")
+    studies = options.studies or sorted(studies_with_pilot)
     with tempfile.TemporaryDirectory(
         prefix="pilots-"
     ) as output:  # a new one: keys say nothing of code whose versions stayed
         write_data_sets(Path(output) / "conf" / "dataset")
-        succeeded = [run(study, given.out.resolve(), Path(output), given.jobs) for study in studies]
+        succeeded = [
+            run(study, options.out.resolve(), Path(output), options.jobs) for study in studies
+        ]
     sys.exit(not all(succeeded))
 
 

@@ -1,8 +1,10 @@
-"""Twelve logs in different dress, made of the real Ferrari and F1TENTH recordings; ``answers.yaml`` holds what each column is.
+"""Twelve logs in different dress, made of the real Ferrari and F1TENTH recordings; ``answers.yaml``
+holds what each column is.
 
-The Ferrari's is 150 to 450 s of its drive, the range that estimators learn from, the F1TENTH car's are two runs of its training file.
-What the recordings do not have is computed: the angle of a steering wheel (16 times the road wheels'), four wheels that roll without
-slip (0.32 m, tracks of 1.35 m), heading by integration, gear, temperatures.
+The Ferrari's is 150 to 450 s of its drive, the range that estimators learn from, the F1TENTH car's
+are two runs of its training file. What the recordings do not have is computed: the angle of a
+steering wheel (16 times the road wheels'), four wheels that roll without slip (0.32 m, tracks of
+1.35 m), heading by integration, gear, temperatures.
 """
 
 from functools import cache
@@ -21,7 +23,9 @@ UNIX = 1_393_000_000.0
 
 @cache
 def ferrari(data, step=1):
-    """150 to 450 s of the drive in SI units and ISO 8855 axes, every ``step``-th sample, (T,) each."""
+    """150 to 450 s of the drive in SI units and ISO 8855 axes, every ``step``-th sample,
+    (T,) each.
+    """
     names = {
         "t": "t",
         "vx": "vx",
@@ -40,7 +44,9 @@ def ferrari(data, step=1):
 
 @cache
 def f1tenth(data, run, rate_hz=100.0):
-    """One run in SI units and ISO 8855 axes, by straight lines where another rate is wanted, (T,) each."""
+    """One run in SI units and ISO 8855 axes, by straight lines where another rate is wanted, (T,)
+    each.
+    """
     table = pd.read_csv(data / RUNS)
     table = table[table["run_id"] == run]
     names = {
@@ -53,10 +59,10 @@ def f1tenth(data, run, rate_hz=100.0):
         "r": "r_imu",
         "delta": "delta",
     }
-    own = np.arange(len(table)) / 100.0
-    t = np.arange(int(own[-1] * rate_hz) + 1) / rate_hz
+    run_time = np.arange(len(table)) / 100.0
+    t = np.arange(int(run_time[-1] * rate_hz) + 1) / rate_hz
     return {"t": t} | {
-        name: np.interp(t, own, table[column].to_numpy())
+        name: np.interp(t, run_time, table[column].to_numpy())
         for name, column in {**names, "Iq": "Iq"}.items()
     }
 
@@ -67,7 +73,9 @@ def later(t, samples, delay):
 
 
 def nuisances(t, seed):
-    """What a logger writes besides: a temperature that rises, a gear, a voltage, a level that stays."""
+    """What a logger writes besides: a temperature that rises, a gear, a voltage, a level that
+    stays.
+    """
     random = np.random.default_rng(seed)
     n = len(t)
     temperature = 80.0 + 10.0 * (1.0 - np.exp(-t / 60.0)) + 0.05 * random.standard_normal(n)
@@ -81,22 +89,27 @@ def nuisances(t, seed):
 
 
 def table(d, columns, **more):
-    """Columns, ``NAME=QUANTITY`` between commas: what ``d`` and ``more`` hold, or the same in units of loggers; - turns it round."""
-    known = d | {
+    """Columns, ``NAME=QUANTITY`` between commas: what ``d`` and ``more`` hold, or the same in units
+    of loggers; - turns it round.
+    """
+    quantities = d | {
         "ms": 1000.0 * d["t"],
         "km/h": 3.6 * d["vx"],
         "deg/s": np.degrees(d["r"]),
         "ay_g": d["ay"] / G,
         "ax_g": d["ax"] / G,
     }
-    known |= {
+    quantities |= {
         "road_deg": np.degrees(d["delta"]),
         "wheel_deg": np.degrees(RATIO * d["delta"]),
         **more,
     }
-    known |= {"beta_deg": np.degrees(d["beta"])} if "beta" in d else {}
+    quantities |= {"beta_deg": np.degrees(d["beta"])} if "beta" in d else {}
     named = [column.rsplit("=", 1) for column in columns.split(", ")]
-    return {name: -known[own[1:]] if own[0] == "-" else known[own] for name, own in named}
+    return {
+        name: -quantities[quantity[1:]] if quantity[0] == "-" else quantities[quantity]
+        for name, quantity in named
+    }
 
 
 def write(file, columns, digits=4, **options):
@@ -109,14 +122,22 @@ def write(file, columns, digits=4, **options):
 def units(data, folder):
     """km/h, deg/s and g, hardly any of it in the header."""
     d = ferrari(data)
-    columns = "Time [s]=t, Speed [km/h]=km/h, OilTemp=temperature, Gyro=deg/s, LatAcc=ay_g, LongAcc=ax_g, SWA [deg]=wheel_deg, Gear=gear, VLat=vy"
+    columns = (
+        "Time [s]=t, Speed [km/h]=km/h, OilTemp=temperature, Gyro=deg/s, LatAcc=ay_g, "
+        "LongAcc=ax_g, SWA [deg]=wheel_deg, Gear=gear, VLat=vy"
+    )
     write(folder / "units.csv", table(d, columns, **nuisances(d["t"], 1)))
 
 
 def german(data, folder):
-    """Decimal commas, semicolons, Latin-1, German names, milliseconds, lateral acceleration to the right."""
+    """Decimal commas, semicolons, Latin-1, German names, milliseconds, lateral acceleration to the
+    right.
+    """
     d = ferrari(data)
-    columns = "Zeit [ms]=ms, v_Fzg [km/h]=km/h, Drehzahl [1/min]=engine, Gierrate [°/s]=deg/s, Querbeschl. [m/s²]=-ay, Längsbeschl. [m/s²]=ax, "
+    columns = (
+        "Zeit [ms]=ms, v_Fzg [km/h]=km/h, Drehzahl [1/min]=engine, Gierrate [°/s]=deg/s, "
+        "Querbeschl. [m/s²]=-ay, Längsbeschl. [m/s²]=ax, "
+    )
     columns += "Lenkradwinkel [°]=wheel_deg, Schwimmwinkel [°]=beta_deg"
     drawn = table(d, columns, engine=900.0 + 90.0 * d["vx"])
     write(folder / "german.csv", drawn, sep=";", decimal=",", encoding="latin-1")
@@ -134,12 +155,17 @@ def numbered(data, folder):
 def unix(data, folder):
     """Unix time in milliseconds, a gyro that points down, a model car."""
     d = f1tenth(data, 2)
-    columns = "stamp=stamp, wheel_v=v, gz=-r, acc_x=ax, acc_y=ay, servo=delta, mocap_u=vx, mocap_v=vy, mocap_r=r_ref"
+    columns = (
+        "stamp=stamp, wheel_v=v, gz=-r, acc_x=ax, acc_y=ay, servo=delta, mocap_u=vx, mocap_v=vy, "
+        "mocap_r=r_ref"
+    )
     write(folder / "unix.csv", table(d, columns, stamp=np.rint(1000.0 * (UNIX + d["t"]))), 5)
 
 
 def flipped(data, folder):
-    """g, deg/s, degrees, two channels that count to the right, and two speeds whose names tell nothing."""
+    """g, deg/s, degrees, two channels that count to the right, and two speeds whose names tell
+    nothing.
+    """
     columns = "t_s=t, V=v, u=vx, v=-vy, imu0=ax_g, imu1=-ay_g, imu2=deg/s, cmd=road_deg"
     write(folder / "flipped.csv", table(f1tenth(data, 5), columns), 5)
 
@@ -151,12 +177,17 @@ def wheels(data, folder):
     side = 0.5 * TRACK * d["r"]
     rear = {"HL": rpm * (d["vx"] - side), "HR": rpm * (d["vx"] + side)}
     front = {"VL": rear["HL"] / np.cos(d["delta"]), "VR": rear["HR"] / np.cos(d["delta"])}
-    columns = "Time (s)=t, n_VL=VL, n_VR=VR, n_HL=HL, n_HR=HR, Gyro=-deg/s, LatAcc=ay, LongAcc=ax, Beta=beta_deg"
+    columns = (
+        "Time (s)=t, n_VL=VL, n_VR=VR, n_HL=HL, n_HR=HR, Gyro=-deg/s, LatAcc=ay, LongAcc=ax, "
+        "Beta=beta_deg"
+    )
     write(folder / "wheels.csv", table(d, columns, **rear, **front))
 
 
 def sideslip(data, folder):
-    """A sideslip angle alone for a reference, no longitudinal acceleration, unix time, 50 Hz, a gyro that is 100 ms late."""
+    """A sideslip angle alone for a reference, no longitudinal acceleration, unix time, 50 Hz, a
+    gyro that is 100 ms late.
+    """
     d = ferrari(data, 2)
     columns = (
         "Timestamp=unix, Speed=km/h, GyroZ=late, AccY=-ay, SteerWheel=wheel_deg, SlipAngle=beta_deg"
@@ -168,7 +199,9 @@ def sideslip(data, folder):
 
 
 def mdf(data, folder):
-    """MDF 4 in groups of two rasters, units for some of the signals, a yaw rate that counts to the right."""
+    """MDF 4 in groups of two rasters, units for some of the signals, a yaw rate that counts to the
+    right.
+    """
     import asammdf
 
     fast = ferrari(data)
@@ -199,39 +232,44 @@ def mdf(data, folder):
 
 
 def bag(data, folder):
-    """A ROS 2 bag: an inertial unit turned round, a servo's command from 0 to 1, velocities of motion capture."""
+    """A ROS 2 bag: an inertial unit turned round, a servo's command from 0 to 1, velocities of
+    motion capture.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     d = f1tenth(data, 2)
     types = get_typestore(Stores.ROS2_HUMBLE)
-    made = types.types
+    message_types = types.types
     start = round(UNIX * 1e9)
 
     def header(k):
         stamp = start + round(d["t"][k] * 1e9)
-        return made["std_msgs/msg/Header"](
-            made["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "base"
+        return message_types["std_msgs/msg/Header"](
+            message_types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9),
+            "base",
         )
 
     def vector(x, y, z):
-        return made["geometry_msgs/msg/Vector3"](x=float(x), y=float(y), z=float(z))
+        return message_types["geometry_msgs/msg/Vector3"](x=float(x), y=float(y), z=float(z))
 
     def twist(x, y, r):
-        return made["geometry_msgs/msg/Twist"](
+        return message_types["geometry_msgs/msg/Twist"](
             linear=vector(x, y, 0.0), angular=vector(0.0, 0.0, r)
         )
 
-    still = made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    origin = made["geometry_msgs/msg/Pose"](made["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), still)
+    no_rotation = message_types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    origin = message_types["geometry_msgs/msg/Pose"](
+        message_types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), no_rotation
+    )
     none = np.zeros(9)
     flat = np.zeros(36)
-    pose = made["geometry_msgs/msg/PoseWithCovariance"](origin, flat)
+    pose = message_types["geometry_msgs/msg/PoseWithCovariance"](origin, flat)
 
     def imu(k):
         return (
             header(k),
-            still,
+            no_rotation,
             none,
             vector(0.0, 0.0, d["r"][k]),
             none,
@@ -240,8 +278,13 @@ def bag(data, folder):
         )
 
     def odometry(k):
-        seen = twist(d["vx"][k], d["vy"][k], d["r_ref"][k])
-        return header(k), "base", pose, made["geometry_msgs/msg/TwistWithCovariance"](seen, flat)
+        velocity = twist(d["vx"][k], d["vy"][k], d["r_ref"][k])
+        return (
+            header(k),
+            "base",
+            pose,
+            message_types["geometry_msgs/msg/TwistWithCovariance"](velocity, flat),
+        )
 
     messages = {
         "/imu/data": ("sensor_msgs/msg/Imu", imu),
@@ -262,7 +305,7 @@ def bag(data, folder):
                 writer.write(
                     connections[topic],
                     start + round(t * 1e9),
-                    bytes(types.serialize_cdr(made[kind](*fields(k)), kind)),
+                    bytes(types.serialize_cdr(message_types[kind](*fields(k)), kind)),
                 )
 
 
@@ -275,12 +318,15 @@ def vbo(data, folder):
         f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}"
         for k in stamps
     ]
-    columns = "velocity=km/h, heading=heading, height=height, Longacc=ax_g, Latacc=-ay_g, YawRate=-deg/s, SWA=-wheel_deg, Slip_COG=-beta_deg"
+    columns = (
+        "velocity=km/h, heading=heading, height=height, Longacc=ax_g, Latacc=-ay_g, "
+        "YawRate=-deg/s, SWA=-wheel_deg, Slip_COG=-beta_deg"
+    )
     numbers = table(d, columns, heading=heading, height=np.full(len(heading), 12.0))
     names = " ".join(["sats time lat long", *numbers])
     rows = [
         f"009 {clock[k]} +01600.0 +04800.0 "
-        + " ".join(f"{own[k]:+.5f}" for own in numbers.values())
+        + " ".join(f"{column_values[k]:+.5f}" for column_values in numbers.values())
         for k in range(len(clock))
     ]
     head = [
@@ -302,7 +348,10 @@ def vbo(data, folder):
 
 def two_runs(data, folder):
     """Two files of 200 Hz, a lateral acceleration that is 80 ms late."""
-    columns = "ts=t, a_long=ax, a_lat=late, yawrate=r, steering=delta, v_wheel=v, Iq=Iq, ref_vx=vx, ref_vy=vy"
+    columns = (
+        "ts=t, a_long=ax, a_lat=late, yawrate=r, steering=delta, v_wheel=v, Iq=Iq, ref_vx=vx, "
+        "ref_vy=vy"
+    )
     for number, run in ((1, 2), (2, 5)):
         d = f1tenth(data, run, 200.0)
         write(folder / f"run_{number}.csv", table(d, columns, late=later(d["t"], d["ay"], 0.08)), 5)
@@ -338,7 +387,7 @@ LOGS = {make.__name__: make for make in MADE}
 
 def write_log(name, data, folder, logs=LOGS):
     """Write one log into a folder of its own; returns its files."""
-    own = folder / name
-    own.mkdir(parents=True)
-    logs[name](data, own)
-    return sorted(own.iterdir())
+    log_folder = folder / name
+    log_folder.mkdir(parents=True)
+    logs[name](data, log_folder)
+    return sorted(log_folder.iterdir())

@@ -1,4 +1,6 @@
-"""`vehest new --yes`, then `vehest run --minutes 5`, on the ten logs of front_door_logs.py, held against front_door.yaml, a line each."""
+"""`vehest new --yes`, then `vehest run --minutes 5`, on the ten logs of front_door_logs.py, held
+against front_door.yaml, a line each.
+"""
 
 import argparse
 import json
@@ -27,36 +29,40 @@ def vehest(folder, *words):
     return ran.returncode, ran.stdout, ran.stderr
 
 
-def differences(told, code, plain, words):
+def differences(expected, code, plain, words):
     """What `vehest new` did otherwise than expected."""
     if code:
-        return [] if told["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
-    found = {one["channel"]: one["column"] for one in plain["channels"]}
+        return (
+            [] if expected["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
+        )
+    proposed_columns = {channel["channel"]: channel["column"] for channel in plain["channels"]}
     wrong = [
-        f"{channel} is {found.get(channel)}, not {own}"
-        for channel, own in told["channels"].items()
-        if found.get(channel) != own
+        f"{channel} is {proposed_columns.get(channel)}, not {column}"
+        for channel, column in expected["channels"].items()
+        if proposed_columns.get(channel) != column
     ]
     wrong += [
-        f"nothing is asked about {own}"
-        for own in told.get("asked", ())
-        if own not in {question["key"] for question in plain["open"]}
+        f"nothing is asked about {question_key}"
+        for question_key in expected.get("asked", ())
+        if question_key not in {question["key"] for question in plain["open"]}
     ]
-    evidence = [text for one in plain["channels"] for text in one["evidence"]]
-    said = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *evidence])
-    return wrong + ([f"'{told['note']}' is not said"] if told.get("note", "") not in said else [])
+    evidence = [text for channel in plain["channels"] for text in channel["evidence"]]
+    messages = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *evidence])
+    return wrong + (
+        [f"'{expected['note']}' is not said"] if expected.get("note", "") not in messages else []
+    )
 
 
 def tried(name, data, folder, minutes):
     """Differences from what is expected, and how the way ended."""
-    told = yaml.safe_load(EXPECTED.read_text(encoding="utf-8"))[name]
+    expected = yaml.safe_load(EXPECTED.read_text(encoding="utf-8"))[name]
     files = [str(file) for file in write_log(name, data, folder, LOGS)]
     code, out, err = vehest(folder, "new", name, *files, "--yes", "--json")
     plain = json.loads(out) if out.strip().startswith("{") else {}
-    wrong = differences(told, code, plain, err)
+    wrong = differences(expected, code, plain, err)
     if code or not plain.get("estimators"):
         end = err.strip().splitlines()[-1] if code else "; ".join(plain["limits"])
-        return wrong + ([f"ended with: {end}"] if told["end"] == "verdict" else []), end
+        return wrong + ([f"ended with: {end}"] if expected["end"] == "verdict" else []), end
     if not minutes:
         return wrong, "not run"
     code, out, err = vehest(
@@ -64,7 +70,7 @@ def tried(name, data, folder, minutes):
     )
     lines = [line for line in out.splitlines() if line.strip()]
     end = " ".join(lines[-6:]) if code == 0 else (err.strip().splitlines() or ["nothing"])[-1]
-    return wrong + ([f"exit {code}"] if (code != 0) == (told["end"] == "verdict") else []), end
+    return wrong + ([f"exit {code}"] if (code != 0) == (expected["end"] == "verdict") else []), end
 
 
 def main(words=None):
@@ -73,11 +79,11 @@ def main(words=None):
     parser.add_argument("names", nargs="*", default=list(LOGS))
     parser.add_argument("--minutes", type=float, default=5.0, help="of vehest run; 0: not run")
     parser.add_argument("--data", type=Path, default=os.environ.get("VEHEST_DATA"))
-    own = parser.parse_args(words)
+    options = parser.parse_args(words)
     failed = 0
-    for name in own.names:
+    for name in options.names:
         with tempfile.TemporaryDirectory() as folder:
-            wrong, end = tried(name, own.data, Path(folder), own.minutes)
+            wrong, end = tried(name, options.data, Path(folder), options.minutes)
         failed += bool(wrong)
         print(f"{name}: {'; '.join(wrong) or 'as expected'}\n    {end[:600]}", flush=True)
     return 1 if failed else 0

@@ -1,6 +1,8 @@
-"""Ten logs as users bring them, made of the real Ferrari and Volvo recordings; ``front_door.yaml`` holds what is expected of each.
+"""Ten logs as users bring them, made of the real Ferrari and Volvo recordings; ``front_door.yaml``
+holds what is expected of each.
 
-Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or to a sentence that says what to record.
+Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or
+to a sentence that says what to record.
 """
 
 import numpy as np
@@ -12,14 +14,17 @@ MPS = 3.6  # km/h
 
 def usual(d):
     """The columns that most logs have."""
-    columns = "Time [s]=t, VehSpd [km/h]=km/h, YawRate [deg/s]=deg/s, AccY [m/s2]=ay, AccX [m/s2]=ax, SteerWheel [deg]=wheel_deg, "
+    columns = (
+        "Time [s]=t, VehSpd [km/h]=km/h, YawRate [deg/s]=deg/s, AccY [m/s2]=ay, AccX [m/s2]=ax, "
+        "SteerWheel [deg]=wheel_deg, "
+    )
     return table(d, columns + "ADMA_VelLat [m/s]=vy")
 
 
 def part(d, start, seconds):
     """A part of a drive, its time from 0."""
     rows = (d["t"] >= start) & (d["t"] < start + seconds)
-    return {name: own[rows] - (start if name == "t" else 0.0) for name, own in d.items()}
+    return {name: samples[rows] - (start if name == "t" else 0.0) for name, samples in d.items()}
 
 
 def six_seconds(data, folder):
@@ -52,24 +57,29 @@ def standstill_first(data, folder):
 
 
 def two_speeds(data, folder):
-    """The speed of antennas and that of the car's bus; the antenna's comes first and is the smoother one."""
+    """The speed of antennas and that of the car's bus.
+
+    The antenna's comes first and is the smoother one.
+    """
     d = ferrari(data)
     random = np.random.default_rng(3)
-    own = np.round(
+    bus_speed = np.round(
         MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05
     ) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
     columns = {
         "Time [s]": d["t"],
         "Velocity [km/h]": MPS * d["vx"],
         **usual(d),
-        "VehSpdLgt_CAN [km/h]": own,
+        "VehSpdLgt_CAN [km/h]": bus_speed,
     }
     del columns["VehSpd [km/h]"]
     write(folder / "antenna.csv", columns)
 
 
 def misnamed_lateral(data, folder):
-    """A lateral velocity called like an acceleration, before the acceleration itself, neither with a unit."""
+    """A lateral velocity called like an acceleration, before the acceleration itself, neither with
+    a unit.
+    """
     d = ferrari(data)
     columns = table(
         d,
@@ -110,7 +120,9 @@ def wheels_in_kmh(data, folder):
 
 
 def vbox(data, folder):
-    """Three drives of a Volvo S90 as its VBOX wrote them: offsets of the Slip_* points changed places."""
+    """Three drives of a Volvo S90 as its VBOX wrote them: offsets of the Slip_* points changed
+    places.
+    """
     for number in ("038", "040", "041"):
         (folder / f"S90__{number}.VBO").write_bytes(
             (data / "vbox" / f"S90__{number}.VBO").read_bytes()

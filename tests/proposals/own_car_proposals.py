@@ -1,7 +1,9 @@
-"""`vehest new` on twelve logs in different dress, held against what was written down before: results/own_car/proposals.csv, a row a column.
+"""`vehest new` on twelve logs in different dress, held against what was written down before:
+results/own_car/proposals.csv, a row a column.
 
-``answers.yaml`` was committed before anything that proposes existed, and has not been changed since; the method was developed with these
-logs at hand, and revised after their outcome was seen. How it does on logs that it was not developed with, they do not tell.
+``answers.yaml`` was committed before anything that proposes existed, and has not been changed
+since; the method was developed with these logs at hand, and revised after their outcome was seen.
+How it does on logs that it was not developed with, they do not tell.
 """
 
 import argparse
@@ -38,47 +40,52 @@ def outcome_of(files):
 
 def rows_of(log, answers, proposed):
     """A row a column, and one for each question about the log as a whole."""
-    columns = {one["column"]: one for one in proposed["channels"]}
-    asked = {question["key"]: question for question in proposed["open"]}
+    columns = {channel["column"]: channel for channel in proposed["channels"]}
+    questions = {question["key"]: question for question in proposed["open"]}
     mirror = _mirror(answers, columns) if "left_right" in answers["asked"] else 1
     rows = [
-        _row(log, name, told, columns.get(name), asked, mirror, name in answers["asked"])
-        for name, told in answers["columns"].items()
+        _row(log, name, answer, columns.get(name), questions, mirror, name in answers["asked"])
+        for name, answer in answers["columns"].items()
     ]
     for name in (*columns, *proposed["unused"]):
         if name not in answers["columns"]:
-            one = columns.get(name)
-            shown, evidence = (
-                (f"{one['channel']}, {one['unit']}", one["evidence"]) if one else ("no channel", [])
+            proposed_channel = columns.get(name)
+            proposal, evidence = (
+                (
+                    f"{proposed_channel['channel']}, {proposed_channel['unit']}",
+                    proposed_channel["evidence"],
+                )
+                if proposed_channel
+                else ("no channel", [])
             )
             rows.append(
                 _line(
                     log,
                     name,
                     "no channel",
-                    shown,
+                    proposal,
                     evidence,
-                    name in asked,
-                    one is None and name not in asked,
+                    name in questions,
+                    proposed_channel is None and name not in questions,
                 )
             )
     if "time" in answers:
         rows.append(_clock(log, answers["time"], proposed))
     for key in WHOLE:
-        wanted = key in answers["asked"]
-        told = key in asked
-        if wanted or told or key == "left_right":
-            evidence = asked[key]["evidence"] if told else [proposed["left_right"] or ""]
-            shown = str(asked[key]["proposed"]) if told else "decided"
+        should_ask = key in answers["asked"]
+        does_ask = key in questions
+        if should_ask or does_ask or key == "left_right":
+            evidence = questions[key]["evidence"] if does_ask else [proposed["left_right"] or ""]
+            proposal = str(questions[key]["proposed"]) if does_ask else "decided"
             rows.append(
                 _line(
                     log,
                     f"({key})",
-                    "asked" if wanted else "decided",
-                    shown,
+                    "asked" if should_ask else "decided",
+                    proposal,
                     evidence,
-                    told,
-                    wanted == told,
+                    does_ask,
+                    should_ask == does_ask,
                 )
             )
     return rows
@@ -86,31 +93,31 @@ def rows_of(log, answers, proposed):
 
 def _mirror(answers, columns):
     """1, or -1 where all signs are reversed, by the yaw rate's column."""
-    name, told = next(
-        (name, told) for name, told in answers["columns"].items() if told["channel"] == "yaw_rate"
+    name, answer = next(
+        item for item in answers["columns"].items() if item[1]["channel"] == "yaw_rate"
     )
-    return int(told["sign"] * columns[name]["sign"]) if name in columns else 1
+    return int(answer["sign"] * columns[name]["sign"]) if name in columns else 1
 
 
-def _row(log, name, told, one, asked, mirror, undecidable):
-    right = f"{told['channel']}, {told['unit']}, sign {told['sign']:+d}" + (
-        f", {told['delay']} ms late" if "delay" in told else ""
+def _row(log, name, answer, channel, questions, mirror, undecidable):
+    right = f"{answer['channel']}, {answer['unit']}, sign {answer['sign']:+d}" + (
+        f", {answer['delay']} ms late" if "delay" in answer else ""
     )
-    if one is None:
+    if channel is None:
         return _line(log, name, right, "no channel", [], False, False)
-    delay = 1000.0 * one["delay"]
-    shown = f"{one['channel']}, {one['unit']}, sign {one['sign']:+d}" + (
+    delay = 1000.0 * channel["delay"]
+    proposal = f"{channel['channel']}, {channel['unit']}, sign {channel['sign']:+d}" + (
         f", {delay:.0f} ms late" if delay else ""
     )
-    turned = mirror if one["channel"] in LATERAL else 1
+    turned = mirror if channel["channel"] in LATERAL else 1
     agrees = (
-        told["channel"] in ("asked", one["channel"])
-        and told["unit"] in ("asked", one["unit"])
-        and told["sign"] == one["sign"] * turned
-        and one["factor"] == 1.0
+        answer["channel"] in ("asked", channel["channel"])
+        and answer["unit"] in ("asked", channel["unit"])
+        and answer["sign"] == channel["sign"] * turned
+        and channel["factor"] == 1.0
         and (
-            abs(delay - told["delay"]) <= TOLERANCE
-            if "delay" in told
+            abs(delay - answer["delay"]) <= TOLERANCE
+            if "delay" in answer
             else delay < LONGEST_UNPLANTED
         )
     )
@@ -118,42 +125,46 @@ def _row(log, name, told, one, asked, mirror, undecidable):
         log,
         name,
         right,
-        shown,
-        one["evidence"],
-        name in asked,
-        agrees and (name in asked) == undecidable,
+        proposal,
+        channel["evidence"],
+        name in questions,
+        agrees and (name in questions) == undecidable,
     )
 
 
-def _clock(log, told, proposed):
+def _clock(log, answer, proposed):
     """The column of times and the rate that it makes."""
     clock = proposed["time"]
-    shown = (
+    proposal = (
         "none"
         if clock is None
         else f"{clock['column']}, {clock['unit']}, {proposed['rate_hz']:g} Hz"
     )
-    right = "none" if told is None else f"{told['column']}, {told['unit']}, {told['rate_hz']} Hz"
-    asked = any(question["key"] == "time" for question in proposed["open"])
+    right = (
+        "none"
+        if answer is None
+        else f"{answer['column']}, {answer['unit']}, {answer['rate_hz']} Hz"
+    )
+    is_question = any(question["key"] == "time" for question in proposed["open"])
     return _line(
         log,
         "(time)",
         right,
-        shown,
+        proposal,
         [] if clock is None else [clock["evidence"]],
-        asked,
-        shown == right and not asked,
+        is_question,
+        proposal == right and not is_question,
     )
 
 
-def _line(log, column, right, shown, evidence, asked, correct):
+def _line(log, column, right, proposal, evidence, is_question, correct):
     cells = (
         log,
         column,
         right,
-        shown,
+        proposal,
         "; ".join(filter(None, evidence)),
-        "asked" if asked else "decided",
+        "asked" if is_question else "decided",
         "yes" if correct else "no",
     )
     return dict(zip(COLUMNS, cells, strict=True))
@@ -182,11 +193,13 @@ def main():
     wrong = [row for row in rows if row["correct"] == "no"]
     for row in wrong:
         print(
-            f"wrong: {row['log']}: {row['column']}: {row['proposed']} ({row['decided/asked']}), not {row['right answer']}"
+            f"wrong: {row['log']}: {row['column']}: {row['proposed']} ({row['decided/asked']}), "
+            f"not {row['right answer']}"
         )
     decided = sum(row["decided/asked"] == "decided" for row in rows)
     print(
-        f"{len(LOGS)} logs, {len(rows)} rows: {decided} decided, {len(rows) - decided} asked, {len(wrong)} wrong; written: {out}"
+        f"{len(LOGS)} logs, {len(rows)} rows: {decided} decided, {len(rows) - decided} asked, "
+        f"{len(wrong)} wrong; written: {out}"
     )
 
 

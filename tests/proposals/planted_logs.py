@@ -11,7 +11,9 @@ TRACK = 1.5
 
 
 def drive(seconds=120.0, rate_hz=50.0, seed=0):
-    """A linear single track on a winding road: SI units, ISO 8855, (T,) each, the wheels' and the steering wheel's angles with them."""
+    """A linear single track on a winding road: SI units, ISO 8855, (T,) each, the wheels' and the
+    steering wheel's angles with them.
+    """
     generator = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     phases = generator.uniform(0.0, 2.0 * np.pi, 6)
@@ -20,12 +22,12 @@ def drive(seconds=120.0, rate_hz=50.0, seed=0):
         + 5.0 * np.sin(2 * np.pi * 0.02 * t + phases[0])
         + 2.0 * np.sin(2 * np.pi * 0.07 * t + phases[1])
     )
-    ay_wanted = 2.5 * np.sin(2 * np.pi * 0.11 * t + phases[2]) + 1.5 * np.sin(
+    target_ay = 2.5 * np.sin(2 * np.pi * 0.11 * t + phases[2]) + 1.5 * np.sin(
         2 * np.pi * 0.23 * t + phases[3]
     )
-    r = ay_wanted / vx
+    r = target_ay / vx
     vy = r * (1.4 - 0.0045 * vx * vx) + 0.08 * np.sin(2 * np.pi * 0.31 * t + phases[4])
-    steer = WHEELBASE * r / vx + 0.002 * ay_wanted
+    steer = WHEELBASE * r / vx + 0.002 * target_ay
     ax = np.gradient(vx, t) - vy * r
     ay = np.gradient(vy, t) + vx * r
 

@@ -1,4 +1,6 @@
-"""What columns are taken for: planted logs whose answers are known, in dresses that names alone do not see through."""
+"""What columns are taken for: planted logs whose answers are known, in dresses that names alone do
+not see through.
+"""
 
 import re
 from pathlib import Path
@@ -10,12 +12,12 @@ import yaml
 from dressed_logs import LOGS, write_log
 from mdf_log import write_mdf
 from own_car_proposals import ANSWERS, outcome_of, rows_of
-from planted_logs import RADIUS, drive, usual, write
+from planted_logs import RADIUS, G, drive, usual, write
 from vbo_log import clock
 
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
-from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import _busiest, inspect
@@ -38,8 +40,8 @@ def drafted(tmp_path, table, **options):
     return draft(inspect("my_car", [write(tmp_path / "lap.csv", table, **options)]))
 
 
-def read_back(made):
-    return open_source(made.dataset).read("lap")
+def read_back(log_draft):
+    return open_source(log_draft.dataset).read("lap")
 
 
 def asked(tmp_path, table):
@@ -55,7 +57,7 @@ CORNERS = ("fl", "fr", "rl", "rr")
 def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path):
     table = usual(drive())
     table["Gyro"] *= -1.0
-    found = proposed(tmp_path, table)
+    by_channel = proposed(tmp_path, table)
     units = {
         "vx": ("Speed", "km/h", 1),
         "yaw_rate": ("Gyro", "deg/s", -1),
@@ -63,9 +65,12 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
         "ax": ("LongAcc", "g", 1),
     }
     units |= {"handwheel": ("Steer", "deg", 1), "sideslip_ref": ("Beta", "deg", 1)}
-    assert {name: (one.column, one.unit, one.sign) for name, one in found.items()} == units
+    assert {
+        name: (proposal.column, proposal.unit, proposal.sign)
+        for name, proposal in by_channel.items()
+    } == units
     assert (
-        found["yaw_rate"]
+        by_channel["yaw_rate"]
         .describe()
         .startswith("yaw_rate: column 'Gyro', deg/s, sign -1: ay vs. vx·yaw_rate: correlation -")
     )
@@ -93,10 +98,10 @@ def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(
         "d": size[of_ay] * d["ay"],
         "e": d["ax"],
     }
-    found = proposed(tmp_path, pd.DataFrame(columns))
+    by_channel = proposed(tmp_path, pd.DataFrame(columns))
     expected = {"vx": ("b", unit), "yaw_rate": ("c", of_rate), "ay": ("d", of_ay)}
-    assert {name: (found[name].column, found[name].unit) for name in expected} == expected
-    assert found["ax"].column == "e"
+    assert {name: (by_channel[name].column, by_channel[name].unit) for name in expected} == expected
+    assert by_channel["ax"].column == "e"
 
 
 LATERAL = ("yaw_rate", "ay", "handwheel", "sideslip_ref")
@@ -107,22 +112,22 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     mirrored = usual(d)
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(tmp_path, mirrored) == ["left_right"]
-    found = proposals_of(
+    proposals = proposals_of(
         tmp_path,
         mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in CORNERS}),
     )
-    assert "right wheels are faster" in found.left_right
-    assert {found.by_channel[name].sign for name in LATERAL} == {-1}
+    assert "right wheels are faster" in proposals.left_right
+    assert {proposals.by_channel[name].sign for name in LATERAL} == {-1}
     heading = np.cumsum(d["r"]) / 50.0  # counter-clockwise from east
     east = np.cumsum(d["vx"] * np.cos(heading)) / 50.0
     north = np.cumsum(d["vx"] * np.sin(heading)) / 50.0
     mirrored["Latitude"] = 48.0 + north / 111_000.0
     mirrored["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
     mirrored.to_csv(tmp_path / "course.csv", index=False)
-    found = inspect("my_car", [tmp_path / "course.csv"]).proposals
+    proposals = inspect("my_car", [tmp_path / "course.csv"]).proposals
     assert (
-        "course over latitude and longitude" in found.left_right,
-        found.by_channel["yaw_rate"].sign,
+        "course over latitude and longitude" in proposals.left_right,
+        proposals.by_channel["yaw_rate"].sign,
     ) == (True, -1)
 
 
@@ -139,49 +144,54 @@ def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp
     table.loc[1000:1100, list(wheels)] = np.nan
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.wheel_radius is not None
-    made = draft(examined)
-    assert (made.examined.proposals.wheel_radius, made.dataset["transforms"]) == (None, [])
-    assert sum("wheel_speed" in note and "missing samples" in note for note in made.notes) == 4
+    log_draft = draft(examined)
+    assert (log_draft.examined.proposals.wheel_radius, log_draft.dataset["transforms"]) == (
+        None,
+        [],
+    )
+    assert sum("wheel_speed" in note and "missing samples" in note for note in log_draft.notes) == 4
 
 
 @pytest.mark.parametrize(
-    ("wheel", "other"),
+    ("wheel", "other_column"),
     [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")],
 )
 def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(
-    tmp_path, wheel, other
+    tmp_path, wheel, other_column
 ):
     d = drive()
     columns = {
         "t": d["t"],
         wheel: d["wheel_fl"],
         "n_VR": d["wheel_fr"],
-        other: np.cumsum(d["r"]) / 50.0,
+        other_column: np.cumsum(d["r"]) / 50.0,
     }
-    found = proposed(tmp_path, pd.DataFrame(columns))
-    assert {one.column for one in found.values()} <= set(columns)
-    assert "wheel_speed_fr" in found
+    by_channel = proposed(tmp_path, pd.DataFrame(columns))
+    assert {proposal.column for proposal in by_channel.values()} <= set(columns)
+    assert "wheel_speed_fr" in by_channel
 
 
-def test_road_wheel_and_steering_wheel_are_told_apart_and_the_ratio_is_estimated_where_the_wheelbase_is_told(
+def test_road_and_steering_wheel_are_distinguished_and_their_ratio_estimated(
     tmp_path,
 ):
     d = drive(300.0)
     table = usual(d)
     assert proposed(tmp_path, table.assign(Steer=d["steer"]))["steer"].unit == "rad"
     assert proposed(tmp_path, table)["handwheel"].unit == "deg"
-    found = proposed(
+    handwheel = proposed(
         tmp_path, table.drop(columns="Steer").assign(**{"SWA [rad]": 4.0 * d["handwheel"]})
     )["handwheel"]
-    assert (found.column, found.unit) == ("SWA [rad]", "rad"), "though no slow corner shows it"
-    assert not any("from slow corners" in text for text in found.evidence)
+    assert (handwheel.column, handwheel.unit) == ("SWA [rad]", "rad"), (
+        "though no slow corner shows it"
+    )
+    assert not any("from slow corners" in text for text in handwheel.evidence)
     file = write(tmp_path / "lap.csv", table)
     assert draft(inspect("my_car", [file])).ratio is None
     ratio = draft(inspect("my_car", [file], {"wheelbase": 2.7})).ratio
     assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
 
 
-def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_the_car_s_own_whatever_their_noise(
+def test_ambiguous_speeds_are_questions_and_the_speed_of_the_bus_is_the_cars(
     tmp_path,
 ):
     d = drive()
@@ -192,12 +202,12 @@ def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_th
         .rename(columns={"Speed": "Velocity"})
         .assign(VehSpd_CAN=3.6 * d["vx"], Velocity=3.6 * (d["vx"] + noise))
     )
-    for table, own, reference in (
+    for table, car_column, reference in (
         (usual(d).assign(GPS_Speed=3.6 * d["vx"] + 0.01), "Speed", "GPS_Speed"),
         (of_bus, "VehSpd_CAN", "Velocity"),
     ):
-        found = proposed(tmp_path, table)
-        assert (found["vx"].column, found["vx_ref"].column) == (own, reference)
+        by_channel = proposed(tmp_path, table)
+        assert (by_channel["vx"].column, by_channel["vx_ref"].column) == (car_column, reference)
         assert asked(tmp_path, table) == ["left_right"]
     assert asked(tmp_path, of_bus.rename(columns={"Velocity": "Rad_1"})) == ["Rad_1", "left_right"]
     table = usual(d).rename(
@@ -218,13 +228,13 @@ def test_no_wheelbase_is_stated_where_the_halves_of_the_drive_contradict_each_ot
 
 def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path):
     d = drive(300.0)
-    made = drafted(
+    log_draft = drafted(
         tmp_path, usual(d).assign(Gyro=np.interp(d["t"] - 0.12, d["t"], np.degrees(d["r"])))
     )
-    assert made.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
-    assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), (
-        "an estimator in the car gets it late, too"
-    )
+    assert log_draft.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
+    assert not any(
+        entry["name"] == "delay_correction" for entry in log_draft.dataset["transforms"]
+    ), "an estimator in the car gets it late, too"
 
 
 @pytest.mark.parametrize("columns", [20, pytest.param(300, marks=pytest.mark.slow)])
@@ -234,8 +244,8 @@ def test_columns_of_noise_do_not_hide_the_car(tmp_path, columns):
     noise = pd.DataFrame(
         {f"S{k}": random.standard_normal(len(d["t"])).cumsum() for k in range(columns)}
     )
-    found = proposed(tmp_path, pd.concat([usual(d), noise], axis=1))
-    assert [found[name].column for name in ("vx", "yaw_rate", "ay", "ax")] == [
+    by_channel = proposed(tmp_path, pd.concat([usual(d), noise], axis=1))
+    assert [by_channel[name].column for name in ("vx", "yaw_rate", "ay", "ax")] == [
         "Speed",
         "Gyro",
         "LatAcc",
@@ -249,9 +259,9 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
     table = usual(d)
     table.loc[1000:1010, "LatAcc"] = np.nan
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    made = drafted(tmp_path, table, na_rep=mark)
-    assert made.dataset["source"] == "text_log"
-    recording = read_back(made)
+    log_draft = drafted(tmp_path, table, na_rep=mark)
+    assert log_draft.dataset["source"] == "text_log"
+    recording = read_back(log_draft)
     np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
     assert np.isfinite([recording["sideslip_ref"], recording["ay"]]).all()
 
@@ -275,7 +285,7 @@ def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps
     assert outcome["next"][-1].startswith('vehest estimate "')
     table = -usual(drive())
     table["Time [s]"] *= -1.0
-    signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
+    signs = {name: proposal.sign for name, proposal in proposed(tmp_path, table).items()}
     assert (signs["vx"], signs["ax"], len({signs[name] for name in LATERAL})) == (-1, -1, 1)
 
 
@@ -284,13 +294,15 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
     yaw = np.cumsum(d["r"]) / 50.0
     x = np.cumsum(d["vx"] * np.cos(yaw) - d["vy"] * np.sin(yaw)) / 50.0
     y = np.cumsum(d["vx"] * np.sin(yaw) + d["vy"] * np.cos(yaw)) / 50.0
-    made = drafted(tmp_path, usual(d).drop(columns="Beta").assign(pose_x=x, pose_y=y, pose_yaw=yaw))
-    assert "vy_ref" in made.channels
-    assert np.corrcoef(read_back(made)["vy_ref"], d["vy"])[0, 1] > 0.9
+    log_draft = drafted(
+        tmp_path, usual(d).drop(columns="Beta").assign(pose_x=x, pose_y=y, pose_yaw=yaw)
+    )
+    assert "vy_ref" in log_draft.channels
+    assert np.corrcoef(read_back(log_draft)["vy_ref"], d["vy"])[0, 1] > 0.9
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message_part"),
     [
         ("lap.csv", b"", "is empty"),
         ("lap.csv", b"speed\n" + b"1.0\n2.0\n" * 50, "no rows of two numbers"),
@@ -314,15 +326,15 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
             for ending in ("mf4", "vbo", "db3", "mcap", "parquet", "zip", "bag")
         ),
     ],
-    ids=lambda own: str(own)[:20],
+    ids=lambda parameter: str(parameter)[:20],
 )
-def test_what_is_no_log_is_one_line(tmp_path, name, content, said):
+def test_what_is_no_log_is_one_line(tmp_path, name, content, message_part):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
     (tmp_path / name).write_bytes(content)
-    with pytest.raises((DataError, MissingError) if said else VehestError) as refusal:
+    with pytest.raises((DataError, MissingError) if message_part else VehestError) as refusal:
         inspect("my_car", [tmp_path / name])
     message = str(refusal.value)
-    assert (said in message, "\n" in message, name in message) == (True, False, True)
+    assert (message_part in message, "\n" in message, name in message) == (True, False, True)
 
 
 def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
@@ -354,11 +366,16 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
 
 
 ROLES = {
-    "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
-    "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
-    "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx", "AccelLateral": "ay",
-    "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other", "Querabweichung": "other", "Vx_world": "other",
-    "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax", "Drehzahl": "other",
+    "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel",
+    "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
+    "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl",
+    "angular_velocity.z": "yaw_rate",
+    "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx",
+    "AccelLateral": "ay",
+    "kappa": "other", "K_path": "other", "e_psi": "other", "lat_err": "other",
+    "Querabweichung": "other", "Vx_world": "other",
+    "map_vel_y": "other", "ACC_YawRate": "yaw_rate", "linear_acceleration.x": "ax",
+    "Drehzahl": "other",
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
     "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
     "VelDown": "other",
@@ -369,14 +386,14 @@ def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
     assert {name: list(hints(name)) for name in ROLES} == {
         name: [role] for name, role in ROLES.items()
     }
-    told = Proposals(
+    proposals = Proposals(
         (
             Proposal("v", "vx", "m/s"),
             Proposal("r", "yaw_rate", "rad/s"),
             Proposal("a", "ax", "m/s²", -1),
         )
     )
-    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
+    assert [proposal.sign for proposal in proposals.mirrored().channels] == [1, -1, -1]
 
 
 @pytest.mark.parametrize("log", LOGS)
@@ -391,7 +408,7 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log):
     ] == []
 
 
-def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_that_motion_contradicts_are_asked(
+def test_steering_is_no_lateral_acceleration_and_contradicted_names_are_asked_about(
     tmp_path,
 ):
     d = drive()
@@ -399,17 +416,17 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_th
     agreeing = table.drop(columns="LatAcc").assign(Steer=d["ay"] / 9.80665 + 0.02 * np.sin(d["t"]))
     assert "ay" not in proposed(tmp_path, agreeing)
     assert "yaw_rate" not in proposed(tmp_path, table.drop(columns="Gyro"))
-    found = proposed(tmp_path, table.drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"}))[
+    ay = proposed(tmp_path, table.drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"}))[
         "ay"
     ]
-    assert (found.column, "contradict its name" in found.question) == ("LongAcc", True)
-    found = proposed(
+    assert (ay.column, "contradict its name" in ay.question) == ("LongAcc", True)
+    ay = proposed(
         tmp_path, table.rename(columns={"LatAcc": "Ch7"}).assign(Ch7=0.8 * table["LatAcc"])
     )["ay"]
-    assert (found.column, "it may be a velocity" in found.question) == ("Ch7", True)
+    assert (ay.column, "it may be a velocity" in ay.question) == ("Ch7", True)
     assert proposed(tmp_path, table.rename(columns={"LatAcc": "Ch7"}))["ay"].question == ""
-    found = proposed(tmp_path, table.drop(columns="LatAcc"))
-    assert [(found[name].column, found[name].unit) for name in ("vx", "ax")] == [
+    by_channel = proposed(tmp_path, table.drop(columns="LatAcc"))
+    assert [(by_channel[name].column, by_channel[name].unit) for name in ("vx", "ax")] == [
         ("Speed", "km/h"),
         ("LongAcc", "g"),
     ]
@@ -420,7 +437,7 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_th
 
 
 @pytest.mark.parametrize(
-    ("first", "how"),
+    ("first", "time_format"),
     [
         ("10:59:30", "%H:%M:%S.%f"),
         ("23:59:30", "%H:%M:%S.%f"),
@@ -430,10 +447,12 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_th
     ],
     ids=["noon", "midnight", "iso", "date", "german"],
 )
-def test_times_of_a_clock_are_read(tmp_path, first, how):
+def test_times_of_a_clock_are_read(tmp_path, first, time_format):
     d = drive(60.0)
     stamps = pd.Timestamp(f"2024-05-03 {first}") + pd.to_timedelta(d["t"], unit="s")
-    words = [stamp.strftime(how)[:-3] + ("Z" if "T" in how else "") for stamp in stamps]
+    words = [
+        stamp.strftime(time_format)[:-3] + ("Z" if "T" in time_format else "") for stamp in stamps
+    ]
     examined = inspect(
         "my_car",
         [
@@ -462,7 +481,7 @@ def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_m
             pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)]),
         )
     )
-    assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == (
+    assert (log.options["runs"], sorted((run.start, run.stop) for run in log.runs)) == (
         "run",
         [(0, 2000), (2000, 4000)],
     )
@@ -520,7 +539,7 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     if suffix == ".csv":
         table = table.rename(columns={"Speed": "Tempo"})
         table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    made = draft(
+    log_draft = draft(
         inspect(
             "my_car",
             [
@@ -533,22 +552,25 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     )
     assert (
         suffix != ".csv"
-        or np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
+        or np.isfinite(open_source(log_draft.dataset).read("lap_run_0")["sideslip_ref"]).all()
     )
-    assert {"vx", "yaw_rate", "ay"} <= made.channels
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (
+    assert {"vx", "yaw_rate", "ay"} <= log_draft.channels
+    assert (
+        log_draft.dataset["max_gap"],
+        [round(duration) for duration in log_draft.durations.values()],
+    ) == (
         1.0,
         [50, 67],
     )
-    assert any("split into 2 recordings" in note for note in made.notes)
+    assert any("split into 2 recordings" in note for note in log_draft.notes)
 
 
 def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path):
     table = usual(drive())
     table.loc[1000:1025, "Steer"] = np.nan
-    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
-    assert made.dataset["channels"]["handwheel"]["max_gap"] == pytest.approx(0.54)
-    steer = read_back(made)["handwheel"][1000:1026]
+    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert log_draft.dataset["channels"]["handwheel"]["max_gap"] == pytest.approx(0.54)
+    steer = read_back(log_draft)["handwheel"][1000:1026]
     np.testing.assert_allclose(np.diff(steer, 2), 0.0, atol=1e-9)
 
 
@@ -559,10 +581,10 @@ def test_missing_samples_of_a_vbox_are_bridged_for_up_to_a_second_and_end_a_reco
     table.loc[1000:1025, "Steer"] = np.nan
     table.loc[3000:3009, "Gyro"] = 327.67  # a code of loggers
     table.loc[4000:4100, "Gyro"] = np.nan
-    made = draft(inspect("my_car", [written(tmp_path / "lap.vbo", table)]))
-    assert made.dataset["max_gap"] == 1.0
-    assert [round(seconds) for seconds in made.durations.values()] == [80, 38]
-    recording = open_source(made.dataset).read("lap_run_0")
+    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.vbo", table)]))
+    assert log_draft.dataset["max_gap"] == 1.0
+    assert [round(seconds) for seconds in log_draft.durations.values()] == [80, 38]
+    recording = open_source(log_draft.dataset).read("lap_run_0")
     np.testing.assert_allclose(np.diff(recording["handwheel"][1000:1026], 2), 0.0, atol=1e-9)
     assert np.abs(recording["yaw_rate"][3000:3010]).max() < 0.3
 
@@ -573,12 +595,14 @@ def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others
     """Two seconds in a table without times."""
     table = usual(drive())
     table.loc[1000:1100, "Steer"] = np.nan
-    made = draft(inspect("my_car", [written(tmp_path / "lap.csv", table.drop(columns="Time [s]"))]))
+    log_draft = draft(
+        inspect("my_car", [written(tmp_path / "lap.csv", table.drop(columns="Time [s]"))])
+    )
     assert any(
         note.startswith("'Steer' (handwheel) is left out: it has missing samples")
-        for note in made.notes
+        for note in log_draft.notes
     )
-    assert Resample(20.0)(read_back(made)).channels.keys() == {
+    assert Resample(20.0)(read_back(log_draft)).channels.keys() == {
         "vx",
         "yaw_rate",
         "ay",
@@ -594,8 +618,11 @@ def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_t
         (table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)),
         "Beta",
     ] = np.nan
-    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
-    assert ("vy_ref" in made.channels, [round(own) for own in made.durations.values()]) == (
+    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert (
+        "vy_ref" in log_draft.channels,
+        [round(duration) for duration in log_draft.durations.values()],
+    ) == (
         True,
         [50, 45],
     )
@@ -618,7 +645,7 @@ POSE = {
 
 
 @pytest.mark.parametrize(
-    ("table", "said", "absent"),
+    ("table", "note_pattern", "missing_channel"),
     [
         (
             lambda: usual(drive()).assign(**{"Time [s]": np.sin(np.arange(6000.0))}),
@@ -644,10 +671,10 @@ POSE = {
     ],
     ids=["no clock", "no name", "impossible angle", "unrelated pose", "standing"],
 )
-def test_what_is_left_out_is_noted(tmp_path, table, said, absent):
+def test_what_is_left_out_is_noted(tmp_path, table, note_pattern, missing_channel):
     proposals = proposals_of(tmp_path, table())
-    assert any(re.search(said, note) for note in proposals.notes)
-    assert (absent in proposals.by_channel, bool(proposals.pose)) == (False, False)
+    assert any(re.search(note_pattern, note) for note in proposals.notes)
+    assert (missing_channel in proposals.by_channel, bool(proposals.pose)) == (False, False)
 
 
 def in_two_files(tmp_path, change, **options):
@@ -665,20 +692,20 @@ def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossibl
     remarks = draft(
         in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))
     ).remarks
-    assert any("in 'lap_2', ay vs. vx·yaw_rate: gain 3.6" in one for one in remarks)
+    assert any("in 'lap_2', ay vs. vx·yaw_rate: gain 3.6" in remark for remark in remarks)
     marked = in_two_files(
         tmp_path,
         lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))),
         na_rep="-",
     )
     assert len(draft(marked).contents) == 2
-    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
-    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
+    proposals = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
+    assert ("handwheel" in proposals.by_channel, "ax" in proposals.by_channel) == (False, True)
     assert any(
         re.search(
             r"'Steer' \(handwheel\) is left out: it is missing or empty in '.*lap_2.csv'", note
         )
-        for note in found.notes
+        for note in proposals.notes
     )
     roll = 0.05 * np.sin(np.arange(6000) / 50.0)
     first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
@@ -699,11 +726,11 @@ def in_ms(table):
 
 
 def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_path):
-    for change, options, said in (
+    for change, options, message_part in (
         (lambda table: table, {"sep": ";"}, "has delimiter ';'"),
         (in_ms, {}, r"has times 'Time \[ms\] in ms'"),
     ):
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(DataError, match=message_part):
             in_two_files(tmp_path, change, **options)
     names, _, numbers = usual(drive()).round(5).to_csv(index=False).partition("\n")
     for name, unit in (("lap_1", "km/h"), ("lap_2", "m/s")):
@@ -725,7 +752,9 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
-    """Though it agrees better with the speed than the inertial unit does, and one row is corrupt."""
+    """Though it agrees better with the speed than the inertial unit does, and one row is
+    corrupt.
+    """
     d = drive(rate_hz=20.0)
     table = pd.DataFrame(
         {
@@ -742,12 +771,12 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.by_channel["ax"].column == "imu_ax"
     assert (
-        "'acc_vehicle_x' is left out: it is the difference of 'mocap_speed' from row to row, not a measurement"
-        in examined.proposals.notes
+        "'acc_vehicle_x' is left out: it is the difference of 'mocap_speed' from row to row, not "
+        "a measurement" in examined.proposals.notes
     )
 
 
-def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_an_unknown_unit_told_of(
+def test_a_torque_is_no_acceleration_and_a_derived_yaw_rate_is_the_references(
     tmp_path,
 ):
     d = drive()
@@ -760,14 +789,17 @@ def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_a
             "Tq": 130.0 * d["ax"],
         }
     )
-    found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
-    assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
-    assert any("'speed' is " in note and "% too low" in note for note in found.notes)
-    found = proposed(
+    proposals = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    assert (proposals.by_channel["vx"].unit, "ax" in proposals.by_channel) == ("km/h", False)
+    assert any("'speed' is " in note and "% too low" in note for note in proposals.notes)
+    proposals = proposed(
         tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01)
     )
-    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
-    assert not found["yaw_rate"].question
+    assert (proposals["yaw_rate"].column, proposals["yaw_rate_ref"].column) == (
+        "Gyro",
+        "yaw_rate_from_yaw",
+    )
+    assert not proposals["yaw_rate"].question
 
 
 def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(
@@ -781,32 +813,41 @@ def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_th
     table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
     table = table.assign(WheelSpeedFL=d["wheel_fl"], WheelSpeedFR=d["wheel_fr"])
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
-    found = examined.proposals.by_channel
-    assert [found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [
+    by_channel = examined.proposals.by_channel
+    assert [by_channel[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [
         -1,
         1,
         1,
         1,
     ]
-    assert found["sideslip_ref"].question.startswith("sign")
+    assert by_channel["sideslip_ref"].question.startswith("sign")
 
 
 def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(
     tmp_path,
 ):
-    """Satellites that come late and are lost once; every other cell of a slow signal is bridged, in Parquet, too."""
+    """Satellites that come late and are lost once.
+
+    Every other cell of a slow signal is bridged, in Parquet, too.
+    """
     table = usual(drive()).astype(float)
     lost = (table["Time [s]"] < 10.0) | ((table["Time [s]"] > 50.0) & (table["Time [s]"] < 53.0))
     table.loc[lost, "Beta"] = np.nan
     table.loc[::2, "LongAcc"] = np.nan
     table.to_parquet(tmp_path / "lap.parquet")
-    for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
-        assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
-        assert ([round(own) for own in made.durations.values()], made.dataset["max_gap"]) == (
+    for log_draft in (
+        drafted(tmp_path, table),
+        draft(inspect("other", [tmp_path / "lap.parquet"])),
+    ):
+        assert log_draft.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
+        assert (
+            [round(duration) for duration in log_draft.durations.values()],
+            log_draft.dataset["max_gap"],
+        ) == (
             [40, 67],
             1.0,
         )
-        assert any("1-500" in note for note in made.notes)
+        assert any("1-500" in note for note in log_draft.notes)
 
 
 def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(
@@ -821,15 +862,15 @@ def test_course_and_heading_without_another_reference_and_samples_that_rows_repe
     )
     notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
     assert (
-        "the difference 'Heading' - 'Course' may be the missing reference of the sideslip angle; if so, save it as a column"
-        in notes
+        "the difference 'Heading' - 'Course' may be the missing reference of the sideslip angle; "
+        "if so, save it as a column" in notes
     )
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks
     remarks = drafted(
         tmp_path, table.assign(Gyro=np.repeat(table["Gyro"].to_numpy()[::10], 10))
     ).remarks
-    assert any(one.startswith("yaw_rate: ") for one in remarks)
+    assert any(remark.startswith("yaw_rate: ") for remark in remarks)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
@@ -839,10 +880,10 @@ def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_form
     d = drive()
     table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 8123.0  # no number that loggers write for nothing
-    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
-    assert made.dataset["transforms"][0]["name"] == "bridge_impossible"
-    assert any("bridge_impossible" in note for note in made.notes)
-    recording = read_back(made)
+    log_draft = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
+    assert log_draft.dataset["transforms"][0]["name"] == "bridge_impossible"
+    assert any("bridge_impossible" in note for note in log_draft.notes)
+    recording = read_back(log_draft)
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
 
@@ -851,7 +892,7 @@ def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_form
 def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path, excess):
     d = drive()
     table = usual(d).assign(Speed=3.6 * excess * d["vx"])
-    found = proposed(
+    by_channel = proposed(
         tmp_path,
         table.assign(
             **{
@@ -861,12 +902,13 @@ def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path,
         ),
     )
     assert (
-        "circumferential speed in km/h, compared with the speed" in found["wheel_speed_rl"].evidence
+        "circumferential speed in km/h, compared with the speed"
+        in by_channel["wheel_speed_rl"].evidence
     )
     too_much = excess > 1.0
     assert (
-        "5 % too high compared with the wheel speeds" in found["vx"].question,
-        "vx km/h +1 0.952" in found["vx"].alternatives,
+        "5 % too high compared with the wheel speeds" in by_channel["vx"].question,
+        "vx km/h +1 0.952" in by_channel["vx"].alternatives,
     ) == (too_much, too_much)
     assert (
         any(
@@ -888,13 +930,19 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
             columns={"Speed": "Speed [km/h]", "Gyro": "Gyro [deg/s]", "LatAcc": "LatAcc [g]"}
         )
     examined = inspect("my_car", [written(tmp_path / f"lap{suffix}", table)])
-    found = examined.proposals.by_channel
-    assert (found["yaw_rate"].unit, found["vx"].unit, found["ay"].unit) == ("rad/s", "km/h", "g")
-    assert "but deg/s according to the header" in found["yaw_rate"].question
-    assert (found["vx"].question, found["ay"].question) == ("", "")
-    own = read_back(draft(examined))
+    by_channel = examined.proposals.by_channel
+    assert (by_channel["yaw_rate"].unit, by_channel["vx"].unit, by_channel["ay"].unit) == (
+        "rad/s",
+        "km/h",
+        "g",
+    )
+    assert "its unit is rad/s, not deg/s, according to ay vs." in by_channel["yaw_rate"].question
+    assert (by_channel["vx"].question, by_channel["ay"].question) == ("", "")
+    recording = read_back(draft(examined))
     np.testing.assert_allclose(
-        own["yaw_rate"], np.interp(own.time - own.time[0], d["t"], d["r"]), atol=1e-4
+        recording["yaw_rate"],
+        np.interp(recording.time - recording.time[0], d["t"], d["r"]),
+        atol=1e-4,
     )
 
 
@@ -910,9 +958,122 @@ def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offe
     )
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"vx": "vx [m/s]", "ay": "ay [m/s²]"}
-    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[1].split()
+    name, unit, sign, factor = open_questions["yaw_rate [rad/s]"].candidates[0].split()
     assert (name, unit, sign) == ("yaw_rate", "rad/s", "+1")
     assert float(factor) == pytest.approx(0.01, rel=0.05)
+
+
+def with_units(d, **factors):
+    """A log with units in its header, of which some channels are multiplied by factors."""
+    columns = {
+        "t [s]": ("t", d["t"]),
+        "speed [km/h]": ("vx", 3.6 * d["vx"]),
+        "yaw rate [deg/s]": ("yaw_rate", np.degrees(d["r"])),
+        "lat acc [m/s²]": ("ay", d["ay"]),
+        "long acc [m/s²]": ("ax", d["ax"]),
+        "steering wheel [deg]": ("handwheel", np.degrees(d["handwheel"])),
+        "lat vel [m/s]": ("vy_ref", d["vy"]),
+    }
+    return pd.DataFrame(
+        {name: factors.get(channel, 1.0) * samples for name, (channel, samples) in columns.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor"),
+    [
+        ("ay", 10.0),
+        ("ay", 2.0),
+        ("vx", 10.0),
+        ("vx", 3.0),
+        ("vx", 0.1),
+        ("yaw_rate", 10.0),
+        ("vy_ref", 10.0),
+    ],
+)
+def test_a_wrong_factor_is_found_by_a_second_relation_and_its_column_alone_is_left_out(
+    tmp_path, channel, factor
+):
+    table = with_units(drive(), **{channel: factor})
+    channels, open_questions = left_out(tmp_path, table)
+    assert {"vx", "yaw_rate", "ay", "ax", "handwheel", "vy_ref"} - set(channels) == {channel}
+    column = next(question for question in open_questions.values() if question.proposed == "-")
+    assert column.candidates[0].startswith(f"{channel} ")
+    if channel != "vy_ref":
+        assert float(column.candidates[0].split()[-1]) == pytest.approx(1.0 / factor, rel=0.1)
+        assert " and " in column.text
+
+
+@pytest.mark.parametrize(
+    ("factors", "units"),
+    [
+        ({"ay": 1.0 / G}, {"ay": "g", "ax": "m/s²"}),
+        ({"ay": 1.0 / G, "ax": 1.0 / G}, {"ay": "g", "ax": "g"}),
+        ({"vx": 1.0 / 3.6}, {"vx": "m/s", "ay": "m/s²"}),
+        ({"vx": 1.0 / 1.609344}, {"vx": "mph", "ay": "m/s²"}),
+        ({"yaw_rate": np.pi / 180.0}, {"yaw_rate": "rad/s", "vx": "km/h"}),
+    ],
+)
+def test_a_unit_that_two_relations_contradict_is_corrected_with_both_named(
+    tmp_path, factors, units
+):
+    d = drive()
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", with_units(d, **factors))])
+    made = draft(ask(examined, interactive=False)[0])
+    found = made.examined.proposals.by_channel
+    assert {name: found[name].unit for name in units} == units
+    for name in factors:
+        assert re.search("according to ay vs. .* and ", found[name].question)
+    samples = {"vx": d["vx"], "yaw_rate": d["r"], "ay": d["ay"], "ax": d["ax"]}
+    for name in units:
+        np.testing.assert_allclose(read_back(made)[name], samples[name], atol=2e-3)
+
+
+def test_a_wrong_gain_that_nothing_else_explains_leaves_out_all_that_may_be_wrong(tmp_path):
+    table = with_units(drive(), ay=2.0)[
+        ["t [s]", "speed [km/h]", "yaw rate [deg/s]", "lat acc [m/s²]"]
+    ]
+    with pytest.raises(ConfigurationError, match="no channel is supported by two pieces"):
+        left_out(tmp_path, table)
+
+
+def test_a_speed_12_percent_too_high_is_noted(tmp_path):
+    notes = proposals_of(tmp_path, with_units(drive(), vx=1.12)).notes
+    assert any("12 % too high compared with ay/yaw_rate" in note for note in notes)
+
+
+def test_tilt_is_asked_where_accelerations_may_be_reversed_as_those_of_a_telephone(tmp_path):
+    d = drive()
+    table = with_units(d, ay=-1.0, ax=-1.0).assign(**{"roll [rad]": 0.01 * d["ay"]})
+    found = proposed(tmp_path, table)
+    assert (found["ax"].sign, found["ay"].sign, found["yaw_rate"].sign) == (-1, -1, 1)
+    assert "only its accelerations are reversed" in found["roll"].question
+
+
+def test_an_unnamed_angle_that_no_wheel_turns_by_is_no_steering_command(tmp_path):
+    d = drive()
+    table = with_units(d).drop(columns="steering wheel [deg]")
+    channels, open_questions = left_out(tmp_path, table.assign(**{"aux [rad]": 0.2 * d["steer"]}))
+    assert "aux [rad]" not in channels.values()
+    assert open_questions["aux [rad]"].proposed == "-"
+
+
+def test_wheels_named_wsp_are_wheels(tmp_path):
+    d = drive()
+    table = with_units(d)
+    for corner in CORNERS:
+        table[f"WSP_{corner.upper()} [km/h]"] = 3.6 * RADIUS * d[f"wheel_{corner}"]
+    assert {f"wheel_speed_{corner}" for corner in CORNERS} <= set(proposed(tmp_path, table))
+
+
+def test_recordings_by_a_column_of_laps_are_named_as_such(tmp_path):
+    d = drive()
+    table = with_units(d)
+    laps = np.searchsorted([50.0, 90.0], d["t"], side="right")
+    table["t [s]"] = d["t"] - np.array([0.0, 50.0, 90.0])[laps]
+    made = drafted(tmp_path, table.assign(Lap=laps + 1))
+    assert len(made.durations) == 3
+    assert any("split into 3 recordings at each value of 'Lap'" in note for note in made.notes)
 
 
 def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_read_twice(
@@ -935,10 +1096,10 @@ def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_rea
 def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
     table = usual(drive())
     table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
-    made = drafted(tmp_path, table)
-    assert made.dataset["drop_rows"] == {"lap": [1001]}
-    assert any("duplicates" in note for note in made.notes)
-    assert len(read_back(made)) == len(table) - 1
+    log_draft = drafted(tmp_path, table)
+    assert log_draft.dataset["drop_rows"] == {"lap": [1001]}
+    assert any("duplicates" in note for note in log_draft.notes)
+    assert len(read_back(log_draft)) == len(table) - 1
 
 
 def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path):
@@ -948,12 +1109,12 @@ def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(t
         "my_car",
         [write(tmp_path / "lap.csv", usual(d).drop(columns="Steer").assign(steer_us=counts))],
     )
-    taken, left = ask(examined, interactive=False)
+    answered, left = ask(examined, interactive=False)
     assert {question.key: question.proposed for question in left}["steer_us"] == "-"
-    assert "steer" not in draft(taken).channels
-    made = draft(ask(examined, ["steer_us=steer rad 1 0.000125"], interactive=False)[0])
-    assert np.corrcoef(read_back(made)["steer"], d["steer"])[0, 1] > 0.99
-    assert np.abs(read_back(made)["steer"] - d["steer"]).max() < 0.01
+    assert "steer" not in draft(answered).channels
+    log_draft = draft(ask(examined, ["steer_us=steer rad 1 0.000125"], interactive=False)[0])
+    assert np.corrcoef(read_back(log_draft)["steer"], d["steer"])[0, 1] > 0.99
+    assert np.abs(read_back(log_draft)["steer"] - d["steer"]).max() < 0.01
 
 
 @pytest.mark.parametrize(
@@ -977,13 +1138,13 @@ def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
     slow = table[["Time [s]", "Speed", "Beta"]][::2]
     slow = slow.assign(**{"Time [s]": slow["Time [s]"] + 0.003})
     mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow]).sort_values("Time [s]")
-    made = drafted(tmp_path, mixed)
-    assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= made.channels
-    own = read_back(made)
+    log_draft = drafted(tmp_path, mixed)
+    assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= log_draft.channels
+    recording = read_back(log_draft)
     np.testing.assert_allclose(
-        own["vx"], np.interp(own.time - own.time[0], d["t"], d["vx"]), atol=0.2
+        recording["vx"], np.interp(recording.time - recording.time[0], d["t"], d["vx"]), atol=0.2
     )
-    assert own.duration == pytest.approx(120.0, abs=0.2)
+    assert recording.duration == pytest.approx(120.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -1000,7 +1161,7 @@ def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
     ],
 )
 def test_the_unit_says_of_what_a_name_is(name, unit, role):
-    assert max(hints(name, unit).items(), key=lambda own: own[1])[0] == role
+    assert max(hints(name, unit).items(), key=lambda role_score: role_score[1])[0] == role
 
 
 def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
@@ -1013,15 +1174,16 @@ def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
     d = {"t": np.arange(2 * len(d["t"])) / 50.0} | {
         name: np.concatenate([d[name], back[name]]) for name in back
     }
-    found = proposed(tmp_path, usual(d).drop(columns="Beta").assign(v_lat=d["vy"]))
-    assert {name: found[name].column for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {
+    by_channel = proposed(tmp_path, usual(d).drop(columns="Beta").assign(v_lat=d["vy"]))
+    assert {name: by_channel[name].column for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {
         "vx": "Speed",
         "yaw_rate": "Gyro",
         "ay": "LatAcc",
         "vy_ref": "v_lat",
     }
     assert {
-        (found[name].sign, found[name].question) for name in ("vx", "yaw_rate", "ay", "vy_ref")
+        (by_channel[name].sign, by_channel[name].question)
+        for name in ("vx", "yaw_rate", "ay", "vy_ref")
     } == {(1, "")}
 
 
@@ -1036,9 +1198,9 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
             "mocap_vy": d["vy"],
         }
     )
-    found = proposed(tmp_path, table)
-    assert (found["vx"].column, found["vx_ref"].column) == ("encoder", "mocap_vx")
-    assert found["vx"].factor == pytest.approx(0.01, rel=0.01)
+    by_channel = proposed(tmp_path, table)
+    assert (by_channel["vx"].column, by_channel["vx_ref"].column) == ("encoder", "mocap_vx")
+    assert by_channel["vx"].factor == pytest.approx(0.01, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -1071,24 +1233,30 @@ def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
             "LatAcc [mg]": 1e3 * d["ay"] / 9.80665,
         }
     )
-    made = drafted(
+    log_draft = drafted(
         tmp_path,
         table.assign(
             **{"LongAcc [mm/s^2]": 1e3 * d["ax"], "VLat [m per s]": d["vx"] * np.tan(d["sideslip"])}
         ),
     )
-    assert {one.channel for one in made.examined.proposals.channels if not one.question} == {
+    assert {
+        proposal.channel
+        for proposal in log_draft.examined.proposals.channels
+        if not proposal.question
+    } == {
         "vx",
         "yaw_rate",
         "ay",
         "ax",
         "vy_ref",
     }
-    assert next(note for note in made.notes if "is unknown; according to" in note).startswith(
+    assert next(note for note in log_draft.notes if "is unknown; according to" in note).startswith(
         "the unit 'm per s' of 'VLat [m per s]'"
     )
     for name, expected in (("vx", d["vx"]), ("yaw_rate", d["r"]), ("ay", d["ay"]), ("ax", d["ax"])):
-        np.testing.assert_allclose(read_back(made)[name], expected, atol=1e-4 * np.ptp(expected))
+        np.testing.assert_allclose(
+            read_back(log_draft)[name], expected, atol=1e-4 * np.ptp(expected)
+        )
 
 
 def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
@@ -1104,7 +1272,7 @@ def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
     write(
         files[1], usual(drive(100.0)).assign(Steer=0.0)
     )  # a sensor that is not plugged in is no other car
-    assert not any("another car" in one for one in draft(inspect("my_car", files)).remarks)
+    assert not any("another car" in remark for remark in draft(inspect("my_car", files)).remarks)
 
 
 def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
@@ -1116,8 +1284,8 @@ def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     for name, sign in (("Gyro", -1.0), ("Steer", 1.0), ("LatAcc", 1.0)):
         table.loc[2000:2499, name] *= sign * slow[back]
     assert any(
-        one.startswith("vx: unsigned: positive while the car reverses")
-        for one in drafted(tmp_path, table).remarks
+        remark.startswith("vx: unsigned: positive while the car reverses")
+        for remark in drafted(tmp_path, table).remarks
     )
 
 
@@ -1127,9 +1295,11 @@ def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_an
         usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
     )
     write(tmp_path / "lap_1.csv", table)
-    other = table[:5000].copy()
-    other.loc[100:200, "RoadWheel [deg]"] = 170.0
-    examined = inspect("my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", other)])
+    second_lap = table[:5000].copy()
+    second_lap.loc[100:200, "RoadWheel [deg]"] = 170.0
+    examined = inspect(
+        "my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", second_lap)]
+    )
     assert {question.key: question.proposed for question in questions_of(examined)}[
         "RoadWheel [deg]"
     ] == "-"
@@ -1154,7 +1324,9 @@ TILTED = {"roll": "Roll [rad]", "pitch": "Pitch [rad]"}
 def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
     tmp_path, of_ay, of_yaw_rate, of_pitch, is_asked
 ):
-    """Gravity is 9.81·sin(roll) along y and -9.81·sin(pitch) along x, so signs show in ay and ax."""
+    """Gravity is 9.81·sin(roll) along y and -9.81·sin(pitch) along x, so signs show in ay
+    and ax.
+    """
     d = drive(240.0)
     heading = np.cumsum(d["r"]) / 50.0
     table = usual(d).drop(columns=["Steer", "Beta"])
@@ -1165,10 +1337,10 @@ def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
     table["Gyro"] *= of_yaw_rate
     table[TILTED["roll"]] = -0.01 * d["ay"]
     table[TILTED["pitch"]] = -0.01 * of_pitch * d["ax"]
-    found = proposed(tmp_path, table)
-    assert (found["yaw_rate"].sign, found["ay"].sign) == (of_yaw_rate, of_ay)
-    assert (found["roll"].sign, found["pitch"].sign) == (1, of_pitch)
-    assert {bool(found[name].question) for name in TILTED} == {is_asked}
+    by_channel = proposed(tmp_path, table)
+    assert (by_channel["yaw_rate"].sign, by_channel["ay"].sign) == (of_yaw_rate, of_ay)
+    assert (by_channel["roll"].sign, by_channel["pitch"].sign) == (1, of_pitch)
+    assert {bool(by_channel[name].question) for name in TILTED} == {is_asked}
     mirrored = proposals_of(tmp_path, table).mirrored().by_channel
     assert (mirrored["roll"].sign, mirrored["pitch"].sign) == (1, -of_pitch)
 
@@ -1188,9 +1360,11 @@ def test_a_counter_of_time_that_wraps_goes_on(tmp_path, name):
     unit = "us" if "us" in name else "s" if "seconds" in name else "ms"
     table = usual(drive()).rename(columns={"Time [s]": f"tick_{unit}"})
     table.iloc[:, 0] = WRAPPED[name](20 * np.arange(6000))
-    made = drafted(tmp_path, table)
-    assert [round(seconds, 2) for seconds in made.durations.values()] == [120.0]
-    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    log_draft = drafted(tmp_path, table)
+    assert [round(seconds, 2) for seconds in log_draft.durations.values()] == [120.0]
+    np.testing.assert_allclose(
+        read_back(log_draft)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6
+    )
 
 
 def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path):
@@ -1201,16 +1375,18 @@ def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path)
         rows[3001:5001:100].copy(),
         rows[3000:5000:100].copy(),
     )
-    made = drafted(tmp_path, table.iloc[rows])
-    assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
-    np.testing.assert_allclose(read_back(made)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    log_draft = drafted(tmp_path, table.iloc[rows])
+    assert (log_draft.dataset["time"]["sort"], list(log_draft.durations)) == (True, ["lap"])
+    np.testing.assert_allclose(
+        read_back(log_draft)["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6
+    )
     for order in (rows[::-1], np.random.default_rng(0).permutation(6000), np.roll(rows, 2000)):
-        made = drafted(tmp_path, table.iloc[order])
-        assert (made.dataset["time"]["sort"], list(made.durations)) == (True, ["lap"])
+        log_draft = drafted(tmp_path, table.iloc[order])
+        assert (log_draft.dataset["time"]["sort"], list(log_draft.durations)) == (True, ["lap"])
     table.loc[2000:, "Time [s]"] -= 40.0
-    made = drafted(tmp_path, table)
-    assert [round(seconds) for seconds in made.durations.values()] == [40, 80]
-    (note,) = [note for note in made.notes if "go back" in note]
+    log_draft = drafted(tmp_path, table)
+    assert [round(seconds) for seconds in log_draft.durations.values()] == [40, 80]
+    (note,) = [note for note in log_draft.notes if "go back" in note]
     assert "split into 2 recordings" in note
     assert "a command on a single recording uses the longest, 80 of 120 s" in note
 
@@ -1218,9 +1394,9 @@ def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path)
 def test_a_clock_that_is_set_back_for_a_while_ends_a_recording_and_mixes_no_rows(tmp_path):
     table = usual(drive())
     table.loc[2500:2599, "Time [s]"] -= 0.7
-    made = drafted(tmp_path, table)
-    assert [round(seconds) for seconds in made.durations.values()] == [50, 71]
-    assert "sort" not in made.dataset["time"]
+    log_draft = drafted(tmp_path, table)
+    assert [round(seconds) for seconds in log_draft.durations.values()] == [50, 71]
+    assert "sort" not in log_draft.dataset["time"]
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.08])
@@ -1252,9 +1428,9 @@ def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp
     table["Longitude"] = 11.0 + np.cumsum(vx * np.cos(heading)) / 50.0 / metres
     table[["Latitude", "Longitude"]] += 1e-7 * noise.T
     table.to_csv(tmp_path / "course.csv", index=False)
-    found = inspect("my_car", [tmp_path / "course.csv"]).proposals
-    assert "course over latitude and longitude" in found.left_right
-    assert (found.by_channel["yaw_rate"].sign, found.by_channel["ay"].sign) == (-1, -1)
+    proposals = inspect("my_car", [tmp_path / "course.csv"]).proposals
+    assert "course over latitude and longitude" in proposals.left_right
+    assert (proposals.by_channel["yaw_rate"].sign, proposals.by_channel["ay"].sign) == (-1, -1)
 
 
 def left_out(tmp_path, table):
@@ -1262,8 +1438,8 @@ def left_out(tmp_path, table):
     examined, questions = ask(
         inspect("my_car", [write(tmp_path / "lap.csv", table)]), interactive=False
     )
-    by_channel = {name: one.column for name, one in examined.proposals.by_channel.items()}
-    return by_channel, {one.key: one for one in questions}
+    by_channel = {name: proposal.column for name, proposal in examined.proposals.by_channel.items()}
+    return by_channel, {question.key: question for question in questions}
 
 
 def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path):
@@ -1297,8 +1473,8 @@ def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answ
         left_out(tmp_path, pd.DataFrame(columns))
     named = {"a": d["t"], "speed": d["vx"], "c [rad/s]": d["r"], "d": d["ay"]}
     assert left_out(tmp_path, pd.DataFrame(named))[0] == {"vx": "speed", "yaw_rate": "c [rad/s]"}
-    found = left_out(tmp_path, pd.DataFrame({**columns, "e": d["ax"]}))[0]
-    assert found == {"vx": "b", "yaw_rate": "c", "ay": "d", "ax": "e"}
+    column_of = left_out(tmp_path, pd.DataFrame({**columns, "e": d["ax"]}))[0]
+    assert column_of == {"vx": "b", "yaw_rate": "c", "ay": "d", "ax": "e"}
 
 
 def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
@@ -1318,8 +1494,8 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
             "AngularVelocityZ": noise[1] + noise[2],
         }
     )
-    found = {name: one.column for name, one in proposed(tmp_path, table).items()}
-    assert found == {
+    column_of = {name: proposal.column for name, proposal in proposed(tmp_path, table).items()}
+    assert column_of == {
         "vx": "VelocityZ",
         "yaw_rate": "AngularVelocityY",
         "ay": "AccelerationX",
@@ -1338,9 +1514,9 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     table = pd.DataFrame({"t": d["t"], "Velocity east [m/s]": east, "vel_n [m/s]": north})
     table["Velocity forward [m/s]"] = d["vx"]
     table = table.assign(**{"Gyro [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
-    found = proposed(tmp_path, table)
-    assert (found["vx"].column, found["vx"].question) == ("Velocity forward [m/s]", "")
-    assert {"vx_ref", "vy_ref"}.isdisjoint(found)
+    by_channel = proposed(tmp_path, table)
+    assert (by_channel["vx"].column, by_channel["vx"].question) == ("Velocity forward [m/s]", "")
+    assert {"vx_ref", "vy_ref"}.isdisjoint(by_channel)
     heading = np.cumsum(d["r"]) / 50.0  # always nearly along x
     east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
     table = pd.DataFrame({"t": d["t"], "twist.linear.x": east, "twist.linear.y": north})
@@ -1378,8 +1554,10 @@ def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_
             "AngularVelocityZ [deg/s]": 50.0 * noise[1],
         }
     )
-    found = proposed(tmp_path, table)
-    columns = {name: found[name].column.split(" ")[0] for name in ("vx", "yaw_rate", "ay", "ax")}
+    by_channel = proposed(tmp_path, table)
+    columns = {
+        name: by_channel[name].column.split(" ")[0] for name in ("vx", "yaw_rate", "ay", "ax")
+    }
     assert columns == {
         "vx": "VelocityZ",
         "yaw_rate": "AngularVelocityY",

@@ -1,4 +1,6 @@
-"""Tables that loggers write with odd headers, cells, times and layouts: read right, or refused with the way out."""
+"""Tables that loggers write with odd headers, cells, times and layouts: read right, or refused with
+the way out.
+"""
 
 import datetime
 
@@ -20,8 +22,8 @@ from vehest.sources.surveys.tables import survey_table
 
 def read_back(file):
     """The data set's draft, and the recording that its source reads by it."""
-    made = draft(inspect("my_car", [file]))
-    return made, open_source(made.dataset).read(file.stem)
+    log_draft = draft(inspect("my_car", [file]))
+    return log_draft, open_source(log_draft.dataset).read(file.stem)
 
 
 def assert_yaw_rate_is(recording, table):
@@ -48,8 +50,8 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     rows = [",".join(f"{value:.5f}" for value in row) for row in zip(*columns, strict=True)]
     file = tmp_path / "lap.csv"
     file.write_text("\n".join([*head, *rows]), encoding="utf-8")
-    made, recording = read_back(file)
-    channels = {name: entry["column"] for name, entry in made.dataset["channels"].items()}
+    log_draft, recording = read_back(file)
+    channels = {name: entry["column"] for name, entry in log_draft.dataset["channels"].items()}
     assert {channels.pop("vx"), channels.pop("vx_ref")} == {"speed #2", "speed #4"}
     assert channels == {"yaw_rate": "z_rate", "ay": "y_acc"}
     np.testing.assert_allclose(recording["ay"], d["ay"], atol=1e-4)
@@ -75,11 +77,11 @@ def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
     lines[701][2] = cell
     file = tmp_path / "lap.csv"
     file.write_text("\n".join(map(",".join, lines)), encoding="utf-8")
-    made, recording = read_back(file)
-    assert made.dataset.get("missing", [cell]) == [cell]
+    log_draft, recording = read_back(file)
+    assert log_draft.dataset.get("missing", [cell]) == [cell]
     table.loc[700, "Gyro"] = 0.5 * (table.loc[699, "Gyro"] + table.loc[701, "Gyro"])
     assert_yaw_rate_is(recording, table)
-    named = [note for note in made.notes if "'bad!' in data row 701 of column 'Gyro'" in note]
+    named = [note for note in log_draft.notes if "'bad!' in data row 701 of column 'Gyro'" in note]
     assert len(named) == (cell == "bad!")
 
 
@@ -88,8 +90,8 @@ def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
     lines = lines_of(table)
     file = tmp_path / "lap.csv"
     file.write_text("\n".join([*lines[:500], lines[0], *lines[500:]]), encoding="utf-8")
-    made, recording = read_back(file)
-    assert made.dataset["drop_rows"] == {"lap": [500]}
+    log_draft, recording = read_back(file)
+    assert log_draft.dataset["drop_rows"] == {"lap": [500]}
     assert_yaw_rate_is(recording, table)
 
 
@@ -101,9 +103,11 @@ def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
     below = [line + ",9" * (6 - line.count(",")) if "," in line else line for line in below]
     text = [*lines[:500], "# marker: lap 2", *lines[500:], *below, ""]
     file.write_text("\n".join(text), encoding="utf-8")
-    made, recording = read_back(file)
-    assert "not read: line '# marker: lap 2'" in made.notes
-    assert made.dataset.get("drop_rows", {}) == ({"lap": [6001, 6002]} if "," in below[0] else {})
+    log_draft, recording = read_back(file)
+    assert "not read: line '# marker: lap 2'" in log_draft.notes
+    assert log_draft.dataset.get("drop_rows", {}) == (
+        {"lap": [6001, 6002]} if "," in below[0] else {}
+    )
     assert len(recording) == 6000
     assert_yaw_rate_is(recording, table)
 
@@ -192,8 +196,8 @@ def test_times_of_a_clock_in_other_forms_go_on_past_midnight(tmp_path, name):
     table = usual(drive())
     table["Time [s]"] = clock_texts(TIMES[name])
     table = table.rename(columns={"Time [s]": "Time"})
-    made, recording = read_back(write(tmp_path / "lap.csv", table))
-    assert (made.dataset["time"]["unit"], recording.rate_hz) == ("clock", 50.0)
+    log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
+    assert (log_draft.dataset["time"]["unit"], recording.rate_hz) == ("clock", 50.0)
     assert_yaw_rate_is(recording, table)
 
 
@@ -208,10 +212,10 @@ def test_durations_of_parquet_are_times_and_columns_that_are_not_read_are_named(
     stored["Time [s]"] = pd.to_timedelta(table["Time [s]"], unit="s")
     file = tmp_path / "lap.parquet"
     pq.write_table(pa.Table.from_pandas(stored), file)
-    made, recording = read_back(file)
-    assert made.dataset["time"] == {"column": "Time [s]", "unit": "ns"}
+    log_draft, recording = read_back(file)
+    assert log_draft.dataset["time"] == {"column": "Time [s]", "unit": "ns"}
     assert_yaw_rate_is(recording, table)
-    assert [note for note in made.notes if note.startswith("not read: column 'ok' holds bool")]
+    assert [note for note in log_draft.notes if note.startswith("not read: column 'ok' holds bool")]
 
 
 def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
@@ -233,6 +237,32 @@ UNSUITED = {
         "".join(f"(1436509052.{k:06d}) can0 1A{k % 9}#2A36{k % 256:02X}\n" for k in range(99)),
         "raw frames of a CAN bus as candump writes them",
     ),
+    "German names": (
+        long_format("Zeit,Runde,Messgröße,Messwert"),
+        "'Messgröße' names the quantity, 'Messwert' holds",
+    ),
+    "an OBD logger": (long_format("time,lap,PID,Data"), "'PID' names the quantity, 'Data' holds"),
+    "annotated CSV": (
+        "#group,false,false,true,true,false,false,true,true\n"
+        ",result,table,_start,_stop,_time,_value,_field,_measurement\n"
+        + "".join(f",,0,2024-03-01,2024-03-02,{0.1 * k:.1f},{k},speed,car\n" for k in range(99)),
+        "'_field' names the quantity, '_value' holds",
+    ),
+    "line protocol": (
+        "".join(f"car,lap=2 speed={k},ay={k % 7} {1_700_000_000_000 + k}\n" for k in range(99)),
+        "InfluxDB's line protocol; export a table with a column of each field",
+    ),
+    "candump with dates": (
+        "".join(
+            f" (2024-03-01 10:00:00.{k:06d})  can0  1A0   [2]  00 {k:02X}\n" for k in range(99)
+        ),
+        "raw frames of a CAN bus as candump writes them",
+    ),
+    "frames in base64": (
+        "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
+        + "".join(f"{k},0x1a0,0,0,0,8,ChssAAD/{k % 10}AA=\n" for k in range(99)),
+        "raw frames of a CAN bus; decode them by the bus's DBC",
+    ),
     "quoted rows": (
         "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
         "each row in one pair of quotes; remove them",
@@ -242,12 +272,12 @@ UNSUITED = {
 
 @pytest.mark.parametrize("name", UNSUITED)
 def test_a_file_without_a_column_a_signal_is_named_with_the_way_out(tmp_path, name):
-    text, said = UNSUITED[name]
+    text, message_part = UNSUITED[name]
     file = tmp_path / "lap.csv"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(DataError) as refused:
         inspect("my_car", [file])
-    assert said in str(refused.value)
+    assert message_part in str(refused.value)
 
 
 def test_long_format_in_parquet_is_named_too(tmp_path):
@@ -281,8 +311,8 @@ def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_pa
     d["sideslip"] = np.where(
         crawls, random.uniform(-np.pi, np.pi, 6000), np.arctan2(d["vy"], np.maximum(d["vx"], 0.1))
     )
-    made, recording = read_back(write(tmp_path / "lap.csv", usual(d)))
-    assert {"name": "velocity_from_sideslip", "min_speed": 1.0} in made.dataset["transforms"]
+    log_draft, recording = read_back(write(tmp_path / "lap.csv", usual(d)))
+    assert {"name": "velocity_from_sideslip", "min_speed": 1.0} in log_draft.dataset["transforms"]
     slow = recording["vx"] < 1.0
     assert np.abs(recording["vy_ref"][slow]).max() == 0.0
     np.testing.assert_allclose(recording["vy_ref"][~slow], d["vy"][~slow], atol=1e-2)
@@ -295,9 +325,9 @@ def test_numbers_that_loggers_write_for_nothing_are_missing_samples(tmp_path, co
     expected = np.radians(table["Gyro"].copy())
     for first in (300, 900, 1500):
         table.loc[first : first + 5, ["Gyro", "Speed"]] = code
-    made, recording = read_back(write(tmp_path / "lap.csv", table))
-    assert made.dataset["channels"]["yaw_rate"]["invalid"] == pytest.approx([code], rel=1e-12)
-    assert any(f"{code:.9g} in 18 samples of 'Gyro'" in note for note in made.notes)
+    log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
+    assert log_draft.dataset["channels"]["yaw_rate"]["invalid"] == pytest.approx([code], rel=1e-12)
+    assert any(f"{code:.9g} in 18 samples of 'Gyro'" in note for note in log_draft.notes)
     assert np.abs(recording["yaw_rate"] - expected[: len(recording)]).max() < 0.02
 
 
@@ -325,10 +355,10 @@ def test_days_of_a_spreadsheet_are_a_clock(tmp_path):
     table = usual(d)
     name = table.columns[0]
     table[name] = 45000.5 + table[name] / 86_400.0
-    made, recording = read_back(
+    log_draft, recording = read_back(
         exact(tmp_path / "lap.csv", table.rename(columns={name: "Timestamp"}))
     )
-    assert made.dataset["time"] == {"column": "Timestamp", "unit": "d"}
+    assert log_draft.dataset["time"] == {"column": "Timestamp", "unit": "d"}
     assert recording.rate_hz == 50.0
 
 
@@ -341,7 +371,7 @@ def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("cell", "said"),
+    ("cell", "message_part"),
     [
         (lambda v: f'"{1e3 * v:,.1f}"', "a separator of thousands, such as '"),
         (lambda v: f"{v:.3f}".replace("-", "−"), "another minus sign, such as '−"),
@@ -349,18 +379,18 @@ def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
         (lambda v: f"{v:.4E}".replace("E", "D"), "another mark of the exponent, such as '"),
     ],
 )
-def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, said):
+def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, message_part):
     table = usual(drive())
     lines = [",".join(table.columns)]
     for row in table.itertuples(index=False):
         cells = [f"{value:.5f}" for value in row]
         at = list(table.columns).index("Gyro")
-        cells[at] = cell(100.0 + row[at]) if "thousand" in said else cell(row[at])
+        cells[at] = cell(100.0 + row[at]) if "thousand" in message_part else cell(row[at])
         lines.append(",".join(cells))
     file = tmp_path / "lap.csv"
     file.write_text("\n".join(lines), encoding="utf-8")
     (reason,) = (reason for reason in survey_table(file).skipped if "'Gyro'" in reason)
-    assert reason.startswith(f"column 'Gyro' holds numbers with {said}")
+    assert reason.startswith(f"column 'Gyro' holds numbers with {message_part}")
 
 
 def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path):

@@ -52,8 +52,8 @@ def test_forest_plot_of_errors_that_differ_much_is_logarithmic_and_says_so():
 def test_points_of_the_cloud_below_are_larger_than_those_above():
     clouds = [Cloud(name, "#111111", TIME, TIME) for name in ("measured", "GRU", "LSTM")]
     (axes,) = clouds_figure([(clouds, "x", "y", False)]).axes
-    first, *others = (line.get_markersize() for line in axes.lines)
-    assert all(first > size for size in others)
+    first, *smaller_sizes = (line.get_markersize() for line in axes.lines)
+    assert all(first > size for size in smaller_sizes)
 
 
 @pytest.mark.parametrize("name", estimator_names())

@@ -160,16 +160,13 @@ def test_an_estimator_that_only_equals_a_baseline_is_not_recommended(part):
 def test_the_comparison_of_a_drive_recommends_by_the_same_rule(part):
     """The page of any comparison and its printed verdict; the static map is as good as the best."""
     artefacts = StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part})
-    (printed,) = drive_study.verdict(artefacts)
-    opening = str(drive_study.comparison(part).blocks[0])
-    assert "Recommended: KS-NN" in printed
-    assert printed in opening.replace("**", "").replace("`", "")
-    assert (
-        "Recommended"
-        not in drive_study.verdict(
-            replace(artefacts, parts={"": without(part, "luenberger", "gru", "ksnn")})
-        )[0]
-    )
+    best, recommended = drive_study.verdict(artefacts)
+    opening = str(drive_study.comparison(part).blocks[0]).replace("**", "").replace("`", "")
+    assert best.startswith("Best: ")
+    assert recommended.startswith("Recommended: KS-NN")
+    assert f"{best} {recommended}" in opening
+    baselines = replace(artefacts, parts={"": without(part, "luenberger", "gru", "ksnn")})
+    assert not any("Recommended" in line for line in drive_study.verdict(baselines))
 
 
 def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
@@ -243,8 +240,9 @@ def test_terminal_and_report_state_the_same(part):
     assert " output=there -o beta.csv" in estimate
     assert " output=there -o on_the_car" in export
     assert "vehest report toy output=there training.patience=5 " in report
-    assert lines[0].replace("*", "") in str(documents(artefacts)["report"].blocks[0]).replace(
-        "*", ""
-    ).replace("`", "")
-    model = lines[2].split()[2]
+    opening = str(documents(artefacts)["report"].blocks[0]).replace("*", "").replace("`", "")
+    sentences = lines[: lines.index("next:")]
+    assert sentences[1].startswith("Recommended: ")
+    assert " ".join(sentences) in opening
+    model = estimate.split()[2]
     assert any(model == model_entry.model_folder.name for model_entry in part.models)

@@ -188,7 +188,7 @@ def test_bands_and_faults_are_listed_by_car(across):
     assert f"Health flags {in_time_percent:.1f} % of the detectable faults" in text
 
 
-def test_minutes_of_reference_are_columns_of_one_table(across):
+def test_minutes_of_reference_are_columns_of_a_single_table(across):
     parts = {
         f"forth_{minutes}": {
             "title": "My car",

@@ -285,7 +285,7 @@ def test_help_shows_choices_and_answers_quickly(place):
         (lambda table: table.drop(columns="Yaw"), "has no column 'Yaw' (it has Time, Speed"),
         (
             lambda table: table.drop(index=range(100, 200)),
-            ("one.csv': 1 gaps, the longest of 1.01 s after 0.99 s", "dataset.clock=interpolate"),
+            ("one.csv': 1 gap, the longest of 1.01 s after 0.99 s", "dataset.clock=interpolate"),
         ),
         (
             lambda table: table.assign(LatAcc=table["LatAcc"].where(table.index != 500)),

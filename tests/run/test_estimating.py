@@ -17,6 +17,7 @@ from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
 from vehest.estimators.registry import estimator_names
 from vehest.run.estimate import estimate_file
+from vehest.run.estimate_summary import describe_use
 from vehest.trust.record import TRUST, read_trust
 
 
@@ -71,12 +72,38 @@ def test_the_summary_for_people_names_point_band_share_rate_warnings_and_file(sa
     band = figures["band_sideslip_deg"]
     assert f"90 % band ±{band['median']:.2f}° (median)" in rows["sideslip"]
     assert rows["warnings"] == "none"
+    assert list(rows)[-1] == "use"
+    assert f"at most ±{band['median']:.2f}° in half of all samples" in rows["use"]
     assert rows["file"].startswith("out.csv (vy [m/s]")
     assert err == ""
     lap({"vx": np.zeros(3000)})
     out, err = saved.done("estimate", "own", "lap.csv", "-o", "out.csv")
     assert "warnings  1, printed above" in out
     assert err.startswith("warning: vx: constant at 0 m/s")
+
+
+def test_the_last_line_of_the_summary_says_which_samples_may_be_used():
+    outcome = {
+        "has_calibration": True,
+        "findings": [],
+        "valid_percent": 81.3,
+        "invalid_reasons": [f"outside the range of the training: {of}" for of in ("|vx|", "|ay|")],
+        "band_sideslip_deg": {"median": 0.5, "largest": 3.0},
+    }
+    band = "the band is made to contain 9 of 10 errors of β, and is at most ±0.50° in half of all"
+    limits = "the others: outside the range of the training: |vx|, |ay|"
+    assert describe_use(outcome) == (
+        f"only the samples with health 0 (81.3 %); {band} samples; {limits}"
+    )
+    valid = outcome | {"valid_percent": 100.0, "invalid_reasons": []}
+    assert describe_use(valid) == f"all samples; {band} samples"
+    doubtful = describe_use(valid | {"findings": ["ay: frozen"]})
+    assert doubtful == f"once the warnings above are settled, all samples; {band} samples"
+    assert describe_use(valid | {"band_sideslip_deg": {}}) == (
+        "all samples; no band says how large their errors are"
+    )
+    assert describe_use(outcome | {"valid_percent": 0.0}).startswith("no sample: health is 0 at")
+    assert describe_use(outcome | {"has_calibration": False}).startswith("not before a comparison")
 
 
 def test_the_summary_names_the_point_of_the_self_calibrating_filter(saved):

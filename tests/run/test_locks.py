@@ -70,13 +70,13 @@ def test_a_single_process_compiles_for_calibration_and_others_wait(tmp_path, mon
     answers = iter([False, False, True])
     with (
         locked_by_process(tmp_path, "compile", "health"),
-        group._compile_lock(tmp_path, lambda: next(answers)),
+        group.compile_lock(tmp_path, lambda: next(answers)),
     ):
         assert next(answers, "all") == "all"
     monkeypatch.setattr(group, "has_to_compile", lambda kernel: False)
     with (
         locked_by_process(tmp_path, "compile", "health"),
-        group._compile_lock(tmp_path, pytest.fail),
+        group.compile_lock(tmp_path, pytest.fail),
     ):
         pass
 

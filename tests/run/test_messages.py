@@ -25,6 +25,7 @@ from vehest.configuration.composition import as_yaml, compose_config, count, exp
 from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
 from vehest.data.files import no_room, written_aside
 from vehest.data.limits import Limits, use_limits
+from vehest.run import console
 from vehest.run.console import Messages
 from vehest.run.failures import failure_of
 from vehest.run.printing import TerminalTable, emit
@@ -167,6 +168,37 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     assert not {"\x07", "\x9b", "\u202e"} & set(text)
     assert "\x1b]" not in text
     assert terminal == (f"{hostile} " in text.split("warning", 1)[1].split(hostile, 1)[1])
+
+
+def test_a_stage_gets_a_line_once_it_has_been_silent_for_long(monkeypatch):
+    monkeypatch.setattr(console, "MAX_SILENT_SECONDS", 0.0)
+    messages = Messages()
+    stream = io.StringIO()
+    messages.console = type(messages.console)(file=stream, soft_wrap=True, width=200)
+    messages.begin("ingest", "long")
+    messages._timers["ingest", "long"].join()
+    monkeypatch.setattr(console, "MAX_SILENT_SECONDS", 600.0)
+    messages.begin("train", "short")
+    messages.begin("report", "stopped")
+    timers = [messages._timers[key] for key in (("train", "short"), ("report", "stopped"))]
+    messages.end("train", "short")
+    messages.close()
+    for timer in timers:
+        timer.join(60.0)  # ends at once, as it was cancelled
+        assert not timer.is_alive()
+    assert stream.getvalue() == "running ingest     long\n"
+    assert messages.printed == []
+
+
+def test_every_stage_of_a_training_is_announced_and_ended(place, monkeypatch):
+    begun = []
+    ended = []
+    monkeypatch.setattr(Messages, "begin", lambda self, *stage: begun.append(stage))
+    monkeypatch.setattr(Messages, "end", lambda self, *stage: ended.append(stage))
+    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "tracking=none")
+    assert [stage for stage, _ in begun] == ["ingest", "downsample", "train"]
+    assert begun[-1] == ("train", "luenberger-luenberger seed 0")
+    assert set(begun) <= set(ended)
 
 
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):

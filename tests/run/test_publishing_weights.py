@@ -54,7 +54,7 @@ def digests(output):
 
 def models_published(pair):
     """Models in the file of published weights."""
-    return PublishedWeights(pair.folder / FILE)._models
+    return PublishedWeights(pair.folder / FILE).models
 
 
 def stop_once_published(patch, n_models):
@@ -62,7 +62,7 @@ def stop_once_published(patch, n_models):
 
     def publish_weights(published, models, output, messages):
         has_room = publish(published, models, output, messages)
-        if len(published._models) >= n_models:
+        if len(published.models) >= n_models:
             os.kill(os.getpid(), signal.SIGINT)
         return has_room
 

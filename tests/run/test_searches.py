@@ -167,5 +167,5 @@ def test_searches_of_papers_cover_the_trainings_of_their_parts():
         ("trial_lstm", 2, "real"),
     ):
         (trial,) = jobs[f"{name}_{number}"]
-        stated = [searches._compared(job.config) for job in jobs[part]]
-        assert searches._compared(trial.config) in stated, name
+        stated = [searches.settings_to_compare(job.config) for job in jobs[part]]
+        assert searches.settings_to_compare(trial.config) in stated, name

@@ -26,6 +26,6 @@ def test_gaps_leave_training_rows_out_and_a_damaged_recording_is_an_error(monkey
         settings = SimpleNamespace(data={"mine": None}, protocol=None, **{**readable, **spoilt})
         if spoilt:
             with pytest.raises(DataError, match="truncated or damaged"):
-                evaluate._training_rows(settings, None, None)
+                evaluate.training_rows(settings, None, None)
         else:
-            assert evaluate._training_rows(settings, None, None) == []
+            assert evaluate.training_rows(settings, None, None) == []

@@ -18,6 +18,7 @@ ALL = sorted(
 
 @cache
 def shipped(name):
+    """A vehicle of conf/vehicle."""
     return vehicle_from_configuration(
         yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
     )
@@ -25,4 +26,5 @@ def shipped(name):
 
 @cache
 def plant_of(name):
+    """Multi-body plant of a vehicle of conf/vehicle."""
     return MultiBodyPlant(shipped(name))

@@ -1,4 +1,6 @@
-"""A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier."""
+"""A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost
+frames, units and signs of a supplier.
+"""
 
 from collections import namedtuple
 
@@ -40,13 +42,19 @@ SIGNALS = {
 }
 ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from its first frame
 Written = namedtuple("Written", "dbc log lost origin")
-"""Files; message -> numbers of the samples whose frames were lost; time of the recording at which the log's clock stands at 0 [s]."""
+"""Files of a log, frames that were lost and its clock.
+
+``lost``: message -> numbers of the samples whose frames were lost. ``origin``: time of the
+recording at which the clock of the log is 0 [s].
+"""
 
 
 def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0, repeats=1):
-    """Write a recording as the frames of a bus, one of each message a sample, the drive ``repeats`` times.
+    """Write a recording as the frames of a bus, one of each message a sample, the drive ``repeats``
+    times.
 
-    Stamps are late by up to twice ``jitter`` [s], evenly distributed; a share of frames is ``lost``.
+    Stamps are late by up to twice ``jitter`` [s], evenly distributed; a share of frames is
+    ``lost``.
     """
     import can
 
@@ -100,7 +108,7 @@ def _messages(recording):
     }
     if "steer" in recording:
         values["Steering"] = {"SteerAng": np.degrees(recording["steer"])}
-    found = {}
+    messages = {}
     for name, signals in values.items():
         message = database.get_message_by_name(name)
         counts = any(signal.name == "Counter" for signal in message.signals)
@@ -110,8 +118,8 @@ def _messages(recording):
             frames.append(
                 message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False)
             )
-        found[name] = (message.frame_id, message.is_extended_frame, frames)
-    return found
+        messages[name] = (message.frame_id, message.is_extended_frame, frames)
+    return messages
 
 
 def ferrari(start, stop):

@@ -1,7 +1,9 @@
-"""Write docs/examples/drive.asc and car.dbc, the CAN log of docs/bus.md: 20 s of a simulated drive as frames.
+"""Write docs/examples/drive.asc and car.dbc, the CAN log of docs/bus.md: 20 s of a simulated drive
+as frames.
 
-`python tests/sources/example_bus.py RECORDING` takes a stored recording of the quickstart at 20 Hz, such as
-outputs/downsample/sim_quickstart-20hz-…/drive_3.parquet. Frames are up to 2 ms late, and 1 % of them are lost.
+`python tests/sources/example_bus.py RECORDING` takes a stored recording of the quickstart at 20 Hz,
+such as outputs/downsample/sim_quickstart-20hz-…/drive_3.parquet. Frames are up to 2 ms late, and 1
+% of them are lost.
 """
 
 import sys

@@ -1,4 +1,6 @@
-"""Functions that a limited process calls as readers: one that answers, and one for each way of ending otherwise."""
+"""Functions that a limited process calls as readers: one that answers, and one for each way of
+ending otherwise.
+"""
 
 import os
 

@@ -8,7 +8,10 @@ ONE = {"vx": {"column": "v", "unit": "m/s"}}
 
 
 def write_mdf(file, groups, version="4.10", clock=None, **options):
-    """Write groups of signals, each on its own clock; ``clock`` is the conversion of the first group's times."""
+    """Write groups of signals, each on its own clock.
+
+    ``clock`` is the conversion of the first group's times.
+    """
     import asammdf
 
     with asammdf.MDF(version=version) as measurement:

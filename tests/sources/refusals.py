@@ -6,7 +6,10 @@ from vehest.data.errors import DataError, VehestError
 
 
 def refusal(act, kind=DataError):
-    """The one printable line of the error in which ``act`` ends; of any kind where ``kind`` is `VehestError`."""
+    """The one printable line of the error in which ``act`` ends.
+
+    Of any kind where ``kind`` is `VehestError`.
+    """
     with pytest.raises(VehestError) as error:
         act()
     message = str(error.value)

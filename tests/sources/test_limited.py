@@ -1,4 +1,6 @@
-"""Reading in a process of its own: what comes back, and one line naming the file however it ends."""
+"""Reading in a process of its own: what comes back, and one line naming the file however it
+ends.
+"""
 
 import sys
 from pathlib import Path
@@ -32,7 +34,7 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file):
     sys.platform == "win32", reason="Windows limits neither memory nor processor time"
 )
 @pytest.mark.parametrize(
-    ("function", "kind", "said"),
+    ("function", "kind", "message_part"),
     [
         ("hangs", DataError, "takes more than 1 s to read, too long for its size"),
         (
@@ -47,7 +49,7 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file):
     ],
 )
 def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
-    file, monkeypatch, function, kind, said
+    file, monkeypatch, function, kind, message_part
 ):
     monkeypatch.setattr("vehest.sources.limited.SECONDS", 1.0)
     with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
@@ -55,7 +57,7 @@ def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
     assert type(error.value) is kind
     message = str(error.value)
     assert message.startswith(f"'{file}'")
-    assert said in message
+    assert message_part in message
     assert message.isprintable()
     assert file.read_bytes() == VALUES.tobytes()
     assert [

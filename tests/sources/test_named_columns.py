@@ -1,4 +1,6 @@
-"""A recording of a DataFrame: columns that a user names, units, times, and one clear error for each mistake."""
+"""A recording of a DataFrame: columns that a user names, units, times, and one clear error for each
+mistake.
+"""
 
 import numpy as np
 import pandas as pd

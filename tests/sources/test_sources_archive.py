@@ -1,4 +1,6 @@
-"""Archives from strangers: what is harmless comes out as it went in, all else is refused in one line and leaves nothing behind."""
+"""Archives from strangers: what is harmless comes out as it went in, all else is refused in one
+line and leaves nothing behind.
+"""
 
 import stat
 import tempfile
@@ -46,12 +48,12 @@ def refused(file, **limits):
 def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path):
     file = packed(tmp_path, *CONTENT.items())
     with unpacked(file) as folder:
-        found = {
+        unpacked_contents = {
             path.relative_to(folder).as_posix(): path.read_bytes()
             for path in folder.rglob("*")
             if path.is_file()
         }
-        assert found == CONTENT
+        assert unpacked_contents == CONTENT
     assert not folder.exists()
 
 

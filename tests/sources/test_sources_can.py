@@ -1,4 +1,6 @@
-"""Logs of python-can's own writers: a drive comes back as it was, and one clear line for what cannot be used."""
+"""Logs of python-can's own writers: a drive comes back as it was, and one clear line for what
+cannot be used.
+"""
 
 import re
 import struct
@@ -56,16 +58,16 @@ def one(signal, length=8):
 def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path, suffix):
     sent = drive()
     write_log(sent, tmp_path, suffix)
-    got = read(tmp_path)
-    k = np.rint((got.time - got.start_time) * 100.0).astype(int)
-    assert len(got) >= len(sent) - 2
-    assert got.rate_hz == 100.0
+    recording = read(tmp_path)
+    k = np.rint((recording.time - recording.start_time) * 100.0).astype(int)
+    assert len(recording) >= len(sent) - 2
+    assert recording.rate_hz == 100.0
     for (
         name,
         step,
     ) in STEPS.items():  # frames of the second message come 0.4 ms late: the slope times that
         slack = 0.0005 * np.abs(np.gradient(sent[name], 0.01)).max()
-        np.testing.assert_allclose(got[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
+        np.testing.assert_allclose(recording[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
 
 
 def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of_several_is_taken(
@@ -76,8 +78,8 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of
         one('0|16@1+ (0.01,0) [0|0] "m/s" Car'),
         [(k / 100, 0, struct.pack("<H6x", 65535 if 20 <= k < 30 else k)) for k in range(100)],
     )
-    got = read(tmp_path, channels={"vx": {**SPEED["vx"], "invalid": [65535]}}, gappy=["vx"])
-    assert np.flatnonzero(np.isnan(got["vx"])).tolist() == list(range(20, 30))
+    recording = read(tmp_path, channels={"vx": {**SPEED["vx"], "invalid": [65535]}}, gappy=["vx"])
+    assert np.flatnonzero(np.isnan(recording["vx"])).tolist() == list(range(20, 30))
     log(
         tmp_path,
         one('0|8@1+ (1,0) [0|0] "m/s" Car'),
@@ -90,7 +92,7 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of
 
 def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_path):
     write_log(drive(), tmp_path)
-    for options, said in (
+    for options, message in (
         (
             {"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}},
             "no signal 'Speed.VehSpeed'; did you mean 'Speed.VehSpd'?",
@@ -109,13 +111,13 @@ def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_pat
         ),
         ({"rate_hz": 50}, "faster than the raster"),
     ):
-        assert said in refusal(lambda options=options: read(tmp_path, **options))
+        assert message in refusal(lambda options=options: read(tmp_path, **options))
     with use_limits(Limits(samples=100)):
         assert "holds 101 frames or more" in refusal(lambda: read(tmp_path))
 
 
 @pytest.mark.parametrize(
-    ("dbc", "said"),
+    ("dbc", "message"),
     [
         (
             one('0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000),
@@ -126,9 +128,9 @@ def test_what_is_declared_wrongly_or_beyond_the_limits_is_said_in_a_line(tmp_pat
         (one("soon"), "cannot be read as a DBC"),
     ],
 )
-def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path, dbc, said):
+def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path, dbc, message):
     log(tmp_path, dbc, [(k / 100, 0, bytes(8)) for k in range(50)])
-    assert said in refusal(lambda: read(tmp_path, channels=SPEED))
+    assert message in refusal(lambda: read(tmp_path, channels=SPEED))
 
 
 def blf_with(content, method=0):
@@ -144,7 +146,7 @@ def blf_with(content, method=0):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "change", "said"),
+    ("suffix", "change", "message"),
     [
         (".blf", lambda content: content[:-20], "is truncated"),
         (
@@ -161,10 +163,10 @@ def blf_with(content, method=0):
         (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "is damaged .*zzz"),
     ],
 )
-def test_a_damaged_log_is_one_line(tmp_path, suffix, change, said):
+def test_a_damaged_log_is_one_line(tmp_path, suffix, change, message):
     written = write_log(drive(3.0), tmp_path, suffix)
     written.log.write_bytes(change(written.log.read_bytes()))
-    assert re.search(said, refusal(lambda: read(tmp_path)))
+    assert re.search(message, refusal(lambda: read(tmp_path)))
 
 
 def ramp(first, missing, n=200):
@@ -191,8 +193,8 @@ def recordings(folder, **options):
 )
 def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, name):
     log(tmp_path, choices(f'65535 "{name}"'), ramp(0, [65535] * 5))
-    got = read(tmp_path, channels={"vx": {**SPEED["vx"], "max_gap": 0.1}})
-    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 100.0, atol=1e-9)
+    recording = read(tmp_path, channels={"vx": {**SPEED["vx"], "max_gap": 0.1}})
+    np.testing.assert_allclose(recording["vx"], np.arange(len(recording)) / 100.0, atol=1e-9)
     parts = recordings(tmp_path)
     expected = [(20, 0.19), (175, 1.99)]
     assert [(len(part), float(part["vx"].max())) for part in parts] == expected
@@ -200,7 +202,8 @@ def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, n
         parts[0]
         .provenance[MISSING]["vx"][0]
         .startswith(
-            "a gap of 0.06 s after 0.19 s, 5 samples of which are marked as not measured, ends the recording"
+            "a gap of 0.06 s after 0.19 s, 5 samples of which are marked as not measured, ends "
+            "the recording"
         )
     )
 
@@ -211,8 +214,8 @@ def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding)
     content = choices('65535 "Ungültig"').replace("m/s", "km/h").encode(encoding)
     (tmp_path / "car.dbc").write_bytes(content)
     speed = {**SPEED["vx"], "unit": "km/h", "max_gap": 0.1}
-    got = read(tmp_path, channels={"vx": speed})
-    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 360.0, atol=1e-9)
+    recording = read(tmp_path, channels={"vx": speed})
+    np.testing.assert_allclose(recording["vx"], np.arange(len(recording)) / 360.0, atol=1e-9)
 
 
 def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(tmp_path):
@@ -227,8 +230,8 @@ def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(t
 )
 def test_values_with_other_names_and_the_zero_of_a_standing_car_are_measurements(tmp_path, names):
     log(tmp_path, choices(names), ramp(0, []))
-    got = read(tmp_path, channels=SPEED)
-    np.testing.assert_allclose(got["vx"], np.arange(len(got)) / 100.0, atol=1e-9)
+    recording = read(tmp_path, channels=SPEED)
+    np.testing.assert_allclose(recording["vx"], np.arange(len(recording)) / 100.0, atol=1e-9)
 
 
 J1939 = """VERSION ""
@@ -256,9 +259,9 @@ def test_reserved_codes_of_j1939_are_missing_samples(tmp_path, maximum, protocol
             data = struct.pack("<H6x", code)
             writer(can.Message(k / 100, 2566834174 & 0x1FFFFFFF, True, data=data, channel=0))
     channels = {"vx": {"column": "Speed", "unit": "km/h"}}
-    got = read(tmp_path, channels=channels, gappy=["vx"])["vx"]
-    assert np.count_nonzero(np.isnan(got)) == n_missing
-    assert (3.6 * got[~np.isnan(got)] < 251.0).all() == (n_missing > 0)
+    speed = read(tmp_path, channels=channels, gappy=["vx"])["vx"]
+    assert np.count_nonzero(np.isnan(speed)) == n_missing
+    assert (3.6 * speed[~np.isnan(speed)] < 251.0).all() == (n_missing > 0)
 
 
 def test_data_check_names_missing_samples_and_goes_on_with_the_segments(tmp_path, monkeypatch):

@@ -49,8 +49,8 @@ def test_time_stamps_rounded_to_milliseconds_can_be_resampled_to_20_hz(rate):
 def test_the_rate_survives_strong_jitter_and_gaps(rate, share):
     generator = np.random.default_rng(5)
     stamps = (np.arange(1000) + share * generator.uniform(-1, 1, 1000)) / rate
-    kept = np.delete(stamps, [*range(300, 350), 500, 777])
-    clock = uniform_clock(kept, "'file'", "interpolate")
+    remaining_stamps = np.delete(stamps, [*range(300, 350), 500, 777])
+    clock = uniform_clock(remaining_stamps, "'file'", "interpolate")
     assert clock.rate_hz == rate
     assert clock.n_samples == pytest.approx(1000, abs=1)
 
@@ -89,7 +89,7 @@ def test_units_and_signs_are_applied_and_misspelt_ones_refused():
     assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column(
         "3", "s", -1
     ), "YAML reads it as a number"
-    for act, said in (
+    for act, message in (
         (
             lambda: columns_from_config({"vz": {"column": "a", "unit": "m/s"}}, "mine"),
             "data set 'mine': channel 'vz': channel 'vz' is not known",
@@ -103,7 +103,7 @@ def test_units_and_signs_are_applied_and_misspelt_ones_refused():
             "here: unit 'km/h' cannot be converted to 's'",
         ),
     ):
-        assert said in refusal(act, ConfigurationError)
+        assert message in refusal(act, ConfigurationError)
 
 
 EVEN = np.arange(1000) / 100.0
@@ -111,17 +111,18 @@ EVEN = np.arange(1000) / 100.0
 
 @pytest.mark.parametrize("policy", ["strict", "interpolate"])
 @pytest.mark.parametrize(
-    ("stamps", "said"),
+    ("stamps", "message_part"),
     [
         (
             EVEN[[0, 1, 1, 2]],
-            "time repeats 1 times, first at sample 2 (0.01 s); repair, remove or sort the rows",
+            "time repeats 1 time, first at sample 2 (0.01 s); repair, remove or sort the rows",
         ),
-        (EVEN[[0, 2, 1, 3]], "time goes backwards 1 times, first at sample 2"),
+        (EVEN[[0, 2, 1, 3]], "time goes backwards 1 time, first at sample 2"),
         (EVEN[:1], "fewer than two"),
         (
             np.append(EVEN, 1e9),
-            "a gap of 1e+09 s between sample 999 (9.99 s) and 1000 (1000000000 s); remove the stray stamp",
+            "a gap of 1e+09 s between sample 999 (9.99 s) and 1000 (1000000000 s); remove the "
+            "stray stamp",
         ),
         (EVEN * 1e-4, "the time stamps lie 1e-06 s apart"),
         (
@@ -132,10 +133,12 @@ EVEN = np.arange(1000) / 100.0
     ],
 )
 @pytest.mark.filterwarnings("error")
-def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(policy, stamps, said):
+def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(
+    policy, stamps, message_part
+):
     message = refusal(lambda: uniform_clock(stamps, "'lap.csv'", policy))
     assert message.startswith("'lap.csv': ")
-    assert said in message
+    assert message_part in message
 
 
 def test_every_recording_of_a_source_keeps_the_rule_and_surveys_name_a_stray_time_stamp(tmp_path):
@@ -149,10 +152,10 @@ def test_every_recording_of_a_source_keeps_the_rule_and_surveys_name_a_stray_tim
     }
     assert open_source({**declared, "rate_hz": 9e4}).read("lap").rate_hz == 9e4
     for read in (lambda source: source.read("lap"), lambda source: source.read_file(file)):
-        said = refusal(lambda read=read: read(open_source({**declared, "rate_hz": 2e5})))
+        message = refusal(lambda read=read: read(open_source({**declared, "rate_hz": 2e5})))
         assert (
-            "recording 'lap': the sampling rate must lie between 1e-06 and 100000 Hz, not at 200000 Hz"
-            in said
+            "recording 'lap': the sampling rate must lie between 1e-06 and 100000 Hz, not at "
+            "200000 Hz" in message
         )
     for rows in (1000, 400):
         stamps = np.where(np.arange(1000) == rows - 1, 1e9, EVEN)
@@ -166,16 +169,17 @@ def test_every_recording_of_a_source_keeps_the_rule_and_surveys_name_a_stray_tim
         )
         with pytest.raises(
             DataError,
-            match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} \(1000000000 s\)",
+            match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} "
+            rf"\(1000000000 s\)",
         ):
             survey(file)
 
 
 def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples_and_withstands_a_stall():
     stamps = np.append(EVEN, 3e5)
-    said = refusal(lambda: uniform_clock(stamps, "'lap.csv'", "interpolate"))
-    assert "over 1001 rows would hold 30000001 samples, more than the limit" in said
-    assert "limits.samples=NUMBER" in said
+    message = refusal(lambda: uniform_clock(stamps, "'lap.csv'", "interpolate"))
+    assert "over 1001 rows would hold 30000001 samples, more than the limit" in message
+    assert "limits.samples=NUMBER" in message
     with use_limits(Limits(samples=30_000_001)):
         assert uniform_clock(stamps, "'lap.csv'", "interpolate").n_samples == 30_000_001
     times = np.arange(2000) / 100 * 1.00003
@@ -191,9 +195,9 @@ def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples_and_withstan
     [
         (
             np.delete(EVEN, np.s_[300:350]),
-            "1 gaps, the longest of 0.51 s after 2.99 s (interval 0.01 s)",
+            "1 gap, the longest of 0.51 s after 2.99 s (interval 0.01 s)",
         ),
-        (np.delete(EVEN, 500), "1 gaps, the longest of 0.02 s after 4.99 s"),
+        (np.delete(EVEN, 500), "1 gap, the longest of 0.02 s after 4.99 s"),
         (
             EVEN + np.where(np.arange(1000) % 2, 5e-4, 0.0),
             "intervals deviate by up to 9.5 % from the median of 0.0105 s",
@@ -206,14 +210,14 @@ def test_gaps_jitter_and_drift_are_found_with_their_size(stamps, found):
 
 
 @pytest.mark.parametrize(
-    ("stamps", "said"),
+    ("stamps", "message_part"),
     [
         (EVEN[:10], "10 samples are too few"),
         (np.arange(300) / 99.0, "samples come at 99 Hz, not at 100 Hz"),
         (np.zeros(300), "inf Hz, not at 100 Hz"),
         (
             np.concatenate([EVEN[:150], EVEN[140:290]]),
-            "time goes backwards 1 times, first at sample 150",
+            "time goes backwards 1 time, first at sample 150",
         ),
         (
             np.cumsum(np.linspace(0.996, 1.004, 3000)) / 100,
@@ -228,7 +232,7 @@ def test_gaps_jitter_and_drift_are_found_with_their_size(stamps, found):
         ),
     ],
 )
-def test_stamps_without_an_even_clock_behind_them_are_refused(stamps, said):
+def test_stamps_without_an_even_clock_behind_them_are_refused(stamps, message_part):
     message = refusal(lambda: uniform_times(stamps, 100.0, "topic"))
     assert message.startswith("topic: ")
-    assert said in message
+    assert message_part in message

@@ -1,4 +1,6 @@
-"""Downloads from a server on loopback that breaks off, changes its file, stalls or sends other bytes."""
+"""Downloads from a server on loopback that breaks off, changes its file, stalls or sends other
+bytes.
+"""
 
 import fcntl
 import hashlib
@@ -64,13 +66,13 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
-        whole = server.contents[name]
+        full_content = server.contents[name]
         self.send_response(200)
-        length = {"Content-Length": str(len(whole))} if server.length else {}
+        length = {"Content-Length": str(len(full_content))} if server.length else {}
         for key, value in {**length, **server.headers}.items():
             self.send_header(key, value)
         self.end_headers()
-        body = whole[: server.breaks.pop(0)] if server.breaks else whole
+        body = full_content[: server.breaks.pop(0)] if server.breaks else full_content
         server.sent.append(len(body))  # before the client can have it and ask for more
         self.wfile.write(body)
         self.close_connection = True
@@ -82,21 +84,21 @@ class Handler(BaseHTTPRequestHandler):
 @pytest.fixture
 def server(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    made = Server()
-    thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
+    server = Server()
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
-    yield made
-    made.shutdown()
+    yield server
+    server.shutdown()
     thread.join()
-    made.server_close()
+    server.server_close()
 
 
-def download(server, folder, known=None):
-    return Download(folder, server.url, ("a.csv",), known or {})
+def download(server, folder, checksums=None):
+    return Download(folder, server.url, ("a.csv",), checksums or {})
 
 
-def refused(what, kind=MissingError):
-    return refusal(lambda: list(what.fetch()), kind)
+def refused(declared, kind=MissingError):
+    return refusal(lambda: list(declared.fetch()), kind)
 
 
 def files(folder):
@@ -139,7 +141,7 @@ def test_two_processes_do_not_fetch_into_one_folder(server, tmp_path):
 
 
 def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server, tmp_path):
-    message = refused(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
+    message = refused(download(server, tmp_path, checksums={"a.csv": sha256(b"other")}), DataError)
     assert all(
         part in message
         for part in (
@@ -150,7 +152,7 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
         )
     )
     assert files(tmp_path) == {}
-    list(download(server, tmp_path, known={"a.csv": sha256(BYTES)}).fetch())
+    list(download(server, tmp_path, checksums={"a.csv": sha256(BYTES)}).fetch())
     (tmp_path / "a.csv").write_bytes(b"changed")
     message = refused(download(server, tmp_path), DataError)
     assert all(
@@ -206,14 +208,14 @@ def test_an_entry_says_address_files_and_checksums_or_is_refused_in_one_line():
         "files": ["a.csv", "b 1.csv"],
         "sha256": {"a.csv": "AB" * 32},
     }
-    what = download_of(open_source({**TABULAR, "download": entry}))
-    assert (what.folder, what.files, what.sha256) == (
+    declared = download_of(open_source({**TABULAR, "download": entry}))
+    assert (declared.folder, declared.files, declared.sha256) == (
         Path("there"),
         ("a.csv", "b 1.csv"),
         {"a.csv": "ab" * 32},
     )
-    assert what.address("b 1.csv") == "https://example.org/folder/b%201.csv"
-    for changes, said in (
+    assert declared.address("b 1.csv") == "https://example.org/folder/b%201.csv"
+    for changes, message in (
         ({"url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
         ({"files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
         *(
@@ -224,13 +226,14 @@ def test_an_entry_says_address_files_and_checksums_or_is_refused_in_one_line():
         wrong = TABULAR | {
             "download": {"url": "https://example.org/folder", "files": ["a.csv"]} | changes
         }
-        assert said in refusal(
+        assert message in refusal(
             lambda wrong=wrong: download_of(open_source(wrong)), ConfigurationError
         )
 
 
 DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(
-    f"{k / 100:.2f},{20 + np.sin(k / 90):.6f},{0.3 * np.sin(k / 70):.6f},{6 * np.sin(k / 70):.5f},{np.cos(k / 90) / 9:.5f}\n"
+    f"{k / 100:.2f},{20 + np.sin(k / 90):.6f},{0.3 * np.sin(k / 70):.6f},"
+    f"{6 * np.sin(k / 70):.5f},{np.cos(k / 90) / 9:.5f}\n"
     for k in range(900)
 )
 
@@ -283,5 +286,6 @@ def test_without_an_address_the_remedy_names_the_data_sets_that_have_one_past_a_
     (line,) = err.splitlines()
     assert "'mine' does not say where its files can be fetched from" in line
     assert line.endswith(
-        "put them into its folder by hand, or declare download in its file; data sets that do: other"
+        "put them into its folder by hand, or declare download in its file; data sets that do: "
+        "other"
     )

@@ -1,4 +1,6 @@
-"""MDF files of asammdf's own writer: groups of several rasters on one clock, and one clear line for what cannot be used."""
+"""MDF files of asammdf's own writer: groups of several rasters on one clock, and one clear line for
+what cannot be used.
+"""
 
 import tempfile
 
@@ -77,15 +79,15 @@ def drive(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def tidy(tmp_path, monkeypatch):
     """Whatever a test reads, nothing is left in the current folder or among temporary files."""
-    here = tmp_path / "here"
+    working_folder = tmp_path / "here"
     temporary = tmp_path / "temporary"
-    here.mkdir()
+    working_folder.mkdir()
     temporary.mkdir()
-    monkeypatch.chdir(here)
+    monkeypatch.chdir(working_folder)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     yield
     assert list(temporary.iterdir()) == []
-    assert {file.name for file in here.iterdir()} <= {"conf", "outputs"}
+    assert {file.name for file in working_folder.iterdir()} <= {"conf", "outputs"}
 
 
 def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive):
@@ -130,7 +132,7 @@ def test_a_name_in_several_groups_needs_its_group_and_an_absent_signal_is_answer
     def of(column, **more):
         return {**CHANNELS, "vx": {"column": column, "unit": "km/h", **more}}
 
-    for channels, said in (
+    for channels, message in (
         (
             of("VehSpd"),
             "signal 'VehSpd' stands 2 times, in group 0 'Powertrain', 1 'Gateway'; say which",
@@ -142,7 +144,7 @@ def test_a_name_in_several_groups_needs_its_group_and_an_absent_signal_is_answer
         (of("Vehspeed"), "has no signal 'Vehspeed'; did you mean 'VehSpd'?"),
         (of("time"), "has no signal 'time'"),  # a master is no signal
     ):
-        assert said in refused(drive, channels=channels)
+        assert message in refused(drive, channels=channels)
     by_number = read_mdf(drive, channels=of("VehSpd", group=1))
     np.testing.assert_allclose(
         by_number["vx"], read_mdf(drive, channels=CHANNELS)["vx"] * 3.7 / 3.6, rtol=1e-4
@@ -193,14 +195,19 @@ def test_text_arrays_and_disordered_time_stamps_are_refused_with_their_group(tmp
     gear = {"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"D", "default": b"?"}
     stamps = np.concatenate([FAST[:50], FAST[49:]])
     text = "signal 'v' of group 0 'Only' holds text; numbers are needed"
-    where = "signal 'v' of group 0 'Only': "
-    for t, samples, more, said in (
+    signal_text = "signal 'v' of group 0 'Only': "
+    for t, samples, more, message in (
         (FAST, np.arange(2001) % 2, {"conversion": gear}, text),
         (FAST, np.array([b"on"] * 2001), {"encoding": "utf-8"}, text),
         (FAST, np.zeros(2001, dtype=[("v", "(3,)<f8")]), {}, "holds an array or structure"),
-        (stamps, np.ones(2002), {}, where + "time repeats 1 times, first at sample 50 (0.49 s)"),
+        (
+            stamps,
+            np.ones(2002),
+            {},
+            signal_text + "time repeats 1 time, first at sample 50 (0.49 s)",
+        ),
     ):
-        assert said in refused(one(tmp_path / "a.mf4", t, samples, **more))
+        assert message in refused(one(tmp_path / "a.mf4", t, samples, **more))
 
 
 @pytest.mark.parametrize("version", ["2.14", "3.30"])
@@ -214,8 +221,8 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
     file = one(tmp_path / "a.mf4", FAST, FAST, "km/h")
     message = refused(file)
     assert (
-        "signal 'v' of group 0 'Only', for channel 'vx', is in 'km/h' by the file and in 'm/s' by conf/dataset"
-        in message
+        "signal 'v' of group 0 'Only', for channel 'vx', is in 'km/h' by the file and in 'm/s' "
+        "by conf/dataset" in message
     )
     assert "set file_units: ignore" in message
     np.testing.assert_allclose(read_mdf(file, file_units="ignore")["vx"], FAST)
@@ -225,7 +232,7 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
 
 
 def test_spellings_are_known_where_they_mean_one_thing():
-    known = {
+    spellings = {
         "Â°/s": "deg/s",
         "1/min": "rpm",
         "m/s^2": "m/s²",
@@ -235,7 +242,7 @@ def test_spellings_are_known_where_they_mean_one_thing():
         "mPa": "another unit",
     }
     unclear = dict.fromkeys(("KN", "Grad"))  # kilonewton or knots; degrees in German, gon elsewhere
-    assert {text: plain_unit(text) for text in (known | unclear)} == known | unclear
+    assert {text: plain_unit(text) for text in (spellings | unclear)} == spellings | unclear
 
 
 def parts_of(file, **options):
@@ -267,7 +274,9 @@ def test_gaps_in_most_of_a_file_are_an_error_that_names_the_first(tmp_path):
 
 
 def test_a_pause_of_one_group_ends_a_recording_of_all_where_max_gap_says_so(tmp_path):
-    """The other group goes on, and a sample on either side of the pause still serves to interpolate."""
+    """The other group goes on, and a sample on either side of the pause still serves to
+    interpolate.
+    """
     slow = np.delete(SLOW, np.s_[(SLOW > 5.0) & (SLOW < 8.0)])
     groups = {
         "Fast": [signal("v", FAST, 3.0 * FAST, "m/s")],
@@ -317,7 +326,7 @@ def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_pa
 
 
 def test_a_misspelt_data_set_is_refused_in_one_line(tmp_path):
-    for changes, said in (
+    for changes, message_part in (
         ({"rate_hz": None}, "give either rate_hz, or as raster"),
         ({"rate_hz": None, "raster": "steer"}, "raster must name one of its channels"),
         ({"gappy": ["steer"]}, "gappy names 'steer'"),
@@ -326,4 +335,4 @@ def test_a_misspelt_data_set_is_refused_in_one_line(tmp_path):
         message = refusal(
             lambda options=options: read_mdf(tmp_path / "a.mf4", **options), ConfigurationError
         )
-        assert all(words in message for words in (said, "data set 'mine'"))
+        assert all(words in message for words in (message_part, "data set 'mine'"))

@@ -1,4 +1,6 @@
-"""Malformed MDF files: a formula is never evaluated, and whatever a file announces ends in one line within limits."""
+"""Malformed MDF files: a formula is never evaluated, and whatever a file announces ends in one line
+within limits.
+"""
 
 import os
 import struct
@@ -33,11 +35,13 @@ def refused(file):
     return message
 
 
-def overwritten(file, block, which, offset, layout, value):
-    """Overwrite a number behind a block's head of 24 bytes; None stands for the block's own address."""
+def overwritten(file, block, block_index, offset, layout, value):
+    """Overwrite a number behind a block's head of 24 bytes; None stands for the block's own
+    address.
+    """
     content = bytearray(file.read_bytes())
     place = -1
-    for _ in range(which + 1):
+    for _ in range(block_index + 1):
         place = content.index(block, place + 1)
     struct.pack_into(layout, content, place + 24 + offset, place if value is None else value)
     file.write_bytes(content)

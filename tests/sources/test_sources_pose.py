@@ -1,4 +1,6 @@
-"""Tables with poses, held channels, rows that do not count and time that restarts, written with a motion in closed form."""
+"""Tables with poses, held channels, rows that do not count and time that restarts, written with a
+motion in closed form.
+"""
 
 import numpy as np
 import pandas as pd
@@ -23,7 +25,10 @@ TIME = {"column": "t", "unit": "s"}
 
 
 def circle(seconds=10.0, lever=(0.0, 0.0), turned=0.0):
-    """A car on a circle to the left; poses are those of a body ``lever`` ahead and to the left of it, turned by ``turned``."""
+    """A car on a circle to the left.
+
+    Poses are those of a body ``lever`` ahead and to the left of it, turned by ``turned``.
+    """
     time = np.arange(round(seconds * RATE)) / RATE
     course = SPEED / RADIUS * time
     yaw = course + np.pi / 2 - SLIP
@@ -83,14 +88,18 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
     table["t"] = 1.7e9 + table["t"] + np.random.default_rng(0).exponential(1e-3, len(table))
     even = read(table, tmp_path, pose=POSE, clock="uniform")
     stamped = read(table, tmp_path, pose=POSE, clock="interpolate")
-    errors = [np.abs(one["vy_ref"][5:-5] - SPEED * np.sin(SLIP)).max() for one in (even, stamped)]
+    errors = [
+        np.abs(recording["vy_ref"][5:-5] - SPEED * np.sin(SLIP)).max()
+        for recording in (even, stamped)
+    ]
     assert errors[0] < 1e-3
     assert errors[1] > 20 * errors[0]
     assert even.rate_hz == RATE
     for lost in (3, 20):
         with pytest.raises(
             DataError,
-            match=r"samples are missing.*; leave rows out by drop_rows or set dataset.clock=interpolate",
+            match=r"samples are missing.*; leave rows out by drop_rows or set "
+            r"dataset.clock=interpolate",
         ):
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
@@ -103,15 +112,17 @@ HELD_CHANNELS = {
 
 @pytest.mark.parametrize("updated", ["sensor", None])
 def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path, updated):
-    """A yaw rate that its sensor samples in every tenth row and that arrives four later, with the sensor's own clock beside it."""
+    """A yaw rate that its sensor samples in every tenth row and that arrives four later, with the
+    sensor's own clock beside it.
+    """
     time = np.arange(1000) / RATE
-    taken = (np.arange(1000) - 4) // 10 * 10
+    source_samples = (np.arange(1000) - 4) // 10 * 10
     truth = np.sin(2 * np.pi * 0.5 * time)
-    values = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0)
-    stamps = np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
+    values = np.where(source_samples >= 0, truth[np.maximum(source_samples, 0)], 0.0)
+    stamps = np.where(source_samples >= 0, 300.0 + source_samples / RATE, 0.0)
     table = pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps})
-    held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
-    recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
+    hold_options = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
+    recording = read(table, tmp_path, channels=HELD_CHANNELS, held=hold_options)
     at = np.rint(recording.time * RATE).astype(int)
     np.testing.assert_allclose(
         recording["yaw_rate"][at % 10 == 0], truth[at][at % 10 == 0], atol=1e-9
@@ -134,8 +145,8 @@ def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path
     table = pd.concat([circle(2.0), circle(3.0), circle(1.0)], ignore_index=True)
     table.loc[[200, 500], "vx"] = 5596.0
     table.to_csv(tmp_path / "laps.csv", index=False)
-    made = source(tmp_path, time_restarts=True, drop_rows={"laps": [201, "501-"]})
-    recordings = list(made.recordings())
+    restarted_source = source(tmp_path, time_restarts=True, drop_rows={"laps": [201, "501-"]})
+    recordings = list(restarted_source.recordings())
     assert [recording.id for recording in recordings] == ["laps_run_0", "laps_run_1"]
     assert [len(recording) for recording in recordings] == [200, 299]
     assert recordings[1].start_time == pytest.approx(0.01)
@@ -148,13 +159,13 @@ def test_a_pause_begins_a_run_and_one_of_several_can_be_chosen(tmp_path):
     table["t"] += np.repeat([0.0, 10.0, 20.0], [200, 50, 300])
     table.to_csv(tmp_path / "laps.csv", index=False)
     recordings = list(source(tmp_path, max_gap=1.0).recordings())
-    assert [(own.id, len(own), own.start_time) for own in recordings] == [
+    assert [(recording.id, len(recording), recording.start_time) for recording in recordings] == [
         ("laps_run_0", 200, 0.0),
         ("laps_run_1", 300, 20.0),
     ]
     assert source(tmp_path, max_gap=1.0, run=1).read_file(tmp_path / "laps.csv").start_time == 20.0
-    said = "holds no run 2 (0, 1)"
-    assert said in refusal(
+    message = "holds no run 2 (0, 1)"
+    assert message in refusal(
         lambda: source(tmp_path, max_gap=1.0, run=2).read_file(tmp_path / "laps.csv")
     )
 
@@ -164,9 +175,9 @@ def test_excluded_files_are_no_recordings(tmp_path):
         circle(1.0).to_csv(tmp_path / f"{name}.csv", index=False)
     assert source(tmp_path, exclude=["still"]).ids() == ["lap_1", "lap_2"]
     assert list(source(tmp_path, exclude=["lap_*"]).inputs()) == ["still.csv"]
-    own = {"channels": HELD_CHANNELS}
-    held = {"channels": ["vx"], "delay": {"yaw_rate": 0.1}}
-    for options, kind, said in (
+    with_held_channels = {"channels": HELD_CHANNELS}
+    with_held_speed = {"channels": ["vx"], "delay": {"yaw_rate": 0.1}}
+    for options, kind, message in (
         ({"exclude": ["lap"]}, MissingError, "exclude names 'lap', which no file is called"),
         ({"exclude": ["*"]}, MissingError, "exclude leaves none"),
         (
@@ -176,13 +187,17 @@ def test_excluded_files_are_no_recordings(tmp_path):
         ),
         ({"pose": POSE | {"window": 4}}, ConfigurationError, "window must be an odd number"),
         (
-            own | {"held": {"channels": ["ay"]}},
+            with_held_channels | {"held": {"channels": ["ay"]}},
             ConfigurationError,
             "names 'ay', which is not one of the data set's channels",
         ),
-        (own | {"held": held}, ConfigurationError, "delay names 'yaw_rate'"),
+        (
+            with_held_channels | {"held": with_held_speed},
+            ConfigurationError,
+            "delay names 'yaw_rate'",
+        ),
     ):
-        assert said in refusal(lambda options=options: source(tmp_path, **options).ids(), kind)
+        assert message in refusal(lambda options=options: source(tmp_path, **options).ids(), kind)
     assert "has 1000 data rows, and drop_rows names row 1001" in refusal(
         lambda: read(circle(), tmp_path, drop_rows={"lap": [1001]})
     )
@@ -190,15 +205,17 @@ def test_excluded_files_are_no_recordings(tmp_path):
 
 def test_where_channels_were_measured_is_said_in_words(tmp_path):
     centre = {"x": 0.0, "y": 0.0}
-    for options, said in (
+    for options, message in (
         ({"reference_point": "unknown"}, "reference measured at a point that is not known"),
         (
             {"reference_point": centre, "imu_point": {"x": -0.2, "y": 0.0}},
-            "reference measured at the centre of gravity; inertial unit 0.2 m behind the centre of gravity",
+            "reference measured at the centre of gravity; inertial unit 0.2 m behind the centre "
+            "of gravity",
         ),
         (
             {"reference_point": {"x": 0.4, "y": -0.1}},
-            "reference measured 0.4 m ahead of and 0.1 m to the right of the centre of gravity, moved to it",
+            "reference measured 0.4 m ahead of and 0.1 m to the right of the centre of gravity, "
+            "moved to it",
         ),
     ):
-        assert "; ".join(origin_in_words(read(circle(), tmp_path, pose=POSE, **options))) == said
+        assert "; ".join(origin_in_words(read(circle(), tmp_path, pose=POSE, **options))) == message

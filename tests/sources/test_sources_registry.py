@@ -84,8 +84,8 @@ def test_a_simulated_drive_has_the_asked_length_and_rate_and_is_another_with_ano
     assert {"vx", "yaw_rate", "ax", "ay", "vy_ref"} <= set(recording.channels)
     assert [finding for finding in checks_of_recording(recording) if finding.level == "error"] == []
     np.testing.assert_array_equal(source.read("b")["ay"], recording["ay"])
-    other = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
-    assert not np.array_equal(other.read("b")["ay"], recording["ay"])
+    other_source = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
+    assert not np.array_equal(other_source.read("b")["ay"], recording["ay"])
     counted = SimulatedSource(simulated(drives=[drive("a", count=3)]))
     assert (counted.ids(), len({counted.seed_of(name) for name in counted.ids()})) == (
         ["a_001", "a_002", "a_003"],
@@ -140,7 +140,7 @@ def test_sensors_of_a_fleet_differ_and_references_do_not():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"kind": "real"}, "simulated"),
         (
@@ -161,10 +161,12 @@ def test_sensors_of_a_fleet_differ_and_references_do_not():
             "if that is meant, raise it: limits.samples=NUMBER",
         ),
     ],
-    ids=lambda own: str(own)[:40],
+    ids=lambda parameter: str(parameter)[:40],
 )
-def test_a_simulation_that_is_misspelt_or_asks_for_too_much_is_refused_in_one_line(changes, said):
-    assert said in refusal(lambda: SimulatedSource(simulated(**changes)), ConfigurationError)
+def test_a_simulation_that_is_misspelt_or_asks_for_too_much_is_refused_in_one_line(
+    changes, message
+):
+    assert message in refusal(lambda: SimulatedSource(simulated(**changes)), ConfigurationError)
 
 
 TABLE = {
@@ -223,8 +225,8 @@ def test_the_values_of_the_car_change_no_key_of_an_ingest(tmp_path):
     (tmp_path / "a.csv").write_text("time,vx\n0,1\n0.1,1\n", encoding="utf-8")
     dataset = TABLE | {"path": str(tmp_path), "files": "*.csv"}
     keys = {
-        plan_ingest({"dataset": own, "output": str(tmp_path)}).key
-        for own in (dataset, dataset | {"car": {"wheelbase": 2.4}}, dataset | {"car": None})
+        plan_ingest({"dataset": declared, "output": str(tmp_path)}).key
+        for declared in (dataset, dataset | {"car": {"wheelbase": 2.4}}, dataset | {"car": None})
     }
     assert len(keys) == 1
 
@@ -240,7 +242,10 @@ def test_shipped_data_sets_have_the_documented_wheelbase(dataset, wheelbase):
 
 @pytest.fixture
 def speeds(tmp_path, monkeypatch):
-    """A function that installs the source of another package; its name is forgotten after the test."""
+    """A function that installs the source of another package.
+
+    Its name is forgotten after the test.
+    """
     yield partial(install_source, tmp_path / "site", monkeypatch)
     forget_source()
 
@@ -267,14 +272,14 @@ def test_a_source_of_another_package_reads_checks_and_ingests_a_data_set(
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message_part"),
     [
         ("raise RuntimeError('no licence')", "RuntimeError: no licence"),
         ("SpeedSource = 3", "no class"),
     ],
 )
-def test_a_source_of_another_package_that_cannot_be_loaded_is_named(speeds, content, said):
+def test_a_source_of_another_package_that_cannot_be_loaded_is_named(speeds, content, message_part):
     speeds(content)
     message = refusal(lambda: open_source({"name": "x", "source": "speeds"}), ConfigurationError)
     assert "source 'speeds' of another package" in message
-    assert said in message
+    assert message_part in message

@@ -67,7 +67,7 @@ def test_missing_empty_and_incomplete_channel_files_are_named(folder):
     file = folder / "lap" / "vx.txt"
     np.savetxt(file, np.zeros(N - 3))
     assert f"holds {N - 3} samples, the time file {N}" in refused(folder)
-    for text, kind, said in (
+    for text, kind, message in (
         (
             "1\n" * 41 + "spam\n",
             DataError,
@@ -77,7 +77,7 @@ def test_missing_empty_and_incomplete_channel_files_are_named(folder):
         ("\n\n", DataError, "vx.txt' has no rows"),
     ):
         file.write_text(text)
-        assert said in refused(folder, kind)
+        assert message in refused(folder, kind)
     file.unlink()
     assert "vx.txt" in refused(folder, MissingError)
 

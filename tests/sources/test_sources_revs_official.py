@@ -1,4 +1,7 @@
-"""The official CSV layout of the Revs database: known values in, SI units out; whatever is malformed is one line."""
+"""The official CSV layout of the Revs database: known values in, SI units out.
+
+Whatever is malformed is one line.
+"""
 
 import re
 
@@ -146,10 +149,10 @@ def one_second(tmp_path_factory):
 
 @pytest.mark.parametrize("case", MALFORMED)
 def test_a_malformed_csv_is_one_line(root, csv, one_second, case):
-    change, said = MALFORMED[case]
+    change, message_part = MALFORMED[case]
     csv.write_bytes(change(one_second))
     message = refused(root)
-    assert (csv.name in message, bool(re.search(said, message))) == (True, True), message
+    assert (csv.name in message, bool(re.search(message_part, message))) == (True, True), message
 
 
 def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, csv, one_second):
@@ -162,11 +165,11 @@ def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, 
 
 def test_a_malformed_table_of_vehicle_parameters_is_one_line(root, csv, one_second):
     csv.write_bytes(one_second)
-    for content, said in (
+    for content, message_part in (
         ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 is called ''"),
         ("mass\nkg\n1\nabc\n", "parameter 'mass' holds 'abc' in line 4"),
         ("mass\nkg\n1\0\n", "is no table of vehicle parameters"),
     ):
         (root / "revs" / "250lm.csv").write_text(content)
         message = refused(root)
-        assert all(words in message for words in ("250lm.csv", said))
+        assert all(words in message for words in ("250lm.csv", message_part))

@@ -1,4 +1,6 @@
-"""ROS 2 bags written by the test, of a drive in closed form: what comes back, and one clear line for what cannot be used."""
+"""ROS 2 bags written by the test, of a drive in closed form: what comes back, and one clear line
+for what cannot be used.
+"""
 
 import contextlib
 import importlib
@@ -117,19 +119,19 @@ def write_bag(folder, topics, storage="sqlite3", layouts=LAYOUTS, name="lap"):
     folder.mkdir(parents=True, exist_ok=True)
     messages = []
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        for topic, held in topics.items():
-            connection = writer.add_connection(topic, held.type, typestore=types)
-            for k, stamp in enumerate(held.times.tolist()):
-                values = {path: samples[k] for path, samples in held.fields.items()}
-                message = _message(types, held.type, values | {"header.stamp": stamp})
+        for topic, topic_data in topics.items():
+            connection = writer.add_connection(topic, topic_data.type, typestore=types)
+            for k, stamp in enumerate(topic_data.times.tolist()):
+                values = {path: samples[k] for path, samples in topic_data.fields.items()}
+                message = _message(types, topic_data.type, values | {"header.stamp": stamp})
                 messages.append(
                     (
                         START_NS + round(stamp * 1e9),
                         connection,
-                        bytes(types.serialize_cdr(message, held.type)),
+                        bytes(types.serialize_cdr(message, topic_data.type)),
                     )
                 )
-        for stamp_ns, connection, raw in sorted(messages, key=lambda one: one[0]):
+        for stamp_ns, connection, raw in sorted(messages, key=lambda entry: entry[0]):
             writer.write(connection, stamp_ns, raw)
     return path
 
@@ -204,7 +206,9 @@ def folder(bags, tmp_path):
 
 
 def test_a_circle_comes_back_from_its_poses(bags):
-    """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and the stamps' nanoseconds."""
+    """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and
+    the stamps' nanoseconds.
+    """
     recording = read(bags)
     k = np.arange(
         1, WINDOW // 2 + 1
@@ -225,7 +229,10 @@ def test_a_circle_comes_back_from_its_poses(bags):
 
 
 def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags):
-    """Straight lines are exact; a line between samples 2.5 ms apart misses a sine by up to A·(ω·dt)²/8 = 1e-4 m/s²."""
+    """Straight lines are exact.
+
+    A line between samples 2.5 ms apart misses a sine by up to A·(ω·dt)²/8 = 1e-4 m/s².
+    """
     recording = read(bags)
     time = recording.time
     missed = 1.01 * ACCELERATION * (PULSATION / 400) ** 2 / 8
@@ -277,7 +284,10 @@ def test_a_command_is_held_and_a_range_is_cut_out(folder):
 
 
 def test_a_moving_average_removes_what_would_alias(tmp_path):
-    """Vibration at 100 Hz looks like a constant to a recording of 100 Hz; an average over its period removes it."""
+    """Vibration at 100 Hz looks like a constant to a recording of 100 Hz.
+
+    An average over its period removes it.
+    """
     topics = drive()
     imu = topics["/imu"]
     imu.fields["linear_acceleration.y"] = np.cos(2 * np.pi * 100 * (imu.times - imu.times[0]))
@@ -318,56 +328,64 @@ def test_absent_or_empty_topics_other_layouts_long_gaps_and_more_than_the_limits
     tmp_path, bags
 ):
     topics = drive()
-    absent = {name: topic for name, topic in topics.items() if name != "/motor"}
+    without_motor = {name: topic for name, topic in topics.items() if name != "/motor"}
     empty = topics | {"/servo": Topic(topics["/servo"].type, topics["/servo"].times[:0], {})}
-    other = LAYOUTS | {
+    other_layouts = LAYOUTS | {
         "car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"
     }  # numbers would come from the wrong bytes
-    for name, how, said in (
-        ("absent", (absent,), "holds no messages of topic '/motor' (of /body, /imu, /servo)"),
+    for name, layout, message in (
+        (
+            "absent",
+            (without_motor,),
+            "holds no messages of topic '/motor' (of /body, /imu, /servo)",
+        ),
         ("empty", (empty,), "holds no messages of topic '/servo'"),
         (
             "other",
-            (topics, "mcap", other),
+            (topics, "mcap", other_layouts),
             "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one",
         ),
     ):
-        assert said in refused(write_bag(tmp_path / name, *how).parent)
+        assert message in refused(write_bag(tmp_path / name, *layout).parent)
     gap = topic_options("motor", max_gap=0.009)
-    whole = topic_options("servo", type="std_msgs/msg/Int64")
+    full_content = topic_options("servo", type="std_msgs/msg/Int64")
     assert "topic '/servo' carries 'std_msgs/msg/Float64', not 'std_msgs/msg/Int64'" in refused(
-        bags, topics=whole
+        bags, topics=full_content
     )
     assert "topic '/motor': field 'motor.rpm' has a gap of 0.01 s" in refused(bags, topics=gap)
     with use_limits(Limits(samples=250)):
         assert "raise it: limits.samples=NUMBER" in refused(bags)
 
 
-ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SELECT id, 1 AS topic_id, id AS timestamp, 'x' AS data FROM c"
+ENDLESS = (
+    "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SELECT id, 1 AS topic_id, "
+    "id AS timestamp, 'x' AS data FROM c"
+)
 
 
 @pytest.mark.parametrize(
-    ("statements", "said"),
+    ("statements", "message"),
     [
         (["DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"], "missing tables"),
         (["UPDATE messages SET timestamp = -1 WHERE id = 5"], "at no time there is"),
         (
             [
-                "UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"
+                "UPDATE message_definitions SET encoded_message_definition = 'float64 "
+                '__import__("os")\''
             ],
             "is damaged",
         ),
     ],
 )
-def test_a_hostile_database_ends_in_one_line(folder, statements, said):
+def test_a_hostile_database_ends_in_one_line(folder, statements, message):
     with contextlib.closing(sqlite3.connect(folder / "lap" / "lap.db3")) as database, database:
         for statement in statements:
             database.execute(statement)
-    assert said in refused(folder)
+    assert message in refused(folder)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "said"),
+    ("before", "after", "message"),
     [
         ("nanoseconds_since_epoch: 17", "nanoseconds_since_epoch: 9917", "which is no time"),
         ("- lap.db3", "- lap.db3\n  - lap.db3", "holds 2400 messages, the bag says 1200"),
@@ -378,12 +396,12 @@ def test_a_hostile_database_ends_in_one_line(folder, statements, said):
         ),  # it is looked for in the bag's own folder
     ],
 )
-def test_metadata_that_lie_are_refused(folder, before, after, said):
+def test_metadata_that_lie_are_refused(folder, before, after, message):
     metadata = folder / "lap" / "metadata.yaml"
     content = metadata.read_text()
     assert before in content
     metadata.write_text(content.replace(before, after))
-    assert said in refused(folder)
+    assert message in refused(folder)
 
 
 def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
@@ -394,12 +412,12 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
     data = folder / "lap" / "lap.db3"
     metadata = folder / "lap" / "metadata.yaml"
     about = yaml.safe_load(metadata.read_text())
-    told = {
+    options = {
         "compression_format": "zstd",
         "compression_mode": "file",
         "relative_file_paths": ["lap.db3.zstd"],
     }
-    about["rosbag2_bagfile_information"] |= told
+    about["rosbag2_bagfile_information"] |= options
     metadata.write_text(yaml.safe_dump(about))
     content = data.read_bytes()
     data.with_name("lap.db3.zstd").write_bytes(
@@ -431,7 +449,7 @@ def test_the_packed_size_of_a_bag_counts_towards_memory(folder, monkeypatch):
 def test_a_misspelt_declaration_is_refused(bags):
     vx = CHANNELS["vx"]
     topics = topic_options
-    for changes, said in (
+    for changes, message in (
         ({"topics": topics("imu", rate_hz=None)}, "a uniform clock needs"),
         ({"topics": topics("motor", average=0.01)}, "a moving average needs"),
         ({"topics": topics("body", average=0.02)}, "orientations cannot be averaged"),
@@ -444,7 +462,7 @@ def test_a_misspelt_declaration_is_refused(bags):
         ({"channels": {"vx": vx | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topics("servo", stamps="header")}, "have no header; set stamps: received"),
     ):
-        assert said in refused(bags, ConfigurationError, **changes)
+        assert message in refused(bags, ConfigurationError, **changes)
 
 
 def identify(car, root):
@@ -476,7 +494,10 @@ def test_declared_constants_of_tables_are_those_that_the_data_show(data_root):
 
 @pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root):
-    """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
+    """Within two of the standard deviations that the script prints.
+
+    What the publishers' files fix exactly, to a millionth.
+    """
     identified = identify("f1tenth", data_root)
     declared = yaml.safe_load(
         CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root))

@@ -1,4 +1,7 @@
-"""Tables of any make: what pandas reads, in SI units and ISO 8855 signs; and one clear line for what cannot be used."""
+"""Tables of any make: what pandas reads, in SI units and ISO 8855 signs.
+
+And one clear line for what cannot be used.
+"""
 
 import bz2
 import gzip
@@ -103,22 +106,24 @@ def test_without_a_time_column_the_rate_is_given(tmp_path):
 
 
 def test_a_stored_recording_is_read_as_what_it_is(tmp_path):
-    kept = Recording(
+    stored = Recording(
         "lap", "kart", 20.0, 450.0, {"ay": np.arange(4.0)}, "simulated", provenance={"seed": 3}
     )
-    write_recording(kept, tmp_path / "lap.parquet")
+    write_recording(stored, tmp_path / "lap.parquet")
     recording = read(tmp_path / "lap.parquet")
-    assert recording["ay"].tolist() == kept["ay"].tolist()
+    assert recording["ay"].tolist() == stored["ay"].tolist()
     assert (recording.rate_hz, recording.start_time, recording.kind) == (20.0, 450.0, "simulated")
 
 
 def test_recordings_are_the_stems_in_order(tmp_path):
     for name in ("b.csv", "a.csv", "a.txt"):
         written(tmp_path, HEADER + rows(3), name)
-    found = source(tmp_path, files="*.csv")
-    assert (found.ids(), list(found.inputs())) == (["a", "b"], ["a.csv", "b.csv"])
-    assert [recording.id for recording in found.recordings()] == ["a", "b"]
-    assert "has no recording 'c' (it has a, b)" in refusal(lambda: found.read("c"), MissingError)
+    csv_source = source(tmp_path, files="*.csv")
+    assert (csv_source.ids(), list(csv_source.inputs())) == (["a", "b"], ["a.csv", "b.csv"])
+    assert [recording.id for recording in csv_source.recordings()] == ["a", "b"]
+    assert "has no recording 'c' (it has a, b)" in refusal(
+        lambda: csv_source.read("c"), MissingError
+    )
     assert "two files are called 'a'" in refusal(source(tmp_path).ids)
 
 
@@ -150,15 +155,15 @@ BAD_TABLES = {
 
 @pytest.mark.parametrize("fault", BAD_TABLES)
 def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path, fault):
-    content, said = BAD_TABLES[fault]
+    content, message_part = BAD_TABLES[fault]
     file = written(tmp_path, content)
     columns = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ay", "unit": "m/s²"}}
     message = refusal(lambda: read(file, channels=columns))
-    assert [words for words in (f"'{file}'", *said) if words not in message] == []
+    assert [words for words in (f"'{file}'", *message_part) if words not in message] == []
 
 
 def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path):
-    for options, said in (
+    for options, message_part in (
         ({"time": None}, "rate_hz must be given"),
         ({"gappy": ["ay"], "channels": {"vx": {"column": "a", "unit": "m/s"}}}, "gappy names 'ay'"),
         ({"encoding": "latin-x"}, "dataset.encoding: 'latin-x' is not known"),
@@ -173,7 +178,7 @@ def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path):
         ({"name": "../evil"}, "must be made of letters"),
     ):
         message = refusal(lambda options=options: source(tmp_path, **options), ConfigurationError)
-        assert said in message
+        assert message_part in message
         assert message.startswith("data set" if "name" in options else "data set 'mine'")
 
 
@@ -184,25 +189,25 @@ def runs_csv(tmp_path, runs):
     return source(tmp_path, files="*.csv", runs="run_id")
 
 
-def test_each_run_becomes_a_recording_with_its_own_start_and_runs_that_cannot_be_told_apart_are_refused(
+def test_each_run_is_a_recording_with_its_start_and_ambiguous_runs_are_refused(
     tmp_path,
 ):
-    found = runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10)
-    assert found.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
-    recordings = list(found.recordings())
+    runs_source = runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10)
+    assert runs_source.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
+    recordings = list(runs_source.recordings())
     assert [recording.start_time for recording in recordings] == [0.0, 0.2, 0.5]
     np.testing.assert_array_equal(
         np.concatenate([recording["vx"] for recording in recordings]), np.arange(60)
     )
     assert recordings[1].provenance["run"] == 3
-    for runs, said in (
+    for runs, message_part in (
         ([1, 1, 2, 2, 1, 1], "run 1 begins again in data row 5"),
         (
             [1, 1, 1.5, 1.5],
             "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers",
         ),
     ):
-        assert f"'{tmp_path / 'lap.csv'}': {said}" in refusal(runs_csv(tmp_path, runs).ids)
+        assert f"'{tmp_path / 'lap.csv'}': {message_part}" in refusal(runs_csv(tmp_path, runs).ids)
     assert len(runs_csv(tmp_path, [4] * 9).read_file(tmp_path / "lap.csv")) == 9
     message = refusal(lambda: runs_csv(tmp_path, [4] * 9 + [5] * 9).read_file(tmp_path / "lap.csv"))
     assert "holds 2 runs (4, 5); name one by +dataset.run=4" in message
@@ -278,12 +283,12 @@ def test_packed_tables_that_unpack_to_too_much_are_refused_within_the_limit_on_m
 def test_an_honest_packed_table_is_read_within_the_limit_and_cells_count_beside_the_text(tmp_path):
     rows_of = b"".join(b"%.2f,5.25,0.125\n" % (k / 100) for k in range(2000))
     file = written(tmp_path, gzip.compress(b"time,vx,ay\n" + rows_of), "lap.csv.gz")
-    taken = len(rows_of) + len(b"time,vx,ay\n") + 16 * 3 * 2001
-    beyond = taken - 10 * file.stat().st_size
-    with use_limits(Limits(memory=beyond)):
+    needed_bytes = len(rows_of) + len(b"time,vx,ay\n") + 16 * 3 * 2001
+    beyond_limit = needed_bytes - 10 * file.stat().st_size
+    with use_limits(Limits(memory=beyond_limit)):
         assert len(read(file)) == 2000
-    with use_limits(Limits(memory=beyond - 1)):
-        assert f"unpacks to {taken} bytes" in refusal(lambda: read(file))
+    with use_limits(Limits(memory=beyond_limit - 1)):
+        assert f"unpacks to {needed_bytes} bytes" in refusal(lambda: read(file))
 
 
 def test_missing_samples_are_bridged_or_end_a_recording_by_max_gap(tmp_path):

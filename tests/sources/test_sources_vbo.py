@@ -1,4 +1,7 @@
-"""Logs of a VBOX: what is read, in which units and on which clock; what is left out, found and refused."""
+"""Logs of a VBOX: what is read, in which units and on which clock.
+
+What is left out, found and refused.
+"""
 
 import re
 
@@ -24,7 +27,7 @@ def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path)
     true = drive()
     assert (recording.id, recording.rate_hz, len(recording)) == ("lap", 100.0, 1000)
     assert recording.start_time == pytest.approx(38_870.45)
-    for name, own in (
+    for name, column in (
         ("vx", "vx"),
         ("yaw_rate", "yaw_rate"),
         ("ax", "ax"),
@@ -32,7 +35,7 @@ def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path)
         ("vy_ref", "vy"),
     ):
         assert np.allclose(
-            recording[name], true[own], rtol=0, atol=1e-4 if name == "vx" else 1e-7
+            recording[name], true[column], rtol=0, atol=1e-4 if name == "vx" else 1e-7
         ), name
     about = recording.provenance
     assert about["slip_offsets_lateral_longitudinal_m"] == {
@@ -99,19 +102,19 @@ def test_missing_samples_end_a_recording_where_max_gap_says_so(tmp_path):
     first, second = open_source(dataset(tmp_path, max_gap=0.5)).recordings()
     assert (len(first), len(second)) == (400, 500)
     at = np.delete(np.arange(1000), np.s_[400:500])
-    got = np.concatenate([first["vx"], second["vx"]])
-    np.testing.assert_allclose(got, drive()["vx"][at], atol=1e-4)
+    speed = np.concatenate([first["vx"], second["vx"]])
+    np.testing.assert_allclose(speed, drive()["vx"][at], atol=1e-4)
 
 
 def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
-    known = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
-    assert read_log(tmp_path / "lap.vbo").units == known | dict(
+    units = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
+    assert read_log(tmp_path / "lap.vbo").units == units | dict(
         zip(COLUMNS.split()[-7:], UNITS, strict=True)
     )
     write_log(tmp_path / "lap.vbo", units=("rad", "km/h", "rad/s", "g", "g", "°", "°"))
-    said = "column 'YawRate', for channel 'yaw_rate', is in 'rad/s' by the file and in 'deg/s'"
-    assert said in refusal(lambda: read(tmp_path))
+    message = "column 'YawRate', for channel 'yaw_rate', is in 'rad/s' by the file and in 'deg/s'"
+    assert message in refusal(lambda: read(tmp_path))
 
 
 def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path):
@@ -139,8 +142,8 @@ def test_columns_of_a_bus_are_the_car_s_own(tmp_path):
     section = "\r\n".join(["[module Information]", *modules, "", "", "[column names]"]).encode()
     (tmp_path / "lap.vbo").write_bytes(content.replace(b"[column names]", section))
     devices = {column.name: column.device for column in survey(tmp_path / "lap.vbo").columns}
-    own = COLUMNS.split()[-7]
-    assert devices == {name: "car" if name == own else "reference" for name in devices}
+    last_column = COLUMNS.split()[-7]
+    assert devices == {name: "car" if name == last_column else "reference" for name in devices}
 
 
 @pytest.mark.parametrize(
@@ -157,9 +160,9 @@ def test_a_damaged_log_is_one_clear_line(tmp_path, old, new, message):
     content = (tmp_path / "lap.vbo").read_bytes()
     assert old in content
     (tmp_path / "lap.vbo").write_bytes(content.replace(old, new, 1))
-    said = refusal(lambda: read(tmp_path))
-    assert "lap.vbo" in said
-    assert re.search(message, said)
+    message_part = refusal(lambda: read(tmp_path))
+    assert "lap.vbo" in message_part
+    assert re.search(message, message_part)
 
 
 def test_a_stray_time_of_day_is_no_midnight():

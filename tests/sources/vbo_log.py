@@ -4,12 +4,17 @@ import numpy as np
 
 RATE = 100.0
 AXLES = {"FL": (0.031, 1.790), "RL": (0.031, -1.060)}
-COLUMNS = "sats time lat long velocity heading height vert-vel Longacc Latacc event-1 SWA Lat._Vel. YawRate X_Accel Y_Accel Slip_FL Slip_RL"
+COLUMNS = (
+    "sats time lat long velocity heading height vert-vel Longacc Latacc event-1 SWA Lat._Vel. "
+    "YawRate X_Accel Y_Accel Slip_FL Slip_RL"
+)
 UNITS = ("rad", "km/h", "°/s", "g", "g", "°", "°")
 
 
 def drive(seconds=10.0):
-    """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²], in ISO 8855 axes, (T,) each."""
+    """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²],
+    in ISO 8855 axes, (T,) each.
+    """
     t = np.arange(round(seconds * RATE)) / RATE
     vx = 20.0 + np.sin(t / 3.0)
     yaw_rate = 0.3 * np.sin(t)
@@ -32,7 +37,10 @@ def clock(seconds):
 
 
 def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
-    """Write a log from a clock time on [s]; ``swapped``: lateral and longitudinal offsets of slip change places; ``end`` comes last."""
+    """Write a log from a clock time on [s].
+
+    ``swapped``: lateral and longitudinal offsets of slip change places; ``end`` comes last.
+    """
     d = drive()
     n = len(d["vx"])
     slip = []
@@ -49,8 +57,14 @@ def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
     rows = []
     for k, stamp in enumerate(clock(first + np.arange(n) / RATE)):
         velocity, turn, ax, ay, vy = (values[k] for values in numbers)
-        begin = f"053 {stamp} +3608.25426832 -1087.02882814 {velocity:07.4f} 195.27 +0040.11 -0000.01 +0000.00 +0000.00 0.000000"
-        rest = f"{0.02:+.6E} {vy:+.9E} {turn:+.9E} {ax:+.9E} {ay:+.9E} {slip[0][k]:+.9E} {slip[1][k]:+.9E} "
+        begin = (
+            f"053 {stamp} +3608.25426832 -1087.02882814 {velocity:07.4f} 195.27 +0040.11 "
+            f"-0000.01 +0000.00 +0000.00 0.000000"
+        )
+        rest = (
+            f"{0.02:+.6E} {vy:+.9E} {turn:+.9E} {ax:+.9E} {ay:+.9E} {slip[0][k]:+.9E} "
+            f"{slip[1][k]:+.9E} "
+        )
         rows.append(f"{begin} {rest}")
     offsets = [
         f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}"

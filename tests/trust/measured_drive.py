@@ -1,4 +1,6 @@
-"""Drives of a linear single track with noise on every channel, and with wheel speeds where they are wanted."""
+"""Drives of a linear single track with noise on every channel, and with wheel speeds where they are
+wanted.
+"""
 
 from dataclasses import replace
 from functools import cache

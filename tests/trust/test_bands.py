@@ -1,4 +1,6 @@
-"""Bands: calibration against planted scales and exchangeable blocks, kernel against numpy, and what is written and read back."""
+"""Bands: calibration against planted scales and exchangeable blocks, kernel against numpy, and what
+is written and read back.
+"""
 
 import math
 from dataclasses import replace
@@ -40,7 +42,10 @@ ORIGIN = {
 
 
 def piece_of(rng, n, deviation=0.1, variance=math.nan):
-    """A range at 20 Hz whose error grows with |ay|, σ² = deviation² + (0.05 ay)²; one error a block of 100 samples, and noise."""
+    """A range at 20 Hz whose error grows with |ay|, σ² = deviation² + (0.05 ay)².
+
+    One error a block of 100 samples, and noise.
+    """
     rows = rng.standard_normal((n, 5)) * [0.3, 3.0, 3.0, 1.0, 0.05] + [0.0, 25.0, 0.0, 0.0, 0.0]
     sigma = np.sqrt(deviation**2 + (0.05 * rows[:, 2]) ** 2)
     shared = np.repeat(rng.standard_normal(n // 100 + 1), 100)[:n]
@@ -63,7 +68,7 @@ def bands_of(seed=0, **changes):
     )
 
 
-def test_scale_follows_a_planted_growth_with_acceleration_and_that_of_a_filter_its_variance_and_a_floor():
+def test_scale_follows_planted_growth_with_acceleration_or_filter_variance():
     rng = np.random.default_rng(1)
     terms = np.stack(
         [np.ones(200_000), 3.0 * rng.standard_normal(200_000), rng.standard_normal(200_000)], axis=1
@@ -90,7 +95,7 @@ def test_band_is_wider_where_errors_are_and_a_filters_takes_its_variance():
     assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
 
 
-def test_pooled_quantile_of_blocks_of_one_is_that_of_split_conformal():
+def test_pooled_quantile_of_single_samples_equals_split_conformal():
     scores = np.random.default_rng(3).exponential(size=40)
     for level in LEVELS:
         rank = math.ceil(level * 41)  # Lei et al. 2018, Theorem 2.2
@@ -111,7 +116,10 @@ def test_each_block_counts_once_and_blocks_that_say_nothing_as_their_samples():
 
 
 def test_coverage_of_a_further_block_averages_the_level():
-    """Over 4000 draws of 12 blocks of unlike sizes and a further one; tolerance: three standard errors, each about 0.006 at 0.5."""
+    """Over 4000 draws of 12 blocks of unlike sizes and a further one.
+
+    Tolerance: three standard errors, each about 0.006 at 0.5.
+    """
     rng = np.random.default_rng(4)
     covered = {level: np.empty(4000) for level in (0.5, 0.68, 0.9)}
     for draw in range(4000):
@@ -121,15 +129,16 @@ def test_coverage_of_a_further_block_averages_the_level():
             np.exp(0.7 * rng.standard_normal(13))[blocks]
             * (rng.standard_normal(13)[blocks] + rng.standard_normal(len(blocks)))
         )
-        seen = blocks < 12
-        for level, own in covered.items():
-            own[draw] = np.mean(
-                scores[~seen] <= pooled_quantile(scores[seen], blocks[seen], level)[0]
+        is_calibration = blocks < 12
+        for level, coverage in covered.items():
+            coverage[draw] = np.mean(
+                scores[~is_calibration]
+                <= pooled_quantile(scores[is_calibration], blocks[is_calibration], level)[0]
             )
-    for level, own in covered.items():
-        error = own.std() / math.sqrt(len(own))
+    for level, coverage in covered.items():
+        error = coverage.std() / math.sqrt(len(coverage))
         assert (
-            level - 3.0 * error <= own.mean() <= level + 0.02
+            level - 3.0 * error <= coverage.mean() <= level + 0.02
         )  # with all weight of K at infinity it would be up to 1/13 more
 
 
@@ -143,13 +152,13 @@ def by_numpy(bands, rows, vy, variance, *, elsewhere):
         OTHER_VEHICLE if elsewhere else 1.0
     )
     half = []
-    for own, feature in (
+    for channel_bands, feature in (
         (bands.vy, terms),
         (bands.sideslip, terms / np.maximum(np.abs(rows[:, [1]]), LOWEST_SPEED)),
     ):
-        weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
-        scale = np.sqrt(np.maximum(np.square(feature) @ weights, own.floor**2))
-        half.append(scale * wider * own.factors[LEVELS.index(CHANNEL_LEVEL)])
+        weights = np.array([channel_bands.weights.get(name, 0.0) for name in TERMS])
+        scale = np.sqrt(np.maximum(np.square(feature) @ weights, channel_bands.floor**2))
+        half.append(scale * wider * channel_bands.factors[LEVELS.index(CHANNEL_LEVEL)])
     half[1] = np.where(half[1] < math.pi, half[1], math.pi)
     return np.where(np.isfinite(vy)[:, None], np.stack(half, axis=1), np.nan)
 
@@ -159,44 +168,51 @@ def by_numpy(bands, rows, vy, variance, *, elsewhere):
 def test_kernel_agrees_with_numpy(variance, elsewhere):
     bands = bands_of(variance=variance)
     rng = np.random.default_rng(6)
-    own = piece_of(rng, 300, variance=variance)
-    rows = own.rows * 2.0
-    vy = own.vy.copy()
-    spread = own.variance.copy()
+    piece = piece_of(rng, 300, variance=variance)
+    rows = piece.rows * 2.0
+    vy = piece.vy.copy()
+    spread = piece.variance.copy()
     rows[10, 0] = np.nan
     rows[20, 1] = np.nan
     vy[30] = np.nan
     spread[40] = -1.0
     rows[50, 1] = 0.0
-    found = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
+    half_widths = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
     np.testing.assert_allclose(
-        found, by_numpy(bands, rows, vy, spread, elsewhere=elsewhere), rtol=1e-13, equal_nan=True
+        half_widths,
+        by_numpy(bands, rows, vy, spread, elsewhere=elsewhere),
+        rtol=1e-13,
+        equal_nan=True,
     )
 
 
-def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are():
+def test_bands_agree_row_by_row_and_are_finite_where_estimates_are():
     packed = bands_of().packed()
-    own = piece_of(np.random.default_rng(7), 50)
+    piece = piece_of(np.random.default_rng(7), 50)
     together = np.empty((50, 2))
-    one = np.empty((1, 2))
-    band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
+    single_row = np.empty((1, 2))
+    unchecked = np.zeros(50)
+    band_rows(
+        piece.rows, piece.vy, piece.variance, unchecked, packed.columns, packed.numbers, together
+    )
     for k in range(50):
         band_rows(
-            own.rows[k : k + 1],
-            own.vy[k : k + 1],
-            own.variance[k : k + 1],
+            piece.rows[k : k + 1],
+            piece.vy[k : k + 1],
+            piece.variance[k : k + 1],
+            unchecked[k : k + 1],
             packed.columns,
             packed.numbers,
-            one,
+            single_row,
         )
-        assert np.array_equal(one[0], together[k])
+        assert np.array_equal(single_row[0], together[k])
     bands = bands_of()
-    own = piece_of(np.random.default_rng(8), 20)
-    rows = own.rows.copy()
-    vy = own.vy.copy()
+    piece = piece_of(np.random.default_rng(8), 20)
+    rows = piece.rows.copy()
+    vy = piece.vy.copy()
     rows[:10] = np.nan
     vy[15] = np.nan
-    half = bands.half_widths(rows, vy, own.variance)
+    half = bands.half_widths(rows, vy, piece.variance)
     assert np.isfinite(half).all(axis=1).tolist() == [k != 15 for k in range(20)]
     assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
 
@@ -223,7 +239,7 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewher
     )  # 20 s at 20 Hz, a turn each 2.5 s
     labels, kind = block_labels([yaw_rate] * 10, [400] * 10, 20.0)
     assert kind == "range"
-    assert [own[0] for own in labels] == list(range(10))
+    assert [block_of[0] for block_of in labels] == list(range(10))
     labels, kind = block_labels([yaw_rate, None], [400, 50], 20.0)
     assert kind == "turn"
     assert (
@@ -236,7 +252,7 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewher
     assert np.flatnonzero(np.diff(labels)).tolist() == [49, 99]
 
 
-def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
+def test_bands_record_their_calibration_and_need_a_reference():
     bands = bands_of()
     assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (
         ("my car",),
@@ -257,19 +273,23 @@ def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
 def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
     rng = np.random.default_rng(10)
     n = 100
-    own = piece_of(rng, n)
-    measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, own.rows.T, strict=True)))
+    piece = piece_of(rng, n)
+    measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, piece.rows.T, strict=True)))
     estimate = Estimate(
-        "lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])}
+        "lap",
+        "some",
+        20.0,
+        0.0,
+        {"vy": piece.vy, "sideslip": np.arctan2(piece.vy, piece.rows[:, 1])},
     )
     ahead = replace(bands_of(), horizon_steps=1)
-    found = with_bands(estimate, measured, ahead)
-    expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])
+    banded = with_bands(estimate, measured, ahead)
+    expected = ahead.half_widths(piece.rows[:-1], piece.vy[1:], piece.variance[1:])
     np.testing.assert_allclose(
-        np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13
+        np.stack([banded["band_vy"], banded["band_sideslip"]], 1)[1:], expected, rtol=1e-13
     )
     rows, _, variance = band_inputs(estimate, measured, CHANNELS, 0)
-    assert np.array_equal(rows, own.rows)
+    assert np.array_equal(rows, piece.rows)
     assert np.isnan(variance).all()
 
 

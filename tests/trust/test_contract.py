@@ -1,4 +1,6 @@
-"""The contract of running online, held for every family by one wrapper, whatever the samples are."""
+"""The contract of running online, held for every family by one wrapper, whatever the
+samples are.
+"""
 
 import math
 import warnings
@@ -75,20 +77,16 @@ def test_a_drive_without_faults_is_estimated_as_without_the_contract(name):
 
 @pytest.mark.parametrize("name", estimator_names())
 @pytest.mark.parametrize("seed", range(2))
-def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_online_as_in_batch(
-    name, seed
-):
+def test_hostile_samples_leave_finite_bounded_estimates_equal_online_and_batch(name, seed):
     estimator = ready(name)
     drive = short_drive(estimator)
     samples = hostile_columns(estimator, drive, seed)
     batch = GuardedRun(estimator)(samples, drive)
-    one_by_one = online(estimator, samples)
-    np.testing.assert_allclose(batch["vy"], one_by_one, rtol=0.0, atol=1e-9)
+    stepped = online(estimator, samples)
+    np.testing.assert_allclose(batch["vy"], stepped, rtol=0.0, atol=1e-9)
     after = estimator.warm_up_steps + estimator.horizon_steps
-    assert np.isfinite(one_by_one[after:]).all()
-    assert "vx" not in drive or np.abs(one_by_one[after:]).max() <= max(
-        np.abs(drive["vx"]).max(), 1.0
-    )
+    assert np.isfinite(stepped[after:]).all()
+    assert "vx" not in drive or np.abs(stepped[after:]).max() <= max(np.abs(drive["vx"]).max(), 1.0)
 
 
 VARIANTS = (  # settings that change what a filter carries from sample to sample
@@ -105,11 +103,11 @@ VARIANTS = (  # settings that change what a filter carries from sample to sample
     ("name", "settings"), [*((name, {}) for name in estimator_names()), *VARIANTS]
 )
 @pytest.mark.parametrize("has_faults", [False, True])
-def test_a_recording_in_parts_is_estimated_as_the_whole(name, settings, has_faults):
+def test_estimating_in_parts_equals_estimating_the_undivided_recording(name, settings, has_faults):
     estimator = fitted(name, **CONFIGS.get(name, {}) | settings)
     drive = short_drive(estimator)
     samples = hostile_columns(estimator, drive, seed=3) if has_faults else columns(estimator, drive)
-    whole = GuardedRun(estimator)(samples, drive)
+    at_once = GuardedRun(estimator)(samples, drive)
     run = GuardedRun(estimator)
     if not run.takes_parts:
         pytest.skip("its recordings are joined before it estimates")
@@ -120,15 +118,15 @@ def test_a_recording_in_parts_is_estimated_as_the_whole(name, settings, has_faul
         for part in (drive.part(slice(first, end)),)
     ]
     tolerance = 1e-6 if name == "sideslip_ffnn" else 1e-12
-    for channel, expected in whole.channels.items():
+    for channel, expected in at_once.channels.items():
         joined_parts = np.concatenate([part[channel] for part in parts])
         np.testing.assert_allclose(
             joined_parts, expected, rtol=0.0, atol=tolerance, err_msg=channel
         )
-    if whole.covariance is not None:
+    if at_once.covariance is not None:
         np.testing.assert_allclose(
             np.concatenate([part.covariance for part in parts]),
-            whole.covariance,
+            at_once.covariance,
             rtol=1e-9,
             atol=1e-12,
         )
@@ -137,10 +135,10 @@ def test_a_recording_in_parts_is_estimated_as_the_whole(name, settings, has_faul
 @pytest.mark.parametrize(
     "name", [name for name in estimator_names() if not name.startswith("learned_ukf")]
 )
-def test_one_bad_sample_does_no_lasting_harm(name):
+def test_a_bad_sample_does_no_lasting_harm(name):
     estimator = ready(name)
     drive = short_drive(estimator)
-    whole = online(estimator, columns(estimator, drive))
+    undisturbed = online(estimator, columns(estimator, drive))
     at = len(drive) // 3
     later = len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
     values = HOSTILE[:-1]  # 0 is a value like any other
@@ -151,7 +149,7 @@ def test_one_bad_sample_does_no_lasting_harm(name):
     }:
         samples = columns(estimator, drive)
         samples[channel][at] = value
-        difference = np.abs(online(estimator, samples) - whole)
+        difference = np.abs(online(estimator, samples) - undisturbed)
         assert np.nanmax(difference[later:]) < 0.05, (channel, value)
 
 
@@ -196,33 +194,33 @@ def moving(k):
     return {"yaw_rate": 0.2 + 1e-4 * k, "vx": 20.0 + 1e-3 * k, "ay": 4.0 + 1e-3 * k}
 
 
-def test_an_estimate_never_exceeds_what_the_speed_allows_and_a_lost_estimator_starts_anew():
+def test_an_estimate_is_bounded_by_speed_and_a_lost_estimator_starts_anew():
     estimator = Saying(lambda step: 0.5 if step < 10 else 500.0)
     stepper = GuardedStepper(estimator)
-    said = [stepper.step(moving(k))["vy"] for k in range(40)]
-    assert max(said) <= 20.1
+    vy = [stepper.step(moving(k))["vy"] for k in range(40)]
+    assert max(vy) <= 20.1
     assert estimator.begun == 3  # 10 good samples and 0.3 s beyond the bound each
-    assert said[10] == pytest.approx(20.0, abs=0.1)
-    assert said[17] == 0.5
+    assert vy[10] == pytest.approx(20.0, abs=0.1)
+    assert vy[17] == 0.5
 
 
-def test_a_car_that_stands_has_no_sideslip_and_one_that_slides_across_has():
+def test_sideslip_is_zero_at_standstill_but_not_when_sliding_across():
     stepper = GuardedStepper(Saying(lambda step: 0.05 if step < 5 else 0.2))
-    said = [
+    sideslip = [
         stepper.step({"yaw_rate": 0.01 * k, "vx": 0.01 * k, "ay": 0.01 * k})["sideslip"]
         for k in range(10)
     ]
-    assert said == [0.0] * 5 + [pytest.approx(math.atan2(0.2, 0.01 * k)) for k in range(5, 10)]
+    assert sideslip == [0.0] * 5 + [pytest.approx(math.atan2(0.2, 0.01 * k)) for k in range(5, 10)]
 
 
 def test_an_estimator_that_breaks_down_starts_anew():
     estimator = Saying(lambda step: math.nan if step == 5 else float(step))
     stepper = GuardedStepper(estimator)
-    said = [stepper.step(moving(k))["vy"] for k in range(8)]
-    assert np.isfinite(said).all()
-    assert said[4] == 4.0
-    assert 3.5 < said[5] < 4.0  # fades from the last one
-    assert said[6] == 0.0
+    vy = [stepper.step(moving(k))["vy"] for k in range(8)]
+    assert np.isfinite(vy).all()
+    assert vy[4] == 4.0
+    assert 3.5 < vy[5] < 4.0  # fades from the last one
+    assert vy[6] == 0.0
     assert estimator.begun == 2
 
 
@@ -247,7 +245,7 @@ def test_an_exception_of_an_estimator_is_passed_on_online_and_on_a_recording(err
         GuardedRun(Defective(estimator.settings))(drive.channels, drive)
 
 
-def test_none_missing_channels_and_words_count_as_not_measured_and_repeated_samples_are_passed_over():
+def test_invalid_samples_count_as_missing_and_repeated_samples_are_skipped():
     estimator = Saying(lambda step: 1.0)
     stepper = GuardedStepper(estimator)
     for sample in (SAMPLE, None, {}, {"vx": None, "yaw_rate": "?"}, SAMPLE):
@@ -273,22 +271,22 @@ def test_v_fades_over_a_long_gap_and_a_new_start_follows():
     stepper = GuardedStepper(estimator)
     for k in range(5):
         stepper.step(moving(k))
-    said = [stepper.step(None)["vy"] for _ in range(40)]
-    assert said[:10] == [2.0] * 10  # bridged
-    assert said[10:] == pytest.approx([2.0 * math.exp(-0.05 * k) for k in range(1, 31)])
+    vy = [stepper.step(None)["vy"] for _ in range(40)]
+    assert vy[:10] == [2.0] * 10  # bridged
+    assert vy[10:] == pytest.approx([2.0 * math.exp(-0.05 * k) for k in range(1, 31)])
     assert stepper.marks & EXTRAPOLATED
     assert stepper.step(moving(60))["vy"] == 2.0
     assert stepper.marks & STARTED
     assert estimator.begun == 2
 
 
-def test_a_clock_at_another_rate_and_the_delay_of_the_filter_are_said_and_a_slower_bus_refused():
+def test_clock_rate_is_warned_of_filter_delay_stated_and_a_slow_bus_refused():
     stepper = GuardedStepper(Saying(lambda step: 0.0))
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for k in range(60):
             stepper.step(moving(k), 0.1 * k)
-    assert [str(warning.message) for warning in said] == [
+    assert [str(warning.message) for warning in caught] == [
         "samples come at 10 Hz instead of 20 Hz; set bus_rate_hz=10"
     ]
     assert GuardedStepper(ready("ksnn"), bus_rate_hz=100.0).delay == pytest.approx(0.0509, abs=1e-3)
@@ -305,10 +303,10 @@ def test_a_spinning_car_may_slide_as_fast_as_it_drove_and_is_marked():
     watch = Watch(usual_limits(("vx", "yaw_rate", "ay"), 20.0), 0, 20.0)
     drive = np.tile([20.0, 0.2, 4.0], (20, 1))
     spin = np.tile([3.0, 2.5, 0.5], (20, 1))  # ay - u r = -7 m/s²
-    said = watch(np.full(40, 15.0), np.concatenate([drive, spin]), np.zeros(40, np.int8))
-    assert (said.vy[26:36] == 15.0).all()  # the speed before is remembered for seconds
-    assert (said.marks[26:] & SPINNING > 0).all()
-    assert not (said.marks[26:36] & CLIPPED).any()
+    watched = watch(np.full(40, 15.0), np.concatenate([drive, spin]), np.zeros(40, np.int8))
+    assert (watched.vy[26:36] == 15.0).all()  # the speed before is remembered for seconds
+    assert (watched.marks[26:] & SPINNING > 0).all()
+    assert not (watched.marks[26:36] & CLIPPED).any()
     calm = Watch(usual_limits(("vx", "yaw_rate", "ay"), 20.0), 0, 20.0)
     slow = np.tile([3.0, 0.2, 0.6], (20, 1))
     assert (
@@ -329,7 +327,7 @@ def test_offline_estimators_and_missing_channels_are_refused():
 @pytest.mark.parametrize(
     ("bus", "rate", "milliseconds"), [(1000.0, 100.0, 10.3), (100.0, 20.0, 50.9)]
 )
-def test_front_end_delays_by_about_one_interval_of_the_estimator(bus, rate, milliseconds):
+def test_front_end_delays_by_about_an_interval_of_the_estimator(bus, rate, milliseconds):
     front = FrontEnd(("ay",), (), usual_limits(("ay",), rate), bus, rate)
     assert 1e3 * front.delay == pytest.approx(milliseconds, abs=0.05)
 
@@ -391,7 +389,7 @@ SPIKES = {"vx": 1.5, "yaw_rate": 0.4, "ay": 5.0, "ax": 5.0, "steer": 0.08}
         ("dugoff_ukf", {}),
     ],
 )
-def test_one_plausible_wrong_sample_disturbs_no_more_with_the_contract_than_without(name, settings):
+def test_contract_does_not_amplify_a_plausible_wrong_sample(name, settings):
     estimator, trust, drive = calibrated(name, **settings)
     samples = columns(estimator, drive)
     guarded = GuardedRun(estimator, trust)(samples, drive)["vy"]
@@ -417,8 +415,10 @@ def test_one_plausible_wrong_sample_disturbs_no_more_with_the_contract_than_with
 
 
 @pytest.mark.parametrize("name", ["learned_ukf", "cnn_ukf"])
-def test_one_ay_of_0_disturbs_trained_filters_no_more_with_the_contract_than_without(name):
-    """Root mean square over 8 s: at most 0.014 m/s of either, which the contract leaves or reduces."""
+def test_contract_does_not_amplify_a_zero_ay_sample_of_trained_filters(name):
+    """Root mean square over 8 s: at most 0.014 m/s of either, which the contract leaves or
+    reduces.
+    """
     estimator, trust, drive = calibrated(name)
     samples = columns(estimator, drive)
     guarded = GuardedRun(estimator, trust)(samples, drive)["vy"]

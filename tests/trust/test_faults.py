@@ -1,4 +1,6 @@
-"""Each kind of fault does to its channel what it says, nothing to any other, and the same for the same seed."""
+"""Each kind of fault does to its channel what it says, nothing to any other, and the same for the
+same seed.
+"""
 
 import math
 from pathlib import Path
@@ -41,14 +43,14 @@ def faulted(samples, kind, channel, severity="medium", **options):
 def test_only_the_channel_changes_and_only_while_the_fault_lasts(samples, kind, severity):
     channel = "vx" if kind == "lost_wheel" else "ay"
     before = {name: values.copy() for name, values in samples.items()}
-    made = inject(samples, RATE, Fault(kind, channel, severity, ONSET, DURATION, seed=3))
+    faulty = inject(samples, RATE, Fault(kind, channel, severity, ONSET, DURATION, seed=3))
     for name, values in before.items():
         np.testing.assert_array_equal(samples[name], values)
         if name != channel:
-            np.testing.assert_array_equal(made[name], values)
+            np.testing.assert_array_equal(faulty[name], values)
     for outside in (slice(0, FIRST), slice(END, None)):
-        np.testing.assert_array_equal(made[channel][outside], before[channel][outside])
-    assert not np.array_equal(made[channel][FIRST:END], before[channel][FIRST:END])
+        np.testing.assert_array_equal(faulty[channel][outside], before[channel][outside])
+    assert not np.array_equal(faulty[channel][FIRST:END], before[channel][FIRST:END])
 
 
 def test_offsets_are_physical_of_either_sign_and_the_same_again(samples):
@@ -73,11 +75,11 @@ def test_offsets_are_physical_of_either_sign_and_the_same_again(samples):
     }
     assert signs == {-1.0, 1.0}
     for kind in KINDS:
-        one, other = (
+        first, again = (
             faulted(samples, kind, "vx" if kind == "lost_wheel" else "ay", seed=5)[1]
             for _ in range(2)
         )
-        np.testing.assert_array_equal(one, other, err_msg=kind)
+        np.testing.assert_array_equal(first, again, err_msg=kind)
 
 
 def test_drift_scale_spikes_and_sign_are_of_their_sizes(samples):
@@ -129,15 +131,15 @@ def test_frozen_and_lost_samples_are_as_many_as_the_severity_says(samples):
         assert np.abs(after[struck]).min() >= 10 * CHANNELS["ay"].high
 
 
-def test_noise_has_the_standard_deviation_that_it_says_short_faults_strike_and_gaps_stay(samples):
+def test_noise_has_its_stated_deviation_short_faults_strike_and_gaps_stay(samples):
     long = {"ay": np.zeros(40_000)}
     noise = inject(long, RATE, Fault("noise", "ay", "medium"))["ay"]
     assert noise.std() == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * len(noise))), (
         "within four standard errors"
     )
     assert abs(noise[1:] @ noise[:-1]) / len(noise) < 4.0 / math.sqrt(len(noise)), "white"
-    made = inject(samples, RATE, Fault("inf", "ay", "mild", ONSET, 1.0 / RATE))["ay"]
-    assert np.flatnonzero(~np.isfinite(made)).tolist() == [FIRST]
+    faulty = inject(samples, RATE, Fault("inf", "ay", "mild", ONSET, 1.0 / RATE))["ay"]
+    assert np.flatnonzero(~np.isfinite(faulty)).tolist() == [FIRST]
     samples["ay"] = np.where(np.arange(600) % 7 == 0, np.nan, samples["ay"])
     after = faulted(samples, "saturation", "ay", "severe")[1]
     np.testing.assert_array_equal(np.isnan(after), np.isnan(samples["ay"][FIRST:END]))
@@ -169,18 +171,18 @@ def test_a_lost_wheel_drops_out_spins_or_locks(samples):
     assert locked[2] == pytest.approx(0.5 * before[2]), "within 0.2 s"
 
 
-def test_a_fault_lasts_from_its_onset_on_and_every_kind_is_for_some_channel_and_none_for_a_reference():
-    for onset, duration, found in (
+def test_faults_start_at_onset_and_each_kind_fits_a_channel_but_no_reference():
+    for onset, duration, samples in (
         (0.0, math.inf, (0, 600)),
         (10.0, 8.0, (200, 360)),
         (29.9, 5.0, (598, 600)),
         (40.0, 5.0, (600, 600)),
     ):
-        assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
+        assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == samples
     for kind in KINDS:
         assert any(applies(kind, channel) for channel in CHANNELS), kind
         assert not any(
-            applies(kind, channel) for channel, own in CHANNELS.items() if own.is_reference
+            applies(kind, channel) for channel, entry in CHANNELS.items() if entry.is_reference
         )
     tried = ("vx", "wheel_speed_rr", "ay", "yaw_rate", "brake_pressure_rear")
     assert [channel for channel in tried if applies("sign", channel)] == ["ay", "yaw_rate"]
@@ -193,7 +195,8 @@ def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
     assert not is_fault("nominal")
     with pytest.raises(
         ConfigurationError,
-        match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate",
+        match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; "
+        r"there are: vx, yaw_rate",
     ):
         inject(samples, RATE, Fault("bias", "handwheel", "mild"))
 
@@ -215,7 +218,7 @@ def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
         (("nan", "ay", "mild", 0.0, 1.0, 0, 1.5), "must be a share above 0, up to 1, not 1.5"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(arguments, message):
+def test_a_senseless_fault_is_refused_in_a_line(arguments, message):
     assert message in refusal(lambda: Fault(*arguments), ConfigurationError)
 
 

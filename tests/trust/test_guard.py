@@ -44,7 +44,7 @@ def test_a_drive_without_faults_passes_as_it_is_once_every_channel_was_there(dri
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e6, -70.0, 30.0])
-def test_a_value_that_no_car_reaches_holds_the_last_one(drive, value):
+def test_an_impossible_value_is_replaced_by_the_last_valid_value(drive, value):
     rows = rows_of(drive)
     rows[100, 2] = value
     cleaned = guard()(rows)
@@ -64,7 +64,7 @@ def test_a_channel_is_missing_for_as_long_as_another_can_be_skipped(drive):
     assert (guard(("ay", "yaw_rate"))(rows).flow == WAIT).sum() == 90
 
 
-def test_a_spike_is_left_aside_a_new_level_believed_and_a_frozen_channel_not_measured(drive):
+def test_a_spike_is_skipped_a_new_level_accepted_a_frozen_channel_unmeasured(drive):
     rows = rows_of(drive)
     rows[100, 2] += 12.0
     rows[200:, 2] += 12.0
@@ -87,8 +87,10 @@ def test_gaps_up_to_half_a_second_are_bridged_and_longer_ones_start_anew(drive, 
     assert (flow == WAIT).sum() == max(samples - 10, 0)
 
 
-@pytest.mark.parametrize(("held", "believed"), [("at its lock", True), ("on the way there", False)])
-def test_a_steering_that_stands_still_is_believed_at_its_lock_alone(drive, held, believed):
+@pytest.mark.parametrize(
+    ("position", "believed"), [("at its lock", True), ("on the way there", False)]
+)
+def test_a_steering_that_stands_still_is_believed_at_its_lock_alone(drive, position, believed):
     steer = np.clip(0.4 * np.sin(0.5 * drive.time), -0.3, 0.35)
     driven = Recording("driven", "car", RATE, 0.0, {"vx": drive["vx"], "steer": steer})
     limits = learn_limits([driven], ("vx", "steer"), RATE)
@@ -101,32 +103,34 @@ def test_a_steering_that_stands_still_is_believed_at_its_lock_alone(drive, held,
 
 
 def test_speeds_have_no_lock_and_standing_cars_no_frozen_channels(drive):
-    standing = np.minimum(drive["vx"], np.median(drive["vx"]))
-    limits = learn_limits([Recording("slow", "car", RATE, 0.0, {"vx": standing})], ("vx",), RATE)
+    clipped_speed = np.minimum(drive["vx"], np.median(drive["vx"]))
+    limits = learn_limits(
+        [Recording("slow", "car", RATE, 0.0, {"vx": clipped_speed})], ("vx",), RATE
+    )
     assert limits.channels["vx"].stops == (-1e300, 1e300)
-    still = planar_drive(20.0)
-    rows = rows_of(still)
+    moving = planar_drive(20.0)
+    rows = rows_of(moving)
     rows[100:300] = 0.0
-    limits = learn_limits([still], CHANNELS, RATE)
-    one_by_one = guard(limits=limits)
-    measured = np.concatenate([one_by_one(rows[k : k + 1]).measured for k in range(len(rows))])
+    limits = learn_limits([moving], CHANNELS, RATE)
+    stepped = guard(limits=limits)
+    measured = np.concatenate([stepped(rows[k : k + 1]).measured for k in range(len(rows))])
     assert measured[110:300].all()
 
 
-def test_limits_are_never_tighter_than_what_a_car_reaches(drive):
+def test_limits_are_never_tighter_than_the_range_of_a_car(drive):
     gentle = Recording("gentle", "car", RATE, 0.0, {name: 0.1 * drive[name] for name in CHANNELS})
     limits = learn_limits([gentle], CHANNELS, RATE)
     usual = usual_limits(CHANNELS, RATE)
-    for name, own in limits.channels.items():
-        assert own.low <= usual.channels[name].low
-        assert own.high >= usual.channels[name].high
+    for name, channel_limits in limits.channels.items():
+        assert channel_limits.low <= usual.channels[name].low
+        assert channel_limits.high >= usual.channels[name].high
         assert (
-            own.jump
+            channel_limits.jump
             >= usual.channels[name].jump - {"vx": 2.0, "yaw_rate": 0.5}.get(name, 6.0) - 1e-12
         )
 
 
-def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
+def test_guard_row_by_row_equals_guard_at_once_to_the_last_bit(drive):
     generator = np.random.default_rng(3)
     rows = rows_of(drive)
     for _ in range(60):
@@ -137,9 +141,9 @@ def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
         )
     limits = GuardLimits({"ay": ChannelLimits(-20.0, 20.0, 2.0, 0.2)})
     at_once = guard(("ay",), limits)
-    one_by_one = guard(("ay",), limits)
+    stepped = guard(("ay",), limits)
     together = at_once(rows)
-    parts = [one_by_one(rows[k : k + 1]) for k in range(len(rows))]
+    parts = [stepped(rows[k : k + 1]) for k in range(len(rows))]
     for name in ("rows", "measured", "flow"):
         assert np.array_equal(
             getattr(together, name),

@@ -1,4 +1,7 @@
-"""Health: healthy drives are not flagged, faults are, each with its reason; online agrees with batch to the last bit."""
+"""Health: healthy drives are not flagged, faults are, each with its reason.
+
+Online agrees with batch to the last bit.
+"""
 
 import math
 import os
@@ -66,14 +69,14 @@ def reason_channel(code):
     return NAMES.get(round(code) % 10_000 // 100, "")
 
 
-def usual_reason(found, begin, end):
-    return Counter(found.reason[begin:end].tolist()).most_common(1)[0][0]
+def usual_reason(health, begin, end):
+    return Counter(health.reason[begin:end].tolist()).most_common(1)[0][0]
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_a_healthy_drive_that_was_not_learnt_from_is_valid(seed):
-    found = judged(model_of(), measured_drive(seed))
-    assert np.mean(found.status == VALID) > 0.999
+    health = judged(model_of(), measured_drive(seed))
+    assert np.mean(health.status == VALID) > 0.999
 
 
 FAULTS = {
@@ -93,27 +96,29 @@ FAULTS = {
 def test_planted_faults_are_flagged_with_their_reason(fault):
     channel, change, kind, seconds = FAULTS[fault]
     drive = measured_drive(3)
-    found = judged(model_of(), drive, **{channel: after(drive[channel], change)})
-    assert (found.status[ONSET - 50 : ONSET] == VALID).all()
-    assert (found.status[ONSET : ONSET + round(seconds * RATE)] > VALID).any()
-    reason = usual_reason(found, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
-    alike = (
+    health = judged(model_of(), drive, **{channel: after(drive[channel], change)})
+    assert (health.status[ONSET - 50 : ONSET] == VALID).all()
+    assert (health.status[ONSET : ONSET + round(seconds * RATE)] > VALID).any()
+    reason = usual_reason(health, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
+    equivalent_channels = (
         {"steer"} if fault == "offset of the yaw rate" else set()
     )  # the steering angle's relation holds as little as with an offset of its own
     assert reason_kind(reason) == kind, reason_in_words(reason)
-    assert reason_channel(reason) in {channel} | alike, reason_in_words(reason)
+    assert reason_channel(reason) in {channel} | equivalent_channels, reason_in_words(reason)
 
 
 def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other():
     model = model_of(("yaw_rate", "vx", "ay", "ax"))
     drive = measured_drive(3)
-    found = judged(model, drive, ay=after(drive["ay"], np.negative))
-    reason = usual_reason(found, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
+    health = judged(model, drive, ay=after(drive["ay"], np.negative))
+    reason = usual_reason(health, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
     assert reason_in_words(reason) == "ay and yaw_rate contradict each other"
 
 
 def sliding(seed, slide=0.0):
-    """A drive in which v grows by ``slide`` [m/s] and back within 2 s while the car turns, without a change of r or u."""
+    """A drive in which v grows by ``slide`` [m/s] and back within 2 s while the car turns, without
+    a change of r or u.
+    """
     drive = measured_drive(seed)
     ramp = np.zeros(len(measured_drive(seed)))
     first = ONSET + int(np.argmax(np.abs(drive["yaw_rate"][ONSET : ONSET + 1000]))) - 50
@@ -130,7 +135,10 @@ def sliding(seed, slide=0.0):
 def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(
     channels, accused
 ):
-    """v r of a slide of 3 m/s is in ax. It is known from ay; without ay it has to go with r², which it does in grip alone."""
+    """v r of a slide of 3 m/s is in ax. It is known from ay.
+
+    Without ay it has to go with r², which it does in grip alone.
+    """
     model = learn_health([sliding(0), sliding(1)], [sliding(2)], channels, RATE)
     rows = np.ascontiguousarray(sliding(3, 3.0).stack(channels))
     statistics = np.empty((len(rows), len(model.statistics)))
@@ -139,18 +147,18 @@ def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of
     )
     at = [
         k
-        for k, one in enumerate(model.statistics)
-        if (one.kind, one.channel) == (kernel.CONTRADICTION, "ax")
+        for k, statistic in enumerate(model.statistics)
+        if (statistic.kind, statistic.channel) == (kernel.CONTRADICTION, "ax")
     ]
     assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
 
 
-def test_noise_jumps_and_lost_channels_are_told():
+def test_noise_jumps_and_lost_channels_are_reported():
     drive = measured_drive(3)
-    found = judged(model_of(), drive, ay=after(drive["ay"], math.nan))
-    assert found.status[ONSET] == DEGRADED
-    assert found.status[ONSET + round(0.6 * RATE)] == INVALID
-    assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
+    health = judged(model_of(), drive, ay=after(drive["ay"], math.nan))
+    assert health.status[ONSET] == DEGRADED
+    assert health.status[ONSET + round(0.6 * RATE)] == INVALID
+    assert reason_in_words(health.reason[ONSET]) == "ay is not measured"
     drive = measured_drive(3)
     generator = np.random.default_rng(0)
     noisy = judged(
@@ -171,13 +179,13 @@ def test_a_flag_is_taken_back_after_the_fault():
     drive = measured_drive(3)
     part = np.array(drive["yaw_rate"])
     part[ONSET : ONSET + 100] += 0.05
-    found = judged(model_of(), drive, yaw_rate=part)
-    assert found.status[ONSET + round(0.1 * RATE) : ONSET + 100].all()
-    assert found.status[ONSET + 100 : ONSET + 100 + round(HOLD_SECONDS * RATE)].all()
-    assert not found.status[ONSET + round(20 * RATE) :].any()
+    health = judged(model_of(), drive, yaw_rate=part)
+    assert health.status[ONSET + round(0.1 * RATE) : ONSET + 100].all()
+    assert health.status[ONSET + 100 : ONSET + 100 + round(HOLD_SECONDS * RATE)].all()
+    assert not health.status[ONSET + round(20 * RATE) :].any()
 
 
-def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
+def test_health_row_by_row_equals_health_at_once_to_the_last_bit():
     model = model_of()
     drive = measured_drive(4)
     rows = np.ascontiguousarray(drive.stack(CHANNELS))
@@ -187,16 +195,16 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
     rows[2600] = np.inf
     measured = np.isfinite(rows)
     packed = model.packed()
-    whole = health_rows(packed, rows, measured, model.start())
+    at_once = health_rows(packed, rows, measured, model.start())
     state = model.start()
     single = [
         health_rows(packed, rows[k : k + 1], measured[k : k + 1], state) for k in range(len(rows))
     ]
     for name in Health._fields:
         np.testing.assert_array_equal(
-            np.concatenate([getattr(part, name) for part in single]), getattr(whole, name)
+            np.concatenate([getattr(part, name) for part in single]), getattr(at_once, name)
         )
-    assert np.isfinite(whole.ratio).all()
+    assert np.isfinite(at_once.ratio).all()
 
 
 def test_without_compilation_health_is_the_same(tmp_path):
@@ -211,11 +219,16 @@ def test_without_compilation_health_is_the_same(tmp_path):
     file = tmp_path / "health.npz"
     compiled = health_rows(model.packed(), rows, measured, model.start())
     np.savez(file, tables=model.packed(), rows=rows, measured=measured, start=model.start())
-    program = "import sys, numpy as np; from vehest.trust.health import health_rows; own = np.load(sys.argv[1])\n"
-    program += (
-        "found = health_rows(own['tables'], own['rows'], own['measured'], own['start'].copy())\n"
+    program = "\n".join(
+        (
+            "import sys, numpy as np",
+            "from vehest.trust.health import health_rows",
+            "inputs = np.load(sys.argv[1])",
+            "tables, rows, measured = inputs['tables'], inputs['rows'], inputs['measured']",
+            "health = health_rows(tables, rows, measured, inputs['start'].copy())",
+            "np.savez(sys.argv[1], status=health.status, reason=health.reason)",
+        )
     )
-    program += "np.savez(sys.argv[1], status=found.status, reason=found.reason)"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", program, str(file)], env=environment, check=True)
     plain = np.load(file)
@@ -231,14 +244,14 @@ def test_senseless_values_leave_nothing_behind():
     healthy = health_rows(model.packed(), rows, np.isfinite(rows), model.start())
     for place, value in enumerate((1e200, -1e300, math.inf, math.nan, 1e7)):
         rows[1000 + 10 * place, place] = value
-    found = health_rows(model.packed(), rows, np.ones(rows.shape, bool), model.start())
-    assert (found.status[[1000, 1010, 1020, 1030, 1040]] > VALID).all()
-    assert np.isfinite(found.ratio).all()
+    health = health_rows(model.packed(), rows, np.ones(rows.shape, bool), model.start())
+    assert (health.status[[1000, 1010, 1020, 1030, 1040]] > VALID).all()
+    assert np.isfinite(health.ratio).all()
     later = slice(1040 + round(30 * RATE), None)
-    np.testing.assert_allclose(found.ratio[later], healthy.ratio[later], rtol=0.2, atol=0.05)
+    np.testing.assert_allclose(health.ratio[later], healthy.ratio[later], rtol=0.2, atol=0.05)
 
 
-def test_a_channel_that_never_moved_in_training_is_watched_and_a_glitch_of_the_recording_no_limit():
+def test_constant_training_channel_is_watched_and_a_training_glitch_sets_no_limit():
     drives = [
         replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))})
         for drive in map(measured_drive, range(4))
@@ -266,12 +279,12 @@ def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
         ("ay", lambda part: part / 9.81),
         ("motor_speed", lambda part: part[0]),
     ):
-        found = judged(model, drives[3], **{channel: after(drives[3][channel], change)})
-        assert (found.status[ONSET : ONSET + 100] > VALID).any(), channel
+        health = judged(model, drives[3], **{channel: after(drives[3][channel], change)})
+        assert (health.status[ONSET : ONSET + 100] > VALID).any(), channel
 
 
 @pytest.mark.parametrize("braking", [False, True])
-def test_a_locked_wheel_is_told_from_a_lost_one(braking):
+def test_a_locked_wheel_is_distinguished_from_a_lost_wheel_speed(braking):
     model = model_of((*CHANNELS, *WHEELS))
     drive = measured_drive(3)
     slows = np.clip(1.0 - np.arange(len(drive) - ONSET) / (0.2 * RATE), 0.0, 1.0)
@@ -285,12 +298,12 @@ def test_a_locked_wheel_is_told_from_a_lost_one(braking):
         faulty["wheel_speed_fl"] = after(
             drive["wheel_speed_fl"], lambda part: (part - slowing / 0.3) * slows
         )
-    found = judged(model, drive, **faulty)
-    words = reason_in_words(found.reason[ONSET + round(0.5 * RATE)])
+    health = judged(model, drive, **faulty)
+    words = reason_in_words(health.reason[ONSET + round(0.5 * RATE)])
     assert words == ("locked wheel: wheel_speed_fl" if braking else "lost wheel: wheel_speed_fl")
 
 
-def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_another_rate():
+def test_saved_health_models_report_data_outside_training_and_other_rates():
     model = model_of()
     drive = measured_drive(3)
     fast = {name: np.array(drive[name]) for name in CHANNELS}
@@ -320,17 +333,17 @@ def ferrari(data_root, start, stop):
     return real_drive(data_root).cut(start, stop).without_references()
 
 
-def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(
+def test_the_ferrari_is_flagged_at_its_steering_glitches_and_rarely_elsewhere(
     data_root,
 ):
     train = ferrari(data_root, 150.0, 450.0)
     validation = ferrari(data_root, 450.0, 550.0)
     model = learn_health([train], [validation], CHANNELS, 100.0)
-    found = judged(model, validation)
+    health = judged(model, validation)
     at = [round((seconds - 450.0) * 100.0) for seconds in (503.49, 524.85)]
-    assert (found.status[at] > VALID).all()
-    assert all(reason_channel(found.reason[k]) == "steer" for k in at)
-    assert not found.status[: at[0]].any()
+    assert (health.status[at] > VALID).all()
+    assert all(reason_channel(health.reason[k]) == "steer" for k in at)
+    assert not health.status[: at[0]].any()
     turned = judged(model, validation, yaw_rate=after(validation["yaw_rate"], np.degrees))
     assert turned.status[ONSET] == INVALID
 
@@ -355,8 +368,8 @@ def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root):
     ):
         changed = np.array(runs[3][channel])
         changed[first:] = change(changed[first:])
-        found = judged(model, runs[3], **{channel: changed})
-        assert (found.status[first : first + 300] > VALID).any(), channel
+        health = judged(model, runs[3], **{channel: changed})
+        assert (health.status[first : first + 300] > VALID).any(), channel
 
 
 def test_a_steering_at_its_lock_is_not_frozen(data_root):
@@ -371,10 +384,10 @@ def test_a_steering_at_its_lock_is_not_frozen(data_root):
     at_lock = real_drive(
         data_root, "hoons_all_test_run_21", "f1tenth"
     ).without_references()  # stays at full lock for 5 s
-    found = judged(model, at_lock)
+    health = judged(model, at_lock)
     assert kernel.FROZEN not in {
         reason_kind(code)
-        for code, status in zip(found.reason, found.status, strict=True)
+        for code, status in zip(health.reason, health.status, strict=True)
         if status > VALID
     }
     half = np.array(at_lock["steer"])
@@ -398,8 +411,10 @@ def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged():
     front = FrontEnd(CHANNELS, (), usual_limits(CHANNELS, slow), RATE, slow)
     passed = [front(row[None]) for row in drive.stack(CHANNELS)]
     rows = np.concatenate([row for row in passed if row is not None])
-    found = health_rows(model.packed(behind_front_end=True), rows, np.isfinite(rows), model.start())
-    assert (found.status > VALID).mean() < 0.02
+    health = health_rows(
+        model.packed(behind_front_end=True), rows, np.isfinite(rows), model.start()
+    )
+    assert (health.status > VALID).mean() < 0.02
     frozen = rows.copy()
     frozen[len(rows) // 2 :, 0] = frozen[len(rows) // 2, 0]
     flagged = health_rows(

@@ -18,13 +18,13 @@ def planted(samples, seed=0):
     """Samples of an autoregression of order 2 around (3, -1)."""
     generator = np.random.default_rng(seed)
     noise = generator.multivariate_normal(np.zeros(2), COVARIANCE, samples)
-    found = np.zeros((samples, 2))
+    series = np.zeros((samples, 2))
     for k in range(2, samples):
-        found[k] = COEFFICIENTS[0] @ found[k - 1] + COEFFICIENTS[1] @ found[k - 2] + noise[k]
-    return found + np.array([3.0, -1.0])
+        series[k] = COEFFICIENTS[0] @ series[k - 1] + COEFFICIENTS[1] @ series[k - 2] + noise[k]
+    return series + np.array([3.0, -1.0])
 
 
-def test_the_planted_autoregression_is_found_with_its_order_whatever_outliers_do():
+def test_the_planted_autoregression_and_its_order_are_fitted_despite_outliers():
     model = fit_autoregression([planted(20_000, seed) for seed in range(2)], max_order=6)
     assert model.order == 2
     np.testing.assert_allclose(model.coefficients, COEFFICIENTS, atol=0.03)
@@ -44,7 +44,7 @@ def test_the_planted_autoregression_is_found_with_its_order_whatever_outliers_do
     )
 
 
-def test_innovations_move_by_what_the_filter_makes_of_a_signature():
+def test_innovations_move_by_the_filtered_signature():
     model = fit_autoregression([planted(5000)], max_order=4)
     healthy = planted(300, seed=5)
     signature = np.zeros((300, 2))
@@ -54,14 +54,14 @@ def test_innovations_move_by_what_the_filter_makes_of_a_signature():
         moved[model.order :], filtered(model, signature)[model.order :], atol=1e-9
     )
     model = Autoregression(np.zeros(1), np.array([[[0.5]], [[0.1]]]), np.ones((1, 1)))
-    found = model.innovations(np.arange(5.0)[:, None])[:, 0]
+    innovations = model.innovations(np.arange(5.0)[:, None])[:, 0]
     np.testing.assert_allclose(
-        found[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2]
+        innovations[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2]
     )
-    assert np.isnan(found[:2]).all()
+    assert np.isnan(innovations[:2]).all()
 
 
-def test_noise_that_grows_with_the_speed_is_found():
+def test_noise_levels_that_grow_with_speed_are_recovered():
     generator = np.random.default_rng(0)
     speed = generator.uniform(10.0, 50.0, 50_000)
     levels = learn_noise_levels(
@@ -89,24 +89,24 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
         delays.append(
             int(np.flatnonzero(above)[0]) + 1
         )  # samples from the onset of a known fault to its alarm
-    found = np.array(delays, np.float64)
+    delay_samples = np.array(delays, np.float64)
     assert abs(
-        found.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))
-    ) < 3.0 * found.std() / math.sqrt(len(found))
+        delay_samples.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))
+    ) < 3.0 * delay_samples.std() / math.sqrt(len(delay_samples))
 
 
-def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once():
+def test_the_oracle_detects_larger_faults_sooner_and_lost_samples_at_once():
     oracle = learn_oracle(
         [measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE
     )
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
-    seen = [
+    detections = [
         oracle.detects(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000)
         for slope in (1e-4, 0.3, 1.0, 5.0)
     ]
-    assert [each.is_detectable for each in seen] == [False, True, True, True]
-    assert seen[1].delay > seen[2].delay > seen[3].delay > 0.0
+    assert [detection.is_detectable for detection in detections] == [False, True, True, True]
+    assert detections[1].delay > detections[2].delay > detections[3].delay > 0.0
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     lost = np.array(drive["yaw_rate"])
     lost[2010:2020] = np.nan

@@ -1,4 +1,6 @@
-"""A damaged trust.yaml is one line or harmless: never an internal error, never a number beyond what can be learnt."""
+"""A damaged trust.yaml is one line or harmless: never an internal error, never a number beyond what
+can be learnt.
+"""
 
 import shutil
 from functools import cache
@@ -46,19 +48,19 @@ def answers(folder):
         stepper = GuardedStepper(model, trust, 100.0)
     except VehestError as error:
         return str(error)
-    found = [estimate[name] for name in CHANNELS if name in estimate.channels]
+    outputs = [estimate[name] for name in CHANNELS if name in estimate.channels]
     for k in range(50):
         step = stepper.step(dict.fromkeys(model.channels, 1.0 + 0.01 * k), 0.01 * k)
-        found.append(np.array([step.get(name, np.nan) for name in CHANNELS]))
-    return found
+        outputs.append(np.array([step.get(name, np.nan) for name in CHANNELS]))
+    return outputs
 
 
-def is_sane(found):
+def is_sane(outputs):
     """Whether estimates and bands stay within what limits that can be learnt allow."""
-    vy, sideslip, *rest = found
-    health = rest[-52]
-    band_vy = rest[0] if len(rest) == 54 else np.zeros(1)
-    band_sideslip = rest[1] if len(rest) == 54 else np.zeros(1)
+    vy, sideslip, *further_channels = outputs
+    health = further_channels[-52]
+    band_vy = further_channels[0] if len(further_channels) == 54 else np.zeros(1)
+    band_sideslip = further_channels[1] if len(further_channels) == 54 else np.zeros(1)
     largest_band = 1e3 * MAX_FACTOR * MAX_TERM**2 / MIN_TERM
     return bool(
         np.nanmax(np.abs(vy)) <= MAX_TAN_SIDESLIP * MAX_TOP_SPEED
@@ -70,11 +72,13 @@ def is_sane(found):
     )
 
 
-def same(found, right):
-    return len(found) == len(right) and all(map(np.array_equal, found, right, [True] * len(right)))
+def are_equal(outputs, expected):
+    return len(outputs) == len(expected) and all(
+        map(np.array_equal, outputs, expected, [True] * len(expected))
+    )
 
 
-def test_every_mutation_of_trust_yaml_is_refused_in_one_line_or_leaves_sane_numbers(folder):
+def test_every_mutation_of_trust_yaml_is_refused_or_leaves_sane_numbers(folder):
     path = folder / TRUST
     text = path.read_text(encoding="utf-8")
     right = answers(folder)
@@ -82,14 +86,14 @@ def test_every_mutation_of_trust_yaml_is_refused_in_one_line_or_leaves_sane_numb
     counts = {"refused": 0, "same bits": 0, "other numbers": 0}
     for name, mutated in mutations(text, N_MUTATIONS).items():
         path.write_text(mutated, encoding="utf-8")
-        found = answers(folder)
-        if isinstance(found, str):
-            assert "\n" not in found, name
+        outputs = answers(folder)
+        if isinstance(outputs, str):
+            assert "\n" not in outputs, name
             counts["refused"] += 1
-        elif same(found, right):
+        elif are_equal(outputs, right):
             counts["same bits"] += 1
         else:
-            assert is_sane(found), name
+            assert is_sane(outputs), name
             counts["other numbers"] += 1
     assert sum(counts.values()) >= N_MUTATIONS
     assert counts["refused"] > N_MUTATIONS // 2, counts
@@ -102,13 +106,13 @@ def test_something_else_than_a_file_is_refused_and_never_counts_as_no_calibratio
     text = path.read_text(encoding="utf-8")
     path.unlink()
     place(kind, path, text)
-    found = answers(folder)
+    outputs = answers(folder)
     if kind == "link to the file":
-        assert same(found, right)
+        assert are_equal(outputs, right)
     else:
-        assert isinstance(found, str)
-        assert str(path) in found
-        assert "\n" not in found
+        assert isinstance(outputs, str)
+        assert str(path) in outputs
+        assert "\n" not in outputs
 
 
 @pytest.mark.parametrize("entries", [1, 60])
@@ -116,31 +120,33 @@ def test_further_channels_of_bands_are_refused(folder, entries):
     path = folder / TRUST
     trust = read_trust(folder)
     text = path.read_text(encoding="utf-8")
-    further = "".join(f"  - wheel_speed_{place}\n" for place in ("fl", "fr", "rl", "rr") * 15)
-    further = "".join(further.splitlines(keepends=True)[:entries])
+    extra_channels = "".join(
+        f"  - wheel_speed_{place}\n" for place in ("fl", "fr", "rl", "rr") * 15
+    )
+    extra_channels = "".join(extra_channels.splitlines(keepends=True)[:entries])
     begin = text.index("  channels:\n", text.index("bands:\n")) + len("  channels:\n")
     assert trust.bands is not None
-    path.write_text(text[:begin] + further + text[begin:], encoding="utf-8")
-    found = answers(folder)
-    assert isinstance(found, str)
-    assert "channel" in found
+    path.write_text(text[:begin] + extra_channels + text[begin:], encoding="utf-8")
+    message = answers(folder)
+    assert isinstance(message, str)
+    assert "channel" in message
 
 
 def test_the_file_of_another_model_is_refused(folder, tmp_path):
-    other = tmp_path / "other"
-    shutil.copytree(YESTERDAY / "models" / "gru", other)  # same channels, rate and horizon
-    shutil.copy(other / TRUST, folder / TRUST)
+    other_model = tmp_path / "other"
+    shutil.copytree(YESTERDAY / "models" / "gru", other_model)  # same channels, rate and horizon
+    shutil.copy(other_model / TRUST, folder / TRUST)
     assert "about.estimator is gru" in answers(folder)
     shutil.copy(pretrained_folder() / TRUST, folder / TRUST)  # of the same family
     assert "belongs to another model" in answers(folder)
 
 
-def test_a_model_that_was_changed_since_is_refused_and_words_for_people_are_not_part_of_it(folder):
+def test_a_changed_model_is_refused_but_a_changed_note_is_not(folder):
     description = folder / "model.yaml"
     text = description.read_text(encoding="utf-8")
     right = answers(folder)
     description.write_text(text.replace("about:\n", "about:\n  note: mine\n", 1), encoding="utf-8")
-    assert same(answers(folder), right)
+    assert are_equal(answers(folder), right)
     description.write_text(text.replace("polyphase", "nearest"), encoding="utf-8")
     assert isinstance(answers(folder), str)
 
@@ -152,7 +158,7 @@ def test_a_file_that_names_no_model_is_used_with_a_remark(folder):
     open_model(str(folder), folder.parent, remarks.append)
     assert len(remarks) == 1
     assert "does not say which model" in remarks[0]
-    assert same(answers(folder), right)
+    assert are_equal(answers(folder), right)
 
 
 @pytest.mark.parametrize("name", ["pretrained", "self_calibrating"])
@@ -164,7 +170,9 @@ def test_the_models_that_come_with_vehest_name_themselves(name):
 
 
 def test_bands_of_a_filter_without_ax_count_it_as_not_measured():
-    """The columns of the bands are those of the channels that are read, also where a setting leaves one out."""
+    """The columns of the bands are those of the channels that are read, also where a setting leaves
+    one out.
+    """
     _, model, trust = open_model("self_calibrating", Path("nowhere"), lambda remark: None)
     fewer = with_settings(model, {"measured_ax": False})
     assert fewer.channels == ("yaw_rate", "vx", "ay")

@@ -24,7 +24,9 @@ def code(kind, channel):
 
 
 def heeded(kind, channel, *, adapts=False, starts_anew=True, status=2, first=10, last=40):
-    """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
+    """Rows, what was measured and the flow after a fault that health sees from ``first`` to
+    ``last``.
+    """
     statuses = np.zeros(STEPS)
     reasons = np.zeros(STEPS)
     statuses[first:last] = status
@@ -61,13 +63,13 @@ def test_accused_channels_are_left_out_unless_needed_or_merely_suspected():
 
 
 @pytest.mark.parametrize("kind", [kernel.OUTSIDE, kernel.SPIN, kernel.MISSING])
-def test_what_is_no_fault_of_a_sensor_changes_nothing(kind):
+def test_a_verdict_that_is_no_sensor_fault_changes_nothing(kind):
     rows, _, flow = heeded(kind, "ay")
     assert np.isfinite(rows).all()
     assert (flow == USE).all()
 
 
-def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
+def test_recursive_families_restart_once_and_adaptive_ones_every_second():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
     assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
     assert np.flatnonzero(
@@ -100,7 +102,7 @@ def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
     assert np.array_equal(flow, heeded(kernel.SCALE, "vx", adapts=True, starts_anew=False)[2])
 
 
-def test_a_fault_shorter_than_a_second_starts_nothing_anew_however_long_its_flag_is_degraded():
+def test_a_fault_shorter_than_a_second_restarts_nothing():
     statuses = np.zeros(STEPS)
     statuses[10:19] = 2.0
     statuses[19:55] = 1.0
@@ -123,7 +125,7 @@ def test_a_fault_shorter_than_a_second_starts_nothing_anew_however_long_its_flag
         assert (flow == USE).all()
 
 
-def test_the_verdict_names_what_guard_and_watch_know():
+def test_the_verdict_names_the_reasons_of_guard_and_watch():
     marks = np.array([0, 0, SPINNING, CLIPPED, EXTRAPOLATED], np.int8)
     measured = np.ones((5, 3), np.bool_)
     measured[1, 1] = False
@@ -133,8 +135,8 @@ def test_the_verdict_names_what_guard_and_watch_know():
         np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason
     )
     assert status.tolist() == [0, 1, 1, 2, 2]
-    said = [reason_in_words(own) for own in reason]
-    assert said == [
+    reasons_text = [reason_in_words(reason_code) for reason_code in reason]
+    assert reasons_text == [
         "",
         "vx is not measured",
         "spin",
@@ -165,7 +167,7 @@ def test_filters_with_parameters_as_states_adapt_and_do_not_start_anew(name, con
     assert monitor.starts_anew != adapts
 
 
-def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_degrees():
+def test_a_band_widens_with_worse_health_and_is_invalid_beyond_six_degrees():
     bands = np.full((4, 2), 0.1)
     marks = np.array([0, 0, 0, EXTRAPOLATED], np.int8)
     widen_rows(
@@ -181,7 +183,8 @@ def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_de
     assert bands[3].tolist() == pytest.approx(
         [2.0, max(0.4, math.atan(2.0 / 20.0))]
     )  # as far as |v| and the farthest in training
-    # Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded.
+    # Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are
+    # degraded.
     status = np.array([0.0, 1.0, 1.0, 0.0])
     reason = np.array([0.0, 40_200.0, 40_200.0, 0.0])
     bands = np.radians([[2.0, 2.0], [2.0, 2.0], [4.0, 4.0], [7.0, 7.0]])

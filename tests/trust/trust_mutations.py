@@ -47,25 +47,25 @@ def at(content, path):
     return content
 
 
-def changed(content, path, how):
+def changed(content, path, way):
     """A copy with one value dropped, lengthened, shortened, reversed or replaced."""
     content = copy.deepcopy(content)
     holder = at(content, path[:-1])
     value = holder[path[-1]]
-    if how == "drop":
+    if way == "drop":
         del holder[path[-1]]
-    elif how == "duplicate" and isinstance(value, list):
+    elif way == "duplicate" and isinstance(value, list):
         holder[path[-1]] = value + value
-    elif how == "60 more" and isinstance(value, list):
+    elif way == "60 more" and isinstance(value, list):
         holder[path[-1]] = value + [value[-1] if value else "vx"] * 60
-    elif how == "one less" and isinstance(value, list):
+    elif way == "one less" and isinstance(value, list):
         holder[path[-1]] = value[:-1]
-    elif how == "reverse" and isinstance(value, list):
+    elif way == "reverse" and isinstance(value, list):
         holder[path[-1]] = value[::-1]
-    elif how == "further key" and isinstance(value, dict):
+    elif way == "further key" and isinstance(value, dict):
         value["ay" if "vx" in value else "further"] = 1.0
-    elif how in VALUES:
-        holder[path[-1]] = copy.deepcopy(VALUES[how])
+    elif way in VALUES:
+        holder[path[-1]] = copy.deepcopy(VALUES[way])
     else:
         return None
     return content
@@ -75,27 +75,30 @@ def mutations(text, number, seed=0):
     """``number`` mutations of a file's text, name -> text."""
     content = yaml.safe_load(text)
     ways = ["drop", "duplicate", "60 more", "one less", "reverse", "further key", *VALUES]
-    every = list(paths(content))
+    value_paths = list(paths(content))
     generator = np.random.default_rng(seed)
     lengthened = [("bands", "channels"), ("health", "channels"), ("health", "limits")]
     drawn = [(path, way) for path in lengthened for way in ways[:5]]
     drawn += [(("guard", "largest_tan_sideslip"), way) for way in ("huge", "minus huge", "zero")]
     drawn += [(("guard", "top_speed"), way) for way in ("huge", "minus huge", "zero")]
-    drawn = [(path, way) for path, way in drawn if path in every]
-    found = {}
-    while len(found) < number:
+    drawn = [(path, way) for path, way in drawn if path in value_paths]
+    texts = {}
+    while len(texts) < number:
         path, way = (
             drawn.pop()
             if drawn
-            else (every[generator.integers(len(every))], ways[generator.integers(len(ways))])
+            else (
+                value_paths[generator.integers(len(value_paths))],
+                ways[generator.integers(len(ways))],
+            )
         )
         mutated = changed(content, path, way)
         if mutated is not None and mutated != content:
             name = f"{'.'.join(map(str, path))}: {way}"
-            found[name] = yaml.safe_dump(mutated, sort_keys=False)
+            texts[name] = yaml.safe_dump(mutated, sort_keys=False)
     for share in (0.0, 0.1, 0.3, 0.5, 0.9, 0.999):
-        found[f"cut at {share:g}"] = text[: int(share * len(text))]
-    found |= {
+        texts[f"cut at {share:g}"] = text[: int(share * len(text))]
+    texts |= {
         "format 0": text.replace("format: 1", "format: 0", 1),
         "format 2": text.replace("format: 1", "format: 2", 1),
         "a list": "- 1\n",
@@ -104,7 +107,7 @@ def mutations(text, number, seed=0):
         "tabs": "format:\t1\n\tabout: {}\n",
         "other estimator": text.replace("estimator: ksnn", "estimator: gru", 1),
     }
-    return found
+    return texts
 
 
 PLACED = ("pipe", "folder", "link to nothing", "link to a device", "link to the file", "binary")

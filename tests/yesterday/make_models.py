@@ -1,7 +1,9 @@
-"""Made once, before a refactoring: a small model of every family with bands and health, fixed drives, and its estimates of them.
+"""Made once, before a refactoring: a small model of every family with bands and health, fixed
+drives, and its estimates of them.
 
-Models in cars must stay usable. test_yesterdays_models.py compares; this script is run again only for a family that is new:
-``PYTHONPATH=tests:src python tests/yesterday/make_models.py FAMILY...``. It leaves folders that are there as they are.
+Models in cars must stay usable. test_yesterdays_models.py compares; this script is run again only
+for a family that is new: ``PYTHONPATH=tests:src python tests/yesterday/make_models.py FAMILY...``.
+It leaves folders that are there as they are.
 """
 
 import sys
@@ -18,7 +20,7 @@ from vehest.inference.estimation import estimate_recording
 from vehest.trust.calibration import Stretch, learn_trust
 from vehest.trust.record import write_trust
 
-HERE = Path(__file__).parent
+FOLDER = Path(__file__).parent
 SECONDS = 5.0
 PREPARATION = {"method": "polyphase", "transforms": []}
 
@@ -48,7 +50,7 @@ def _drives(estimator):
 def main():
     """Make what is missing."""
     for name in sys.argv[1:] or estimator_names():
-        folder = HERE / "models" / name
+        folder = FOLDER / "models" / name
         if folder.exists():
             continue
         estimator = fitted(name)
@@ -61,7 +63,7 @@ def main():
         write_trust(trust, folder)
         drive = drive_for(estimator)
         drive = drive.cut(drive.start_time, drive.start_time + SECONDS)
-        path = HERE / "drives" / drive_name(estimator)
+        path = FOLDER / "drives" / drive_name(estimator)
         path.parent.mkdir(exist_ok=True)
         if not path.exists():
             write_recording(drive, path)

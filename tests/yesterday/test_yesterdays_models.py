@@ -1,4 +1,6 @@
-"""Models that were saved before a refactoring give the estimates that they gave then, with their bands and their health."""
+"""Models that were saved before a refactoring give the estimates that they gave then, with their
+bands and their health.
+"""
 
 import json
 from pathlib import Path
@@ -18,15 +20,15 @@ from vehest.trust.health import INVALID, TOO_WIDE
 from vehest.trust.health_kernel import JUMP
 from vehest.trust.verdict import WIDEST
 
-HERE = Path(__file__).parent
-MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
+FOLDER = Path(__file__).parent
+MODELS = sorted(folder.name for folder in (FOLDER / "models").iterdir())
 TOLERANCE = 1e-6
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_yesterday_estimates_as_it_did(name):
-    folder, model, trust = open_model(str(HERE / "models" / name), HERE, print)
-    drive = read_recording(HERE / "drives" / drive_name(model))
+    folder, model, trust = open_model(str(FOLDER / "models" / name), FOLDER, print)
+    drive = read_recording(FOLDER / "drives" / drive_name(model))
     then = read_estimate(folder / "estimate.parquet")
     now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
@@ -51,9 +53,9 @@ def test_a_model_of_yesterday_estimates_as_it_did(name):
 
 
 def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
-    folder = HERE / "models" / "ksnn"
+    folder = FOLDER / "models" / "ksnn"
     model = load_model(folder)
-    drive = read_recording(HERE / "drives" / drive_name(model))
+    drive = read_recording(FOLDER / "drives" / drive_name(model))
     monkeypatch.chdir(tmp_path)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     code, out, err = run_vehest(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -25,9 +26,10 @@ from vehest.alignment.signs import (
     wrong_unit,
 )
 from vehest.alignment.standstill import BoolArray, standstill
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import STANDSTILL_SPEED
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, number_of
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
@@ -43,6 +45,8 @@ SPIKE_EXCESS = 1.0  # of the usual range, beyond it
 SPIKE_SECONDS = 0.25
 USUAL_STEP_QUANTILE = 0.995  # quantile of the steps between samples
 SPIKE_STEP = 3.0  # of a usual step: a sensor that shakes jumps all the time
+JUMP_STEP = 20.0  # of a usual step, for an excursion that stays within the usual range
+JUMP_SECONDS = 1.0
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
@@ -140,7 +144,7 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             else "check the column and its unit"
         )
         message = (
-            f"{len(outside)} samples outside the possible range "
+            f"{number_of(len(outside), 'sample')} outside the possible range "
             f"({channel.low:.4g} to {channel.high:.4g} {channel.unit}), the largest "
             f"{samples[worst]:.6g} {channel.unit} at t = {recording.time[worst]:.12g} s; "
             f"{'the simulated car spun here' if spun else remedy}"
@@ -308,9 +312,11 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 
 def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Short excursions far beyond the usual range that begin and end with a jump.
+    """Short excursions that begin and end with a jump: far beyond the usual range, or to one value
+    by steps that are far larger than usual.
 
-    A code for "not available" or a lost bit looks so; a manoeuvre needs longer to come and go.
+    A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre
+    needs longer to come and go. A wheel that shows nothing is the finding ``dropout``.
     Those beyond what a vehicle can do are the finding ``impossible``. A sideslip angle without
     speed is noise.
     """
@@ -350,6 +356,37 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
                 "mark these samples as missing, or exclude them"
             )
             yield Finding("warning", "spike", name, message)
+        jumps = [
+            run
+            for run in _between_jumps(samples, recording.rate_hz)
+            if run not in spikes and name not in WHEELS and counts[slice(*run)].all()
+        ]
+        if jumps:
+            begin, end = max(jumps, key=lambda run: run[1] - run[0])
+            unit = CHANNELS[name].unit
+            message = (
+                f"jumps away and back {len(jumps)} time{'s' if len(jumps) > 1 else ''} within "
+                f"{JUMP_SECONDS:g} s, the longest to {samples[begin]:.4g} {unit} for "
+                f"{(end - begin) / recording.rate_hz:.3g} s from "
+                f"t = {recording.time[begin]:.12g} s; mark these samples as missing, "
+                "or exclude them"
+            )
+            yield Finding("warning", "spike", name, message)
+
+
+def _between_jumps(samples: FloatArray, rate_hz: float) -> Iterator[tuple[int, int]]:
+    """Runs of equal samples, or a single zero, between two jumps that lead away and back."""
+    steps = np.diff(samples)
+    usual = float(np.nanquantile(np.abs(steps), USUAL_STEP_QUANTILE))
+    is_jump = (np.abs(steps) > JUMP_STEP * usual) & (usual > 0.0)
+    edges = np.flatnonzero(is_jump) + 1
+    for begin, end in pairwise(edges.tolist()):
+        away = steps[begin - 1]
+        back = steps[end - 1]
+        is_return = abs(away + back) < 0.5 * min(abs(away), abs(back))
+        is_code = np.ptp(samples[begin:end]) == 0.0 and (end - begin > 1 or samples[begin] == 0.0)
+        if is_return and is_code and end - begin <= JUMP_SECONDS * rate_hz:
+            yield begin, end
 
 
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:

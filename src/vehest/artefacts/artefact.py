@@ -1,9 +1,11 @@
 """Artefacts: one folder a stage, with a manifest; a folder is complete, or it does not exist.
 
-StagePlan -> `find`, or `make` under its lock -> Artefact; folder, key -> `valid_artefact` -> Artefact or none
+    StagePlan --`find`, or `make` under its lock--> Artefact
+    folder, key --`valid_artefact`--> Artefact or None
 
-The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration (`keys`), the
-digests of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
+The folder's name ends in the stage's key: a hash of everything that determines the content, which
+is the stage's configuration (`keys`), the digests of its inputs and the version of its code.
+Commit, library versions, time and machine are provenance and not part of the key.
 """
 
 from __future__ import annotations
@@ -45,15 +47,13 @@ class StagePlan:
 
     stage: str
     label: str  # start of the folder's name
-    config: Mapping[
-        str, Any
-    ]  # the part of the configuration that determines the content, plain values
+    # the part of the configuration that determines the content, plain values
+    config: Mapping[str, Any]
     inputs: Mapping[str, str]  # name -> digest
     code: str  # version of the stage's code
     output: Path  # the output root
-    key_config: Mapping[str, Any] | None = (
-        None  # the part of ``config`` in the key; none: all of it
-    )
+    # the part of ``config`` in the key; none: all of it
+    key_config: Mapping[str, Any] | None = None
 
     @property
     def content(self) -> dict[str, Any]:
@@ -127,7 +127,10 @@ class Output:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Keys of manifest.json (docs/cli.md) beside its format; one of 0, where none is stated, is otherwise the same as 1."""
+    """Keys of manifest.json (docs/cli.md) beside its format.
+
+    A manifest that states no format has format 0, which is otherwise the same as 1.
+    """
 
     stage: str
     label: str
@@ -154,8 +157,8 @@ def valid_artefact(
 ) -> Artefact | None:
     """The artefact of a folder, if it is valid for a key; there is no other check of that.
 
-    None where it is missing, damaged (which ``warn`` is told), interrupted or of another key. ``hash_files`` is that of
-    `read_artefact`.
+    None where it is missing, damaged (which ``warn`` is told), interrupted or of another key.
+    ``hash_files`` is that of `read_artefact`.
     """
     try:
         artefact = read_artefact(folder, hash_files=hash_files)
@@ -188,19 +191,20 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
     for name, output in manifest.outputs.items():
         if files.get(name) != output.bytes:
             raise DataError(
-                f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again"
+                f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage "
+                f"'{manifest.stage}' again"
             )
         if hash_files and _digest_of(folder / name, (folder / name).stat()) != output.sha256:
             raise DataError(
-                f"'{folder / name}' was changed after it was made (its digest is not that in {MANIFEST}); "
-                f"remove '{folder}', and the stage '{manifest.stage}' makes it again"
+                f"'{folder / name}' was changed after it was made (its digest is not that in "
+                f"{MANIFEST}); remove '{folder}', and the stage '{manifest.stage}' makes it again"
             )
     outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
     return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """What the manifest of a stage's folder says, its files not looked at; raises as `read_artefact`."""
+    """The manifest of a stage's folder; its files are not checked. Raises as `read_artefact`."""
     path = folder / MANIFEST
     try:
         content = read_json(path)
@@ -235,9 +239,21 @@ def _files(folder: Path) -> list[Path]:
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-    """Run a stage: ``write`` fills an empty folder, which then gets its manifest and its final name; ``interrupted`` if it was stopped.
+    """Run a stage and return its artefact.
 
-    Raises `MissingError` where the disk is full or not writable, and what ``write`` raises; nothing is left behind then.
+    Parameters
+    ----------
+    plan : StagePlan
+        Stage, label, configuration and inputs, which determine the key.
+    write : callable
+        Fills an empty folder, which then gets its manifest and its final name; returns
+        ``interrupted`` if it was stopped.
+
+    Raises
+    ------
+    MissingError
+        The disk is full or not writable. After this error, and after those that ``write``
+        raises, no file remains.
     """
     started = time.monotonic()
     remove_leftovers(plan.folder.parent)
@@ -271,7 +287,10 @@ def ensured(
     should_stop: Callable[[], bool],
     on_wait: Callable[[Waiting], None],
 ) -> Artefact | None:
-    """Make an artefact under its lock, or take another process's; none if ``should_stop`` ended the wait for it; raises as `make` does."""
+    """Make an artefact under its lock, or take the one that another process made meanwhile.
+
+    None if ``should_stop`` ended the wait for that process; raises as `make` does.
+    """
     with held(plan.lock, should_stop, on_wait) as mine:
         if not mine:
             return None
@@ -279,7 +298,10 @@ def ensured(
 
 
 def provenance() -> dict[str, Any]:
-    """Circumstances that do not determine the content, with the digest of the checkout's file of locked versions, where there is one."""
+    """Circumstances that do not determine the content: time, machine, commit, library versions.
+
+    In a checkout, the digest of its file of locked versions is among them.
+    """
     lock = CHECKOUT / "constraints.txt"
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -316,7 +338,7 @@ def library_versions() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Commit of the checkout that vehest runs from, marked if it has changes; empty without a checkout.
+    """Commit of the checkout that vehest runs from, marked if it has changes; else empty.
 
     Changes in results/ do not count: a command that writes tables there would mark its own record.
     """

@@ -1,10 +1,12 @@
 """What of a configuration enters keys: options that differ from their defaults.
 
-settings -> `changed_options` -> key of an artefact (`artefact.StagePlan`) and keys of a published study (`run.published`)
-keys of a published study, keys of today -> `changed_keys` -> what has changed
+    settings --`changed_options`--> options in the key of an artefact (`artefact.StagePlan`) and
+                                    in the keys of a published study (`run.published`)
+    keys of a published study, keys of today --`changed_keys`--> differing keys with their causes
 
-An option that has its default is left out, so that a new option, and a line of YAML that only repeats a default, change no key. The
-defaults themselves belong to the version of the class that declares them (tests/golden/defaults.json).
+An option that has its default is left out, so that a new option, and a line of YAML that only
+repeats a default, change no key. The defaults themselves belong to the version of the class that
+declares them (tests/golden/defaults.json).
 """
 
 from __future__ import annotations
@@ -16,13 +18,16 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
 
 Keys = dict[str, dict[str, str]]
-"""Keys of a study: what is made, for example ``scheme_1: train ksnn`` -> cause (``code``, ``configuration``, ``data``) -> version or hash."""
+"""Keys of a study: step, such as ``scheme_1: train ksnn`` -> cause -> version or hash.
+
+Causes are ``code``, ``configuration`` and ``data``.
+"""
 
 CONFIGURATION = "configuration"
 
 
 def changed_keys(recorded: Keys, today: Keys) -> list[tuple[str, str]]:
-    """Pairs of what has another key today than results were recorded with, and the cause; they are valid where there are none.
+    """Steps whose key differs from the recorded one, each with the cause; empty: results are valid.
 
     A cause that today's keys leave out, as that of raw files which are not here, is not compared.
     """
@@ -44,8 +49,8 @@ def hash_of(content: Any) -> str:
 def changed_options(settings: Any) -> dict[str, Any]:
     """Options of a dataclass's instance that differ from their defaults, as plain values.
 
-    A group of settings inside is compared with the group that is the default there, option by option. An option without a default is
-    always among them.
+    A group of settings inside is compared with the group that is the default there, option by
+    option. An option without a default is always among them.
     """
     return {
         option.name: value

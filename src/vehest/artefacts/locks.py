@@ -1,7 +1,8 @@
 """Locks across processes: one process at a time makes an artefact.
 
-The operating system drops a lock when its holder ends. The files stay: removing one while another process waits for it would make two
-locks. A process that waits holds no other lock, except that of the tracking store, under which nothing waits: so there is no deadlock.
+The operating system drops a lock when its holder ends. The files stay: removing one while another
+process waits for it would make two locks. A process that waits holds no other lock, except that of
+the tracking store, under which nothing waits: so there is no deadlock.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ class Waiting:
 
 
 class Lock:
-    """A lock of an output root, by a stage and a name that is unique in it; it ends with the process that holds it."""
+    """A lock in an output root, identified by a stage and a name that is unique in the stage.
+
+    It ends with the process that holds it.
+    """
 
     def __init__(self, output: Path, stage: str, name: str) -> None:
         self.stage = stage
@@ -43,7 +47,13 @@ class Lock:
         )  # a file that only stands for a lock would outlive its process
 
     def take(self) -> bool:
-        """Take the lock if it is free; raises MissingError where the output root cannot be written to."""
+        """Take the lock if it is free; returns whether it was.
+
+        Raises
+        ------
+        MissingError
+            The output root cannot be written to.
+        """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(blocking=False)
@@ -75,7 +85,22 @@ def held(
     should_stop: Callable[[], bool] = lambda: True,
     on_wait: Callable[[Waiting], None] | None = None,
 ) -> Iterator[bool]:
-    """Hold a lock, and wait for it until ``should_stop``, by default not at all; yields whether it is held; raises `MissingError`."""
+    """Hold a lock within a ``with`` block; yields whether it is held.
+
+    Parameters
+    ----------
+    lock : Lock
+        The lock to take.
+    should_stop : callable
+        Whether to end the wait for another process; by default there is no wait.
+    on_wait : callable or None
+        Called once where another process has the lock.
+
+    Raises
+    ------
+    MissingError
+        The output root cannot be written to.
+    """
     try:
         mine = lock.take()
         if not mine and on_wait is not None:

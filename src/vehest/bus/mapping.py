@@ -30,9 +30,8 @@ class BusSignals:
 
     database: Database  # messages that carry them
     by_channel: Mapping[str, ChannelSignal]  # channel -> its message and signal
-    factors: Mapping[
-        str, float
-    ]  # channel -> factor from the unit of the DBC to SI units and ISO 8855 signs
+    # channel -> factor from the unit of the DBC to SI units and ISO 8855 signs
+    factors: Mapping[str, float]
     bus: int | str | None = None  # number or name of the bus, where a log holds several
 
 

@@ -36,11 +36,14 @@ BO_ {band} VehestBand: 8 Vehest
  SG_ BandAliveCounter : 60|4@1+ (1,0) [0|15] "" Car
 
 CM_ "Estimates of lateral velocity and sideslip angle by vehest; signs of ISO 8855.";
-CM_ BO_ {estimate} "A frame an estimate. The smallest raw value of a signal, of a width the largest, says that there is none.";
-CM_ BO_ {band} "Half widths of the calibrated 90 % bands, sent after the estimate with the same counter.";
+CM_ BO_ {estimate} "A frame an estimate. \
+The smallest raw value of a signal, of a width the largest, says that there is none.";
+CM_ BO_ {band} "Half widths of the calibrated 90 % bands, \
+sent after the estimate with the same counter.";
 CM_ SG_ {estimate} YawRate "Where the method estimates one.";
 CM_ SG_ {estimate} AliveCounter "One more with each estimate, modulo 16.";
-CM_ SG_ {band} HealthReason "0: none; else ten thousands are the kind, hundreds the channel: vehest.reason_in_words says it.";
+CM_ SG_ {band} HealthReason "0: none; else ten thousands are the kind, \
+hundreds the channel: vehest.reason_in_words says it.";
 VAL_ {estimate} LateralVelocity -524288 "not available" ;
 VAL_ {estimate} SideslipAngle -524288 "not available" ;
 VAL_ {estimate} YawRate -131072 "not available" ;

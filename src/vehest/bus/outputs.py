@@ -15,8 +15,8 @@ from vehest.data.estimate import IN_DEGREES, number_cell, time_cell
 from vehest.data.files import writing_error
 from vehest.trust.health import reason_in_words
 
-FIRST = ("vy", "sideslip")
-LAST = ("band_vy", "band_sideslip", "health", "health_reason")
+LEADING_COLUMNS = ("vy", "sideslip")
+TRAILING_COLUMNS = ("band_vy", "band_sideslip", "health", "health_reason")
 
 
 def output_files(path: Path | None) -> list[Path]:
@@ -46,9 +46,9 @@ class Output:
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
         self._names = [
-            *FIRST,
-            *(name for name in names if name not in FIRST + LAST),
-            *(name for name in LAST[:2] if name in names),
+            *LEADING_COLUMNS,
+            *(name for name in names if name not in LEADING_COLUMNS + TRAILING_COLUMNS),
+            *(name for name in TRAILING_COLUMNS[:2] if name in names),
         ]
         self._path = path or Path()
         self._angles: list[str] = []  # columns of `IN_DEGREES`
@@ -58,7 +58,7 @@ class Output:
             with writing(path):
                 self._table = path.open("w", encoding="utf-8", newline="", buffering=1)
             self._angles = [name for name, angle in IN_DEGREES.items() if angle in self._names]
-            self._row(["time", "sampled", *self._names, *LAST[2:], *self._angles])
+            self._row(["time", "sampled", *self._names, *TRAILING_COLUMNS[2:], *self._angles])
         elif path is not None:
             from can.io.asc import ASCWriter
 

@@ -25,8 +25,8 @@ from vehest.sources.clocks import mean_step, plain_rate
 GAIN = 0.02
 # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
 MAX_PERIOD_DEVIATION = 0.05
-PLAIN = 5e-3  # relative distance to a round rate that is taken for it
-SLACK = 1e-9  # s
+ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is taken for it
+STAMP_TOLERANCE = 1e-9  # s
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
             "identifiers, say which"
         )
     if rate_hz is None:
-        rate_hz = plain_rate(1.0 / periods[clock], PLAIN)
+        rate_hz = plain_rate(1.0 / periods[clock], ROUND_RATE_TOLERANCE)
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigurationError(f"the rate of a bus must be a positive number [Hz], not {rate_hz}")
     cycle = 1.0 / rate_hz
@@ -115,7 +115,8 @@ class Sampler:
         self.cycle = 1.0 / timing.rate_hz
         self.next_time = timing.start
         self._limits = {
-            name: max(period, self.cycle) + SLACK for name, period in timing.periods.items()
+            name: max(period, self.cycle) + STAMP_TOLERANCE
+            for name, period in timing.periods.items()
         }
         self._values = dict.fromkeys(timing.periods, math.nan)
         self._stamps = dict.fromkeys(timing.periods, -math.inf)

@@ -59,8 +59,8 @@ class CarValues:
         imu = self.imu_to_rear_axle
         if imu is not None and not -self.wheelbase <= imu <= 2.0 * self.wheelbase:
             raise ValueError(
-                "imu_to_rear_axle must lie between one wheelbase behind the rear axle and two ahead "
-                f"of it ({-self.wheelbase:g} to {2.0 * self.wheelbase:g} m), not at {imu:g}"
+                "imu_to_rear_axle must lie between one wheelbase behind the rear axle and two "
+                f"ahead of it ({-self.wheelbase:g} to {2.0 * self.wheelbase:g} m), not at {imu:g}"
             )
 
     def scaled(self, factor: float) -> CarValues:

@@ -33,9 +33,8 @@ class Derivation:
     """How a channel is made of others."""
 
     of: tuple[str, ...]  # channels of the log that it is made of, in the end
-    transforms: tuple[
-        Mapping[str, Any], ...
-    ]  # entries of a data set's ``transforms``, in order; None: a value that only the user knows
+    # entries of a data set's ``transforms``, in order; None: a value that only the user knows
+    transforms: tuple[Mapping[str, Any], ...]
 
     @property
     def meanings(self) -> dict[str, str]:

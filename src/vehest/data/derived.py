@@ -67,9 +67,8 @@ class SteeringCurve:
     """
 
     inputs: tuple[float, ...]  # values of the channel at the corners, increasing
-    angles: tuple[
-        float, ...
-    ]  # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
+    # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
+    angles: tuple[float, ...]
     channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
 
     def __post_init__(self) -> None:
@@ -215,9 +214,8 @@ class AccelerationFromSpeed:
 
     channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
     cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
-    direction: Literal["causal", "zero_phase"] = (
-        "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
-    )
+    # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
+    direction: Literal["causal", "zero_phase"] = "causal"
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.

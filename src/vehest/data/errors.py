@@ -62,6 +62,11 @@ def counted(names: Sequence[str]) -> str:
     )
 
 
+def number_of(count: int, noun: str) -> str:
+    """A number with its noun, of which the plural ends with s: ``1 gap``, ``2 gaps``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def abbreviated(names: Sequence[str], max_named: int) -> str:
     """The first of some names, and the number of the others: ``a, b and 3 more``."""
     n_more = len(names) - max_named

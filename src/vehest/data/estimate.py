@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,7 +47,9 @@ IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "
 """Columns of written tables in degrees -> the quantity [rad] that each repeats for people."""
 
 COLUMN_UNITS: dict[str, str] = {"time": "s", **QUANTITIES, **dict.fromkeys(IN_DEGREES, "deg")}
-"""Columns of written tables, with units."""
+"""Columns of written tables, with units; entries of a covariance have theirs by `column_units`."""
+
+COVARIANCE = "covariance"  # column of entry (i, j): covariance_i_j
 
 
 def time_cell(seconds: float) -> str:
@@ -77,13 +79,11 @@ class Estimate(TimeSeries):
     estimator: str  # name of the estimator
     rate_hz: float  # rate of the estimate [Hz]
     start_time: float  # time of the first sample [s]
-    channels: Mapping[
-        str, FloatArray
-    ]  # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    channels: Mapping[str, FloatArray]
     mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
-    covariance: FloatArray | None = (
-        None  # of the errors of some of the quantities, (T, n, n), where the method has one
-    )
+    # of the errors of some of the quantities, (T, n, n), where the method has one
+    covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
@@ -123,6 +123,13 @@ class Estimate(TimeSeries):
             raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
         return self.channels[name]
 
+    def _table(self) -> dict[str, FloatArray]:
+        [columns] = estimate_columns([self])
+        return with_degrees(columns)
+
+    def _table_units(self) -> dict[str, str]:
+        return column_units(self)
+
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
         """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
         NaN outside the estimate.
@@ -158,3 +165,37 @@ class Estimate(TimeSeries):
             np.int64
         )
         return np.where((index >= 0) & (index < len(self)), index, -1)
+
+
+def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
+    """Time, quantities and entries of the covariance of each part of an estimate, on one clock."""
+    done = 0
+    start = None
+    for part in parts:
+        start = part.start_time if start is None else start
+        columns = {
+            "time": start + np.arange(done, done + len(part)) / part.rate_hz,
+            **part.channels,
+        }
+        done += len(part)
+        if part.covariance is not None:
+            columns |= {
+                f"{COVARIANCE}_{i}_{j}": part.covariance[:, i, j]
+                for i, j in np.ndindex(part.covariance.shape[1:])
+            }
+        yield columns
+
+
+def with_degrees(columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Columns of an estimate, followed by the angles among them in degrees."""
+    angles = {name: angle for name, angle in IN_DEGREES.items() if angle in columns}
+    return {**columns, **{name: np.degrees(columns[angle]) for name, angle in angles.items()}}
+
+
+def column_units(estimate: Estimate) -> dict[str, str]:
+    """Units of the columns of an estimate's table, entries of its covariance included."""
+    units = [QUANTITIES[name] for name in estimate.covariance_of]
+    of_covariance = {
+        f"{COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
+    }
+    return COLUMN_UNITS | of_covariance

@@ -26,14 +26,12 @@ class FoldsFile:
     """How a split is cross-validated."""
 
     number: Annotated[int, Field(ge=MIN_FOLDS)] = 5  # of folds, three or more
-    of: Literal["recordings", "laps", "seconds"] = (
-        "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
-    )
+    # unit that is never cut in two; seconds: ``block_seconds`` of driving
+    of: Literal["recordings", "laps", "seconds"] = "laps"
     recordings: str = "*"  # pattern of those that take part
     block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
-    gap_seconds: NonNegativeFloat = (
-        2.0  # taken off training and validation where they border on another fold [s]
-    )
+    # taken off training and validation where they border on another fold [s]
+    gap_seconds: NonNegativeFloat = 2.0
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:

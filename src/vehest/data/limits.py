@@ -22,16 +22,13 @@ class Limits:
 
     samples: PositiveInt = 20_000_000  # of one channel of a recording, also after resampling
     columns: PositiveInt = 10_000  # columns that the header of a table may name
-    memory: PositiveInt = (
-        1_600_000_000  # what reading one file may take beyond ten times its size [bytes]
-    )
-    filter_samples: PositiveInt = (
-        1_000_000  # reach of a filter, or length of an estimator's window, in samples
-    )
+    # what reading one file may take beyond ten times its size [bytes]
+    memory: PositiveInt = 1_600_000_000
+    # reach of a filter, or length of an estimator's window, in samples
+    filter_samples: PositiveInt = 1_000_000
     jobs: PositiveInt = 10_000  # trainings of one sweep or study
-    text_bytes: PositiveInt = (
-        16 * 2**20
-    )  # length of a configuration, manifest or other text that describes something [bytes]
+    # length of a configuration, manifest or other text that describes something [bytes]
+    text_bytes: PositiveInt = 16 * 2**20
 
 
 _DEFAULTS = Limits()

@@ -42,12 +42,10 @@ class Recording(TimeSeries):
     start_time: float  # time of the first sample [s]
     channels: Mapping[str, FloatArray]  # canonical name -> samples, float64 of shape (T,), SI units
     kind: Kind = "real"  # ``real`` or ``simulated``
-    gappy: frozenset[str] = (
-        frozenset()
-    )  # channels in which NaN means "not measured"; everywhere else NaN is an error
-    provenance: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # where samples come from (JSON values only); not part of the data
+    # channels in which NaN means "not measured"; everywhere else NaN is an error
+    gappy: frozenset[str] = frozenset()
+    # where samples come from (JSON values only); not part of the data
+    provenance: Mapping[str, Any] = field(default_factory=dict)
     car: CarValues = UNKNOWN_CAR  # values of its data set; a stored recording has none
 
     def __post_init__(self) -> None:

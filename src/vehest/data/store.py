@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -15,7 +15,15 @@ import pyarrow.parquet as pq
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError
-from vehest.data.estimate import COLUMN_UNITS, IN_DEGREES, QUANTITIES, Estimate, Mode
+from vehest.data.estimate import (
+    COVARIANCE,
+    IN_DEGREES,
+    Estimate,
+    Mode,
+    column_units,
+    estimate_columns,
+    with_degrees,
+)
 from vehest.data.files import writing_error, written_aside
 from vehest.data.parquet import parquet_file, read_numbers
 from vehest.data.recording import Kind, Recording
@@ -24,7 +32,6 @@ from vehest.data.text_files import first_line, parse_json
 
 _METADATA_KEY = b"vehest"
 _FORMAT = 1
-_COVARIANCE = "covariance"
 _LAYOUT: dict[str, Any] = {
     "compression": "zstd",
     "use_dictionary": False,
@@ -190,17 +197,7 @@ def write_estimate_parts(parts: Iterable[Estimate], path: Path, band: str = "") 
     first = next(remaining)
     about = _about_estimate(first) | ({"band": band} if band else {})
     columns = map(with_degrees, estimate_columns(chain([first], remaining)))
-    units = [QUANTITIES[name] for name in first.covariance_of]
-    of_covariance = {
-        f"{_COVARIANCE}_{i}_{j}": f"{units[i]}·{units[j]}" for i, j in np.ndindex(2 * (len(units),))
-    }
-    _write(path, columns, "estimate", about, COLUMN_UNITS | of_covariance)
-
-
-def with_degrees(columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Columns of an estimate, followed by the angles among them in degrees."""
-    angles = {name: angle for name, angle in IN_DEGREES.items() if angle in columns}
-    return {**columns, **{name: np.degrees(columns[angle]) for name, angle in angles.items()}}
+    _write(path, columns, "estimate", about, column_units(first))
 
 
 def _about_estimate(estimate: Estimate) -> dict[str, Any]:
@@ -210,25 +207,6 @@ def _about_estimate(estimate: Estimate) -> dict[str, Any]:
         about["n_states"] = estimate.covariance.shape[1]
         about["covariance_of"] = list(estimate.covariance_of)
     return about
-
-
-def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
-    """Time, quantities and entries of the covariance of each part of an estimate, on one clock."""
-    done = 0
-    start = None
-    for part in parts:
-        start = part.start_time if start is None else start
-        columns = {
-            "time": start + np.arange(done, done + len(part)) / part.rate_hz,
-            **part.channels,
-        }
-        done += len(part)
-        if part.covariance is not None:
-            columns |= {
-                f"{_COVARIANCE}_{i}_{j}": part.covariance[:, i, j]
-                for i, j in np.ndindex(part.covariance.shape[1:])
-            }
-        yield columns
 
 
 def read_estimate(path: Path) -> Estimate:
@@ -249,14 +227,14 @@ def read_estimate(path: Path) -> Estimate:
         for name in IN_DEGREES:
             columns.pop(name, None)
         if n_states is not None:
-            n_entries = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
+            n_entries = sum(name.startswith(f"{COVARIANCE}_") for name in columns)
             if n_states < 1 or n_states**2 != n_entries:
                 raise DataError(
                     f"n_states is {n_states}, and there are {n_entries} columns of the covariance; "
                     "make it again"
                 )
             entries = [
-                columns.pop(f"{_COVARIANCE}_{row}_{column}")
+                columns.pop(f"{COVARIANCE}_{row}_{column}")
                 for row, column in np.ndindex(n_states, n_states)
             ]
             covariance = np.stack(entries, axis=1).reshape(-1, n_states, n_states)

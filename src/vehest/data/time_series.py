@@ -72,8 +72,20 @@ class TimeSeries(ABC):
         body = "".join(f"<tr>{row}</tr>" for row in (header, *rows))
         return f"<p>{escape(self._describe())}</p><table>{body}</table>"
 
+    def _table(self) -> dict[str, FloatArray]:
+        """Columns of the table of all samples, ``time`` first, shape (T,) each."""
+        return {"time": self.time, **self.channels}
+
+    def _table_units(self) -> dict[str, str]:
+        """Column of the table -> its unit."""
+        return {"time": "s", **self.units}
+
     def to_pandas(self) -> pd.DataFrame:
-        """The channels as columns in SI units, on an index ``time`` [s].
+        """The samples as a table on an index ``time`` [s].
+
+        Of a recording the channels in SI units; of an estimate the columns that `vehest estimate`
+        writes: its quantities in SI units, entries of the covariance, if there is one, and the
+        sideslip angle and its band also in degrees.
 
         Returns
         -------
@@ -82,6 +94,8 @@ class TimeSeries(ABC):
         """
         import pandas as pd
 
-        frame = pd.DataFrame(dict(self.channels), index=pd.Index(self.time, name="time"))
-        frame.attrs["units"] = {"time": "s", **self.units}
+        columns = self._table()
+        units = self._table_units()
+        frame = pd.DataFrame(columns).set_index("time")
+        frame.attrs["units"] = {name: units[name] for name in columns}
         return frame

@@ -62,9 +62,8 @@ class Resample:
     method: Literal["polyphase", "decimate"] = "polyphase"  # ``polyphase`` or ``decimate``
     zero_crossings: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
-    cutoff: ClassVar[float] = (
-        0.86  # of the slower Nyquist frequency, where the stop band has then begun
-    )
+    # of the slower Nyquist frequency, where the stop band has then begun
+    cutoff: ClassVar[float] = 0.86
 
     def __post_init__(self) -> None:
         if not 0.0 < self.rate_hz < math.inf:
@@ -119,7 +118,7 @@ class Resample:
                 f"{length} samples",
             )
             names = _without_gaps(recording, tuple(recording.channels))
-            taps = self._taps(up, down)
+            taps = self.taps(up, down)
             n_out = -(-len(recording) * up // down)
             channels = {name: _resampled(recording[name], up, down, taps, n_out) for name in names}
         return replace(recording, rate_hz=self.rate_hz, channels=channels)
@@ -133,7 +132,8 @@ class Resample:
         down = ratio.denominator
         return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
 
-    def _taps(self, up: int, down: int) -> FloatArray:
+    def taps(self, up: int, down: int) -> FloatArray:
+        """Coefficients of the anti-aliasing filter at ``up`` times the rate of the recording."""
         slower = max(up, down)
         half = self.zero_crossings * slower
         taps, window = windowed_sinc(half, self.cutoff / slower, self.kaiser_beta)
@@ -165,15 +165,14 @@ class LowPass:
     channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
     direction: Literal["causal", "zero_phase"] = "zero_phase"  # ``causal`` or ``zero_phase``
     design: Literal["butterworth", "fir"] = "butterworth"  # ``butterworth`` or ``fir``
-    reach: PositiveFloat = (
-        0.3  # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
-    )
+    # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
+    reach: PositiveFloat = 0.3
 
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError(
-                "a low-pass of design fir needs as many later samples as earlier ones; use design=butterworth for a "
-                "causal one"
+                "a low-pass of design fir needs as many later samples as earlier ones; use "
+                "design=butterworth for a causal one"
             )
 
     def __call__(self, recording: Recording) -> Recording:
@@ -278,9 +277,8 @@ class BridgeImpossible:
     offline.
     """
 
-    beside: Annotated[float, Field(ge=0.0)] = (
-        0.0  # reach of a line to either side, where a slower signal was interpolated [s]
-    )
+    # reach of a line to either side, where a slower signal was interpolated [s]
+    beside: Annotated[float, Field(ge=0.0)] = 0.0
 
     def __call__(self, recording: Recording) -> Recording:
         """Bridge them; a channel with more than a tenth of them stays, whose unit is then wrong."""
@@ -434,9 +432,8 @@ class DelayCorrection:
 class OffsetCorrection:
     """Take constant offsets off channels."""
 
-    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(
-        hash=False
-    )  # by channel, in its unit
+    # by channel, in its unit
+    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)
 
     def __call__(self, recording: Recording) -> Recording:
         """Subtract the offsets.
@@ -483,9 +480,8 @@ class Preparation:
     """
 
     method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
-    transforms: tuple[
-        dict[str, Any], ...
-    ] = ()  # applied before, at the native rate, each by its ``name`` and its arguments
+    # applied before, at the native rate, each by its ``name`` and its arguments
+    transforms: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         for entry in self.transforms:

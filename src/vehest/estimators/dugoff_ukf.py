@@ -19,7 +19,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.estimators.base import (
@@ -41,20 +40,10 @@ from vehest.estimators.filtering.dugoff_identification import (
     read_sensor_levels,
     search_levels,
 )
-from vehest.estimators.filtering.track_filter import KAPPA, UNKNOWN_MOTION
-from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import MARGIN
+from vehest.estimators.filtering.track_c import track_c_values
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import IdentificationSettings
-from vehest.vehicle.dugoff import (
-    BMW_545I,
-    LARGEST_RATIO,
-    LEAST_COSINE,
-    LEAST_LOAD,
-    LEAST_SHARE,
-    TRACK_STATES,
-    LoadedCar,
-)
+from vehest.vehicle.dugoff import BMW_545I, LoadedCar
 
 SENSORS: dict[str, tuple[str, ...]] = {
     "full": ("ay", "yaw_rate", "fy_front", "fy_rear"),
@@ -367,41 +356,7 @@ class DugoffUkf(DugoffFilter):
 
     def c_values(self) -> dict[str, Any]:
         """Values of the C template for the filter without a network."""
-        s = self.settings
-        car = s.car
-        forces = s.inputs == "full"
-        wheelbase = car.cg_to_front_axle + car.cg_to_rear_axle
-        process, sensors = self.noise_covariances(self.levels)
-        measured = 4 if forces else 2  # forces that are never measured need no row
-        return {
-            "network": False,
-            **super().c_values(),
-            "n": len(TRACK_STATES),
-            "m": measured,
-            "rule": symmetric_rule(len(TRACK_STATES), KAPPA),
-            "lower": None,
-            "repair": True,
-            "margin": MARGIN,
-            "forces": forces,
-            "smooth": s.curve == "smooth",
-            "car": car,
-            "step": 1.0 / s.rate_hz,
-            "transfer": car.cg_height / wheelbase,
-            "load_front": GRAVITY * car.cg_to_rear_axle / wheelbase,
-            "load_rear": GRAVITY * car.cg_to_front_axle / wheelbase,
-            "minimum_speed": s.minimum_speed,
-            "rolling": np.square(UNKNOWN_MOTION),
-            "process": process.diagonal().numpy(),
-            "sensors": sensors.diagonal(dim1=-2, dim2=-1).numpy()[:, :measured],
-            "front": self.axle_tyres[:3],
-            "rear": self.axle_tyres[3:],
-            "nonlinear_from": s.nonlinear_from,
-            "linear_below": s.linear_below,
-            "largest": LARGEST_RATIO[s.curve],
-            "least_share": LEAST_SHARE,
-            "least_load": LEAST_LOAD,
-            "least_cosine": LEAST_COSINE,
-        }
+        return {"network": False, **super().c_values(), **track_c_values(self)}
 
 
 ESTIMATOR = DugoffUkf

@@ -28,7 +28,7 @@ BOX = ((-6.0, 4.0), (0.2, 2.0))
 STARTS = ((-2.0, 2.0), (0.5, 1.5))
 ROUNDING = 1e-9  # by which a search may end beyond the box
 MIN_SPREAD = 1e-12  # rad², of models that agree to the last digit
-MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
+VARIANCE_POWER_RANGE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class EnsembleUkf(NetworkUkf):
             **super().c_values(),
             **ensemble,
             "least_spread": MIN_SPREAD,
-            "most_size": MOST_SIZE,
+            "most_size": VARIANCE_POWER_RANGE,
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
@@ -223,7 +223,7 @@ def scaled_variance(
 ) -> FloatArray:
     """10^p₁ (σ²)^p₂, and ε on top so that no filter takes it for exact; (T,) [rad²] (Eq. 11)."""
     size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, MIN_SPREAD))
-    return least_variance + 10.0 ** np.clip(size, *MOST_SIZE)
+    return least_variance + 10.0 ** np.clip(size, *VARIANCE_POWER_RANGE)
 
 
 ESTIMATOR = EnsembleUkf

@@ -210,6 +210,11 @@ class LearnedUkf(CarFilterEstimator):
         )
 
     @property
+    def training_friction(self) -> float:
+        """Friction of the training recordings, from which that of other tyres departs."""
+        return self.friction
+
+    @property
     def full_title(self) -> str:
         """Title with what is learnt."""
         s = self.settings

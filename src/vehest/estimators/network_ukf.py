@@ -18,7 +18,11 @@ from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.dugoff_filter import CHANNELS, PseudoMeasurement
-from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetworkEstimator
+from vehest.estimators.networks.sample_network import (
+    INPUTS,
+    NORMALISATION_SUFFIXES,
+    SampleNetworkEstimator,
+)
 from vehest.training.context import FitContext
 
 MIN_VARIANCE = 1e-6
@@ -61,7 +65,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     @property
     def variant(self) -> str:
         """Name of the family with the network's inputs and the gate."""
-        return self.inputs + self.gate_suffix + NAMED[self.normalisation]
+        return self.inputs + self.gate_suffix + NORMALISATION_SUFFIXES[self.normalisation]
 
     @property
     def n_parameters(self) -> int:

@@ -10,8 +10,12 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import UNSET, setting
 from vehest.estimators.base import Trial, rate
+from vehest.estimators.filtering.self_calibrating_settings import (
+    TYPICAL_REAR,
+    TYPICAL_WHEELBASE,
+    WHEELBASE_POWERS,
+)
 from vehest.estimators.recursive import Recursive
-from vehest.estimators.self_calibrating import SCALED, TYPICAL_REAR, TYPICAL_WHEELBASE
 
 
 class PriorMap(Recursive):
@@ -67,7 +71,9 @@ class PriorMap(Recursive):
     @property
     def k(self) -> float:
         """Compliance of the car's rear axle [rad s²/m]: tyres of small cars slip more."""
-        return self.compliance * (self.wheelbase / TYPICAL_WHEELBASE) ** SCALED["compliance"]
+        return (
+            self.compliance * (self.wheelbase / TYPICAL_WHEELBASE) ** WHEELBASE_POWERS["compliance"]
+        )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """r (b - C u²) [m/s]."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.declared import LARGEST as LARGEST_SETTING
+from vehest.declared import MAX_SETTING as LARGEST_SETTING
 from vehest.declared import Group, setting
 from vehest.estimators.base import (
     FitData,

@@ -15,7 +15,7 @@ from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
 from vehest.estimators.networks.sample_network import (
     INPUTS,
-    NAMED,
+    NORMALISATION_SUFFIXES,
     SampleNetwork,
     SampleNetworkEstimator,
     clip_sideslip,
@@ -62,7 +62,7 @@ class SideslipFfnn(SampleNetworkEstimator):
     @property
     def variant(self) -> str:
         """Name with the inputs and their normalisation."""
-        return self.inputs + NAMED[self.normalisation]
+        return self.inputs + NORMALISATION_SUFFIXES[self.normalisation]
 
     @property
     def full_title(self) -> str:

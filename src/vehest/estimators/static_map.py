@@ -14,8 +14,9 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified separately
-CONDITION = 1e8
+# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified
+# separately
+MAX_CONDITION_NUMBER = 1e8
 
 
 class StaticMap(Recursive):
@@ -48,7 +49,7 @@ class StaticMap(Recursive):
             vy = vy - self.values[name] * columns[name]
         design = np.stack([columns[name] for name in self.unknown], axis=1)
         scale = np.sqrt(np.mean(np.square(design), axis=0))
-        if not (scale > 0).all() or np.linalg.cond(design / scale) > CONDITION:
+        if not (scale > 0).all() or np.linalg.cond(design / scale) > MAX_CONDITION_NUMBER:
             raise DataError(
                 "the training recordings do not determine a static map: the car hardly turns, or "
                 "always at the same speed"

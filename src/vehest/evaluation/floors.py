@@ -91,7 +91,7 @@ BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white
 SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
 MIN_SAMPLES = 20
 MIN_WHITE_SHARE = 0.01  # of an axle's slow error, so that no measurement is exact
-CHUNK = 20_000  # samples that are held at once
+SAMPLES_TOGETHER = 20_000  # samples that are held at once
 UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
 MIN_POSITIVE = 1e-9
 
@@ -118,14 +118,12 @@ class Drive:
     """
 
     rate_hz: float  # [Hz]
-    inputs: dict[
-        str, FloatArray
-    ]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    inputs: dict[str, FloatArray]
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
-    starts_at_reference: bool = (
-        False  # whether estimators start from the reference at the first sample
-    )
+    # whether estimators start from the reference at the first sample
+    starts_at_reference: bool = False
     min_sideslip_speed: float = 0.0  # speed from which on sideslip is scored [m/s]
 
     @property
@@ -276,9 +274,8 @@ def _robust_deviation(samples: FloatArray) -> float:
 class Noise(NamedTuple):
     """A disturbance in two parts."""
 
-    density: (
-        float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
-    )
+    # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    density: float
     deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
     time_constant: float  # of the slow part [s]
 
@@ -515,8 +512,8 @@ def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatAr
     """Standard deviation of v along a drive [m/s], (T,)."""
     model, prior = _model_of(drive, inputs, levels)
     deviation = np.empty(len(drive.vy_ref))
-    for begin in range(0, len(deviation), CHUNK):
-        part = slice(begin, begin + CHUNK)
+    for begin in range(0, len(deviation), SAMPLES_TOGETHER):
+        part = slice(begin, begin + SAMPLES_TOGETHER)
         part_model = model._replace(
             transition=model.transition[part], observation=model.observation[part]
         )
@@ -541,9 +538,8 @@ def _model_of(
     transition: dict[tuple[int, int], FloatArray | float] = {}
     noises = list[float]()
     priors = list[float]()
-    measured: list[
-        tuple[dict[int, FloatArray | float], float]
-    ] = []  # combinations of states, and the variance of each
+    # combinations of states, and the variance of each
+    measured: list[tuple[dict[int, FloatArray | float], float]] = []
 
     def state(decay: float, noise: float, prior: float) -> int:
         """Add x⁺ = decay x + w; returns its index."""

@@ -111,17 +111,15 @@ class Protocol:
     """What is scored, and when."""
 
     rate_hz: float = 20.0  # at which every estimate is read [Hz]; held, never interpolated
-    warm_up_seconds: float = (
-        10.0  # how long before a range, or before each sequence, an estimator may start [s]
-    )
+    # how long before a range, or before each sequence, an estimator may start [s]
+    warm_up_seconds: float = 10.0
     skip_seconds: float = 1.5  # start of each range, or of each sequence, that is not scored [s]
     # ranges are cut, from their starts, into sequences of this length without overlap, in each of
     # which an estimate starts anew; a
     # remainder is left out [s]; None leaves ranges whole
     sequence_seconds: float | None = None
-    initial_state: bool = (
-        False  # whether estimates start at the reference state of the first sample
-    )
+    # whether estimates start at the reference state of the first sample
+    initial_state: bool = False
     # test sets, with commas between them, of another car or tyre than the training's that the
     # recordings do not tell apart by their
     # vehicle: bands are wider there by their rule
@@ -225,13 +223,11 @@ class Scored:
     is_sideslip_scored: BoolArray  # whether the car is fast enough (`Protocol.min_sideslip_speed`)
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     other_states: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    covariance: FloatArray | None = (
-        None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
-    )
+    # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
-    nis: FloatArray | None = (
-        None  # normalised innovation squared of the filter's update, where the method gives it
-    )
+    # normalised innovation squared of the filter's update, where the method gives it
+    nis: FloatArray | None = None
     nis_dof: FloatArray | None = None  # numbers measured at each update
     # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is
     # one

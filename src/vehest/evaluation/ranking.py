@@ -60,9 +60,8 @@ class Ranking:
     order: Sequence[Name]  # by RMSE over all seeds, the lowest first
     rmse: Mapping[Name, float]  # over all seeds of each
     intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
-    pairs: Mapping[
-        tuple[Name, Name], Comparison
-    ]  # (first, second) -> comparison, of every pair that was compared, either way round
+    # (first, second) -> comparison, of every pair that was compared, either way round
+    pairs: Mapping[tuple[Name, Name], Comparison]
     n_blocks: int  # resampled blocks; no intervals and comparisons below `MIN_BLOCKS`
     block_seconds: float  # mean time in a block at which sideslip is scored [s]
     effective_blocks: float  # how many equal blocks the best one's squared error is spread over

@@ -102,10 +102,14 @@ def write_onnx(estimator: Estimator, path: str | Path) -> None:
 class _Step(nn.Module):
     """One step, from a sample (C,) and states to quantities () and states.
 
-    Args:
-        network: of the estimator.
-        outputs: names of the quantities.
-        starts: states before the first sample, by name.
+    Parameters
+    ----------
+    network
+        Of the estimator.
+    outputs
+        Names of the quantities.
+    starts
+        States before the first sample, by name.
     """
 
     def __init__(

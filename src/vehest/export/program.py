@@ -45,6 +45,7 @@ from vehest.trust.guard import (
 )
 from vehest.trust.health_kernel import Layout, Model
 from vehest.trust.named_arrays import views
+from vehest.trust.tyre_check import FRICTION_SLIP
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
@@ -100,6 +101,7 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
         ],
         "refuses_infinite": estimator.channels if "infinite" in estimator.refuses else (),
         "notes": estimator.notice,
+        "checks_tyres": estimator.training_friction is not None,
     }
     state = render_block(path, "state", precision, beside, **values).rstrip()
     header = render("method.h.j2", precision, **values, state=state)
@@ -199,6 +201,7 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "adapts": monitor.adapts,
         "persistent_steps": monitor.persistent_steps,
         "bands": band_table(stepper),
+        "checks_tyres": estimator.training_friction is not None,
         "pi": math.pi,
     }
 
@@ -249,12 +252,16 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
         "floor_vy": head[2],
         "floor_sideslip": head[3],
         "lowest_speed": head[4],
+        "tyre_weight_vy": head[5],
+        "tyre_weight_sideslip": head[6],
         "weights_vy": terms[0],
         "weights_sideslip": terms[1],
         "largest": terms[2],
         "terms": ("P", "1", "vx", "ax", "ay", "yaw rate vx", "steer vx", "vy"),
         "first_feature": band_rules.FIRST_FEATURE,
         "farthest": stepper.monitor.largest_vy,
+        "tyre_check": stepper.monitor.tyre_check,
+        "friction_slip": FRICTION_SLIP,
     }
 
 

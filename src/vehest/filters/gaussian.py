@@ -24,11 +24,12 @@ class Gaussian(NamedTuple, Generic[Array]):
 class Filtered(NamedTuple, Generic[Array]):
     """What a filter knows after a sequence of T samples."""
 
-    predicted: Gaussian[
-        Array
-    ]  # state at each sample before its measurement; mean (..., T, n); the first is the initial state
+    # state at each sample before its measurement; mean (..., T, n); the first is the initial state
+    predicted: Gaussian[Array]
     filtered: Gaussian[Array]  # state at each sample after its measurement
-    innovation: Array  # measurement minus what was expected of it, (..., T, m); 0 where nothing was measured
-    # (..., T, m, m); rows and columns of what was not measured are those of the identity, so that eᵀS⁻¹e counts what was measured only
+    # measurement minus what was expected of it, (..., T, m); 0 where nothing was measured
+    innovation: Array
+    # (..., T, m, m); rows and columns of what was not measured are those of the identity, so that
+    # eᵀS⁻¹e counts what was measured only
     innovation_covariance: Array
     measured: Tensor | NDArray[np.bool_]  # whether there was a measurement, bool, (..., T, m)

@@ -62,10 +62,16 @@ def kalman_scan(
         )
     (steps, m) = measurements.shape
     n = model.transition.shape[-1]
-    shapes = ((n, n), (n,), (n, n), (m, n), (m,), (m,))
+    shapes = {
+        "transition": (n, n),
+        "transition_offset": (n,),
+        "process_noise": (n, n),
+        "observation": (m, n),
+        "observation_offset": (m,),
+        "observation_noise": (m,),
+    }
     parts = [
-        _contiguous(part, (steps, *shape), name)
-        for name, part, shape in zip(LinearModel._fields, model, shapes, strict=True)
+        _contiguous(getattr(model, name), (steps, *shape), name) for name, shape in shapes.items()
     ]
     y = _contiguous(measurements, (steps, m), "measurements").copy()
     start = (
@@ -179,8 +185,8 @@ def _scan(  # type: ignore[no-untyped-def]
             mean[i] = x[i]
             for j in range(n):
                 cov[i, j] = P[i, j]
-        # One measurement after the other, since their noise is independent. The yaw rate before ay keeps
-        # more digits.
+        # One measurement after the other, since their noise is independent. The yaw rate before ay
+        # keeps more digits.
         for c in range(m - 1, -1, -1):
             if not is_measured[c]:
                 continue
@@ -208,7 +214,7 @@ def _scan(  # type: ignore[no-untyped-def]
 
 @numba.njit
 def _row_times(a, i, b, j):  # type: ignore[no-untyped-def]
-    """Row i of a matrix times row j of another: an element of A Bᵀ, or of A B where B is symmetric."""
+    """Row i of A times row j of B: an element of A Bᵀ, or of A B where B is symmetric."""
     total = 0.0
     for c in range(a.shape[1]):
         total += a[i, c] * b[j, c]

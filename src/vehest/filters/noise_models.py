@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vehest.filters.unscented_scan import CompiledNoise
 
-FLOOR = 1e-7
+COVARIANCE_FLOOR = 1e-7
 """Added to the diagonal, so that a covariance stays positive definite (Węgrzynowski et al. 2024,
 Eq. 7).
 """
@@ -23,8 +23,9 @@ DEVIATION = 1e-3  # of the random weights of L to begin with; its offsets start 
 
 
 class ConstantNoise(nn.Module):
-    """A full covariance L Lᵀ + `FLOOR` · I with a lower triangular factor that is learnt, row by
-    row in units that `begin` may set.
+    """A full covariance L Lᵀ + `COVARIANCE_FLOOR` · I with a learnt lower triangular factor L.
+
+    The factor's entries are stored row by row, in units that `begin` may set.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ class ConstantNoise(nn.Module):
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
         factor = self.factor * self.unit[_lower(self.n)[0]] * self.learnt
-        return _product(factor, self.n, FLOOR).expand(*state.shape[:-1], self.n, self.n)
+        return _product(factor, self.n, COVARIANCE_FLOOR).expand(*state.shape[:-1], self.n, self.n)
 
 
 class StateDependentNoise(nn.Module):
@@ -97,7 +98,10 @@ class StateDependentNoise(nn.Module):
         self.reset()
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
-        """Start from a covariance, (n, n); see `ConstantNoise.begin`. L sees states in units, (k,)."""
+        """Start from a covariance, (n, n), see `ConstantNoise.begin`.
+
+        The network receives states in ``state_unit``, (k,).
+        """
         self.constant.begin(covariance, pace)
         with torch.no_grad():
             self.unit.copy_(self.constant.unit / SCALE**0.5)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class SigmaRule(NamedTuple):
-    """Symmetric points: the mean, and mean ± spread · columns of the covariance's Cholesky factor."""
+    """Symmetric points: the mean, and mean ± spread · columns of the Cholesky factor of P."""
 
     spread: float  # distance in columns of the factor, positive
     centre_mean: float  # weight of the mean point in means

@@ -169,7 +169,7 @@ def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultW
 
 
 @compiled
-def forward(  # type: ignore[no-untyped-def]
+def forward(
     calls,
     at_state,
     car_at,
@@ -268,7 +268,7 @@ def forward(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):  # type: ignore[no-untyped-def]
+def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):
     """The adjoint of `forward` over all samples.
 
     Parameters
@@ -353,7 +353,7 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
 
 
 @compiled
-def _add(total, values, first, end):  # type: ignore[no-untyped-def]
+def _add(total, values, first, end):
     rows = total.reshape(-1, total.shape[total.ndim - 1])
     added = values.reshape(-1, total.shape[total.ndim - 1])
     for row in range(rows.shape[0]):
@@ -362,7 +362,7 @@ def _add(total, values, first, end):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _clear(values, first, end):  # type: ignore[no-untyped-def]
+def _clear(values, first, end):
     rows = values.reshape(-1, values.shape[values.ndim - 1])
     for row in range(rows.shape[0]):
         for b in range(first, end):

@@ -49,7 +49,7 @@ from vehest.filters.unscented_loops import (
 )
 from vehest.filters.unscented_steps import room
 
-MARGIN = 1e-6
+MIN_EIGENVALUE_SHARE = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
 Array = NDArray[Any]
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -62,8 +62,8 @@ class NonlinearFiltered(NamedTuple):
     """What a nonlinear filter knows after a sequence."""
 
     steps: Filtered[Tensor]
-    # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in a scan without repair, made everything
-    # from there on NaN
+    # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in
+    # a scan without repair, made everything from there on NaN
     repaired: Tensor
 
 
@@ -86,9 +86,8 @@ class PointModel:
     )
     scratch_rows = 0
     parameters: Sequence[Tensor] = ()  # what gradients are wanted for
-    lower: Sequence[float] | None = (
-        None  # smallest possible value of each state, (n,); none: everything is possible
-    )
+    # smallest possible value of each state, (n,); none: everything is possible
+    lower: Sequence[float] | None = None
 
     def working(self) -> AbstractContextManager[object]:
         """What the entries are called within, by one thread for all."""
@@ -189,7 +188,7 @@ def _setting(
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
     return Setting(
-        (np.array(rule, dtype), lower, dtype(MARGIN), repair),
+        (np.array(rule, dtype), lower, dtype(MIN_EIGENVALUE_SHARE), repair),
         gate is not None,
         dtype(limit),
         patience,
@@ -256,7 +255,8 @@ def unscented_scan(
         )
     if inputs.shape[:-1] != measurements.shape[:-1]:
         raise ValueError(
-            f"inputs of shape {tuple(inputs.shape)} do not fit measurements of shape {tuple(measurements.shape)}"
+            f"inputs of shape {tuple(inputs.shape)} do not fit measurements of shape "
+            f"{tuple(measurements.shape)}"
         )
     sequences, steps, m = measurements.shape
     n = initial.mean.shape[-1]
@@ -265,7 +265,8 @@ def unscented_scan(
         covariance = initial.covariance.expand(sequences, n, n)
     except RuntimeError:
         raise ValueError(
-            f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences"
+            f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} "
+            "sequences"
         ) from None
     dtype = np.float32 if measurements.dtype == torch.float32 else np.float64
     setting = _setting(model, rule, n, dtype, repair, gate)
@@ -430,8 +431,9 @@ def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
     """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's
     parameters alone.
     """
-    after: Tensor = _Moved.apply(model, states, inputs, *model.parameters)  # type: ignore[no-untyped-call]
-    return after
+    apply: Any = _Moved.apply
+    moved_states: Tensor = apply(model, states, inputs, *model.parameters)
+    return moved_states
 
 
 class _Moved(torch.autograd.Function):
@@ -586,7 +588,8 @@ def _forward_by(
         for at, entry in zip(functions, at_states, strict=True)
         for part in (entry, at and at.car)
     ]
-    return partial(loop, Forward._make((*steps, *entries, model.car)), *noises)
+    called: list[Any] = [*steps, *entries, model.car]
+    return partial(loop, Forward(*called), *noises)
 
 
 def _backward_by(
@@ -595,19 +598,17 @@ def _backward_by(
     """The adjoint's loop with a model, and the gradients as it takes them."""
     parameter_gradients = model.learnt(gradients)
     if not model.is_compiled or config.DISABLE_JIT:
-        return partial(
-            getattr(backward, "py_func", backward),
-            Backward._make((*BACKWARD, *model.entries[2:], model.car)),
-        ), parameter_gradients
+        uncompiled: list[Any] = [*BACKWARD, *model.entries[2:], model.car]
+        loop = getattr(backward, "py_func", backward)
+        return partial(loop, Backward(*uncompiled)), parameter_gradients
     points = tape.moved[0]
     inputs = u[0]
-    called = [
+    models = [
         by_address(entry, points, inputs, model.car, upstream, points, parameter_gradients, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
-    return partial(
-        backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))
-    ), parameter_gradients
+    called: list[Any] = [*steps_by_address(BACKWARD, points.dtype), *models, model.car]
+    return partial(backward, Backward(*called)), parameter_gradients
 
 
 def _sequences_last(values: Array) -> Array:

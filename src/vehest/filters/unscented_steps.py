@@ -3,7 +3,8 @@
 Flow of one sample k (forward), with the function that computes each arrow:
 
     x, P of sample k - 1 --points_of--> points --model--> moved --moments_of--> x, P before y[k]
-    x, P before y[k] --points_of--> points --model--> expected --gate_of, update_of--> x, P after y[k]
+    x, P before y[k] --points_of--> points --model--> expected
+                     --gate_of, update_of--> x, P after y[k]
 
 With sigma points X_s, weights w_s (means) and v_s (covariances), and L Lᵀ = P:
 
@@ -91,38 +92,38 @@ def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
 
 
 @piece
-def at_row(values, row, b):  # type: ignore[no-untyped-def]
+def at_row(values, row, b):
     """Vector of a row (the indices before the last one, as one) from sequence b on."""
     return load_unfused(values, row * values.shape[values.ndim - 1] + b)
 
 
 @piece
-def _scratch_row(rows, row):  # type: ignore[no-untyped-def]
+def _scratch_row(rows, row):
     """Vector of one row of scratch memory, (R, W)."""
     return load_unfused(rows, row * rows.shape[1])
 
 
 @piece
-def _set_scratch_row(rows, row, vector):  # type: ignore[no-untyped-def]
+def _set_scratch_row(rows, row, vector):
     """Write a vector into one row of scratch memory, (R, W)."""
     store(rows, row * rows.shape[1], vector)
 
 
 @piece
-def _rows(count, like):  # type: ignore[no-untyped-def]
+def _rows(count, like):
     """Scratch memory of ``count`` vectors of the type of ``like``, (count, W)."""
     return np.empty((count, width(like)), like.dtype)
 
 
 @piece
-def _read(values, rows, b):  # type: ignore[no-untyped-def]
+def _read(values, rows, b):
     """Copy all rows of the sequences from b on into scratch memory."""
     for row in range(rows.shape[0]):
         _set_scratch_row(rows, row, at_row(values, row, b))
 
 
 @piece
-def _write(rows, out, b, end):  # type: ignore[no-untyped-def]
+def _write(rows, out, b, end):
     """Copy scratch memory to the sequences from b to ``end``, at most one vector of them."""
     stride = out.shape[out.ndim - 1]
     for row in range(rows.shape[0]):
@@ -130,7 +131,7 @@ def _write(rows, out, b, end):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _is_any_positive(condition, b, end, scratch):  # type: ignore[no-untyped-def]
+def _is_any_positive(condition, b, end, scratch):
     """Whether a vector is positive for a sequence from b to ``end``; ``scratch`` (1, W) becomes the
     vector.
     """
@@ -142,7 +143,7 @@ def _is_any_positive(condition, b, end, scratch):  # type: ignore[no-untyped-def
 
 
 @compiled
-def points_of(mean, state_covariance, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
+def points_of(mean, state_covariance, rules, drawn, repaired, first, end):
     """Draw sigma points X_s = x ± γ L_j and write ``drawn``: points, factors L, covariances.
 
     A covariance that is not positive definite is repaired first (`_repaired`); ``repaired`` (B,)
@@ -186,7 +187,7 @@ def points_of(mean, state_covariance, rules, drawn, repaired, first, end):  # ty
 
 
 @compiled
-def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
+def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):
     """Adjoint of `points_of`; what a repair added counts as constant.
 
     x̄ += Σ X̄_s,  L̄_j = γ (X̄_{1+j} - X̄_{1+n+j}),  P̄ += adjoint of the Cholesky factor
@@ -222,7 +223,7 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
 
 
 @piece
-def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-def]
+def _deviations(values, b, m, rule, deviation, i):
     """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into
     scratch (S · m, W).
     """
@@ -237,7 +238,7 @@ def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-de
 
 
 @piece
-def _weighted(first_deviation, i, n, second_deviation, j, m, rule, centre):  # type: ignore[no-untyped-def]
+def _weighted(first_deviation, i, n, second_deviation, j, m, rule, centre):
     """Weighted product of deviations, i of (S · n, W) with j of (S · m, W); the mean point has the
     weight ``centre``.
     """
@@ -252,7 +253,7 @@ def _weighted(first_deviation, i, n, second_deviation, j, m, rule, centre):  # t
 
 
 @compiled
-def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ignore[no-untyped-def]
+def moments_of(values, noise, rules, mean, covariance, first, end):
     """Weighted mean x = Σ w_s V_s and covariance P = Σ v_s (V_s - x)(V_s - x)ᵀ + (Q + Qᵀ)/2."""
     (count, n) = values.shape[:2]
     (rule, lower, _, _) = rules
@@ -274,7 +275,7 @@ def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ign
 
 
 @compiled
-def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
+def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``.
 
     Q̄ = (P̄ + P̄ᵀ)/2,  D̄_s = 2 v_s Q̄ D_s with D_s = V_s - x,  V̄_s = D̄_s + w_s (x̄ - Σ_r D̄_r).
@@ -325,7 +326,7 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
 
 
 @compiled
-def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, first, end):  # type: ignore[no-untyped-def]
+def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, first, end):
     """Mark measurements that the gate refuses: NaN in ``y``, true in ``is_gated_out``, (m, B) each.
 
     ``refused`` (B, m) counts how long each has been refused; see `Gate`.
@@ -362,7 +363,7 @@ def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, f
 
 
 @compiled
-def update_of(mean, drawn, expected, y, noise, rules, post, update_results, repaired, first, end):  # type: ignore[no-untyped-def]
+def update_of(mean, drawn, expected, y, noise, rules, post, update_results, repaired, first, end):
     """Update the state with a measurement; an element of ``y`` that is NaN was not measured.
 
     K = C S⁻¹,  x⁺ = x + K (y - ŷ),  P⁺ = P - K Cᵀ (see the module).
@@ -432,7 +433,7 @@ def update_of(mean, drawn, expected, y, noise, rules, post, update_results, repa
 
 
 @piece
-def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
+def _moved(mean, K, error, i, m, b):
     """State i after the update, before its lower bound: x_i + Σ_c K_ic e_c."""
     state = at_row(mean, i, b)
     for c in range(m):
@@ -441,7 +442,7 @@ def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # type: ignore[no-untyped-def]
+def _spread(expected, points, mean, y, b, rule, error, spread, deviation):
     """Write innovation, deviations e_s of expected measurements and d_s of points; 0 where not
     measured.
     """
@@ -463,7 +464,7 @@ def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # ty
 
 
 @piece
-def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, innovation_covariance, factor):  # type: ignore[no-untyped-def]
+def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, innovation_covariance, factor):
     """Write C = Σ v_s d_s e_sᵀ, S = Σ v_s e_s e_sᵀ + R and the factor of S.
 
     Returns 1 in lanes in which S is positive definite, else 0.
@@ -489,7 +490,7 @@ def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, innovation_co
 
 
 @piece
-def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ignore[no-untyped-def]
+def _posterior(covariance, b, cross, factor, gain, post_covariance):
     """Write the gain K = C S⁻¹, by the factor of S, and P⁺ = P - (K Cᵀ + C Kᵀ)/2."""
     n = covariance.shape[0]
     m = cross.shape[0] // n
@@ -509,7 +510,7 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
 
 
 @piece
-def _solve(factor, right_sides, at, m, solved):  # type: ignore[no-untyped-def]
+def _solve(factor, right_sides, at, m, solved):
     """Solve S x = b by the factor of S, for b the m rows of ``right_sides`` from ``at`` on."""
     for j in range(m):
         remainder = _scratch_row(right_sides, at + j)
@@ -524,7 +525,7 @@ def _solve(factor, right_sides, at, m, solved):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def update_adjoint(  # type: ignore[no-untyped-def]
+def update_adjoint(
     mean, points, expected, y, rules, update_results, post_bars, prior_bars, other_bars, first, end
 ):
     """Adjoint of `update_of`; writes gradients of x, P, points, expected measurements, R and y.
@@ -661,7 +662,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
 
 
 @piece
-def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
+def _cholesky(A, L, n):
     """Write lower factors L of matrices A = L Lᵀ, (n · n, W).
 
     Returns 1 in lanes in which the matrix is positive definite, else 0.
@@ -690,7 +691,7 @@ def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
+def _repaired(A, L, lane, n, margin, repair):
     """Add a multiple of the identity to one lane's matrix (n · n, W) and write its factor.
 
     The smallest eigenvalue becomes ``margin`` times the largest. Where that fails, or there are no
@@ -717,7 +718,7 @@ def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cholesky_single(A, L):  # type: ignore[no-untyped-def]
+def _cholesky_single(A, L):
     """Write the lower factor of one matrix into L, which is zero; return whether A is positive
     definite.
     """
@@ -739,7 +740,7 @@ def _cholesky_single(A, L):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _cholesky_adjoint(L, L_bar, inner, A_bar, n):  # type: ignore[no-untyped-def]
+def _cholesky_adjoint(L, L_bar, inner, A_bar, n):
     """A_bar += sym(L⁻ᵀ Φ(Lᵀ L_bar) L⁻¹), Φ the lower triangle with half the diagonal (Murray 2016,
     Eq. 10).
     """

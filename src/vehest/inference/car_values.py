@@ -22,7 +22,7 @@ from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.trust.record import Trust
 
 FORMAT = 1
-WIDENING = 1.5
+DEVIATION_FACTOR = 1.5
 """By which the deviations of a record are multiplied before an estimate starts from them."""
 LIMITS = {
     "leakage": (-0.3, 0.3),
@@ -212,7 +212,9 @@ def _is_changed(model: SelfCalibrating, name: str) -> bool:
     return bool(getattr(model.settings, name) != getattr(SelfCalibrating.settings_type(), name))
 
 
-def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) -> SelfCalibrating:
+def calibrated(
+    model: Estimator, record: CarRecord, widening: float = DEVIATION_FACTOR
+) -> SelfCalibrating:
     """The filter with a car's wheelbase and, as priors, its leakage and rear axle.
 
     Deviations are widened. Errors are those of `with_settings`.

@@ -10,9 +10,17 @@ from typing import Any
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.data.estimate import IN_DEGREES, QUANTITIES, Estimate, number_cell, time_cell
+from vehest.data.estimate import (
+    IN_DEGREES,
+    QUANTITIES,
+    Estimate,
+    estimate_columns,
+    number_cell,
+    time_cell,
+    with_degrees,
+)
 from vehest.data.files import written_aside
-from vehest.data.store import estimate_columns, with_degrees, write_estimate_parts
+from vehest.data.store import write_estimate_parts
 from vehest.trust.health import reason_in_words
 
 TABLE_SUFFIXES = (".parquet", ".csv")

@@ -107,8 +107,8 @@ def drive_figure(
     """Draw a drive on one page for print, in colours that colour-blind readers tell apart.
 
     Sideslip with the 90 % band and the health of the first estimate; lateral velocity; the measured
-    channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over reference.
-    What is not there is left out.
+    channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over
+    reference. What is not there is left out.
 
     Parameters
     ----------

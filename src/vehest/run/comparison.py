@@ -55,12 +55,10 @@ class Comparison:
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
-    finished: Mapping[str, Member] = field(
-        default_factory=dict
-    )  # key of a training -> its trained and evaluated member
-    differences: Mapping[str, Differences] = field(
-        default_factory=dict
-    )  # key of a training -> options in which it differs from others of its variant and seed
+    # key of a training -> its trained and evaluated member
+    finished: Mapping[str, Member] = field(default_factory=dict)
+    # key of a training -> options in which it differs from others of its variant and seed
+    differences: Mapping[str, Differences] = field(default_factory=dict)
     reason_unfinished: str = NO_TIME
 
     @property

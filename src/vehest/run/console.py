@@ -5,6 +5,7 @@ Text from files is shown with control characters as escapes, and nothing in it i
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any
@@ -26,6 +27,7 @@ from vehest.data.errors import printable
 
 WARNING = "warn"
 REUSED = "skip"  # status of an existing artefact, also in records of finished studies
+RUNNING = "run"
 MARKS = {
     WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
@@ -36,11 +38,14 @@ MARKS = {
     "fail": ("failed", "red"),
     "stop": ("stopped", "yellow"),
     "wait": ("waiting", "cyan"),
+    RUNNING: ("running", "cyan"),
     "again": ("again", "yellow"),
 }
 """Status -> its word and colour."""
 
 MAX_BARS = 16
+MAX_SILENT_SECONDS = 10.0
+"""After this time a stage that is still running gets a line, so that a log shows no hang."""
 
 
 class _Console(Console):
@@ -63,6 +68,7 @@ class Messages:
         self.quiet = quiet
         self.printed: list[tuple[str, str, str, str]] = []
         self._reused: list[tuple[str, str]] = []  # stage and label, not printed yet
+        self._timers: dict[tuple[str, str], threading.Timer] = {}  # of running stages
 
     def warn(self, text: str) -> None:
         """Print a warning."""
@@ -74,13 +80,33 @@ class Messages:
         if status == REUSED:
             self._reused.append((stage, label))
             return
-        word, colour = MARKS[status]
         if status == WARNING:
+            word, colour = MARKS[status]
             text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
         else:
-            suffix = (f" {printable(detail)}" if detail else "", "dim")
-            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)
+            text = _status_line(status, stage, label, detail)
         self._print(text, always=status == WARNING)
+
+    def begin(self, stage: str, label: str) -> None:
+        """Print that a stage is running if it has not ended after `MAX_SILENT_SECONDS`."""
+        line = _status_line(RUNNING, stage, label)
+        timer = threading.Timer(MAX_SILENT_SECONDS, self._print, [line])
+        timer.daemon = True
+        self.end(stage, label)
+        self._timers[stage, label] = timer
+        timer.start()
+
+    def end(self, stage: str, label: str) -> None:
+        """Note the end of a stage, if it was begun."""
+        timer = self._timers.pop((stage, label), None)
+        if timer is not None:
+            timer.cancel()
+
+    def close(self) -> None:
+        """Note the end of all stages and print the reused artefacts."""
+        for stage, label in list(self._timers):
+            self.end(stage, label)
+        self.print_reused()
 
     def print_reused(self) -> None:
         """Print one line for all existing artefacts that were reused since the last such line."""
@@ -116,6 +142,12 @@ class Messages:
         drawn = not self.quiet and self.console.is_terminal
         bars = Bars(*columns, console=self.console, transient=True, disable=not drawn)
         return bars if drawn else nullcontext(bars)
+
+
+def _status_line(status: str, stage: str, label: str, detail: str = "") -> Text:
+    word, colour = MARKS[status]
+    suffix = (f" {printable(detail)}" if detail else "", "dim")
+    return Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)
 
 
 class Bars(Progress):

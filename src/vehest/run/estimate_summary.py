@@ -92,17 +92,44 @@ def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
         "file": f"{outcome['out']}{_columns(Path(outcome['out']))}",
         "picture": outcome.get("plot", ""),
         "note": outcome.get("note", ""),
+        "use": describe_use(outcome),
     }
     return [f"{label:<{LABEL_WIDTH}}{text}" for label, text in rows.items() if text]
 
 
 def _valid(outcome: Mapping[str, Any]) -> str:
-    """Share of valid samples, and the most frequent reasons for the others."""
+    """Share of valid samples, and what it rests on where the model has no calibration."""
     share = f"{outcome['valid_percent']:.3g} % of the estimated samples"
     if not outcome["has_calibration"]:
         return f"{share}, by gaps and speeds alone: the model has no calibration"
-    reasons = "; ".join(_grouped(outcome["invalid_reasons"]))
-    return f"{share}{reasons and f'; the others: {reasons}'}"
+    return share
+
+
+def describe_use(outcome: Mapping[str, Any]) -> str:
+    """Which samples may be used, how far off they may be, and what limits the others."""
+    if not outcome["has_calibration"]:
+        return (
+            "not before a comparison with a reference: the model has no calibration, so that "
+            "neither its error nor its range is known"
+        )
+    condition = "once the warnings above are settled, " if outcome["findings"] else ""
+    limits = "; ".join(_grouped(outcome["invalid_reasons"]))
+    valid_percent = outcome["valid_percent"]
+    if not valid_percent:
+        return f"no sample: health is 0 at none{limits and f'; {limits}'}"
+    where = (
+        "all samples"
+        if valid_percent == 100.0
+        else f"only the samples with health 0 ({valid_percent:.3g} %)"
+    )
+    band = outcome.get("band_sideslip_deg")
+    error = (
+        "the band is made to contain 9 of 10 errors of β, and is at most "
+        f"±{band['median']:.2f}° in half of all samples"
+        if band
+        else "no band says how large their errors are"
+    )
+    return f"{condition}{where}; {error}{limits and f'; the others: {limits}'}"
 
 
 def _grouped(reasons: Sequence[str]) -> list[str]:

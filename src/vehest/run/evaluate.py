@@ -280,7 +280,7 @@ def _write(
         rows += _rows(head, figures, figure_intervals(blocks[name]))
         rows += _rows_of_parts(evaluation, head, spans, scored, bands)
         under_faults += _rows_under_faults(estimator, evaluation, head, spans, scored, trust)
-    rows += _training_rows(evaluation, model, estimator)
+    rows += training_rows(evaluation, model, estimator)
     write_segments(folder / BLOCKS, blocks)
     for file, timed in ((METRICS, False), (TIMINGS, True)):
         with open(folder / file, "w", newline="", encoding="utf-8") as stream:
@@ -450,7 +450,7 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
     return float(np.median(times))
 
 
-def _training_rows(
+def training_rows(
     evaluation: Evaluation, model: Artefact, estimator: Estimator
 ) -> list[dict[str, Any]]:
     """Errors on the training ranges.

@@ -43,9 +43,8 @@ class FaultSettings:
     channel: str
     severity: Annotated[Severity, "mild, medium or severe"]
     size: float | None = None  # instead of the severity's
-    start: float | None = (
-        None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
-    )
+    # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    start: float | None = None
     duration: float | None = None  # [s]; None: to the end of the range
     seed: int = 0
 

@@ -111,7 +111,7 @@ class Group:
                 waiting = [job for job in waiting if job not in jobs]
             members = []
             for job in self.jobs:
-                with _compile_lock(job.plan.output, should_stop):
+                with compile_lock(job.plan.output, should_stop):
                     members.append(_member(self, job, models[job.plan.key], artefact_of))
             return members
 
@@ -163,7 +163,7 @@ def _member(
     )
 
 
-def _compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
+def compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
     """While kernels of calibration and evaluation are not in the compile cache, one process
     compiles them, and others wait for it.
     """

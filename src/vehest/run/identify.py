@@ -42,7 +42,7 @@ from vehest.sources.base import car_of
 IDENTIFIED_SHARE = (
     0.5  # of the prior's variance: a number is identified on a drive that leaves less
 )
-ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
+STATE_ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
 UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
 MEANINGS = {
@@ -183,7 +183,7 @@ def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
     numbers = {
-        name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in ROWS.items()
+        name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in STATE_ROWS.items()
     }
     numbers |= {
         name: (float(mean[:, at].mean()), math.sqrt(variance[:, at].mean()))
@@ -200,7 +200,8 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights
     numbers = {
-        name: Normal(float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()
+        name: Normal(float(mean[at]), float(deviation[at]))
+        for name, at in (STATE_ROWS | OFFSETS).items()
     }
     return numbers | {"grip": Normal(*_grip(model, start))}
 

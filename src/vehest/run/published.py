@@ -20,7 +20,13 @@ from typing import Any
 from vehest.artefacts.keys import CONFIGURATION, Keys, changed_keys, changed_options, hash_of
 from vehest.configuration.composition import Config
 from vehest.configuration.files import find_pipeline, pipeline_names
-from vehest.data.errors import ConfigurationError, MissingError, VehestError, abbreviated
+from vehest.data.errors import (
+    ConfigurationError,
+    MissingError,
+    VehestError,
+    abbreviated,
+    number_of,
+)
 from vehest.data.schema import validated
 from vehest.data.split_files import dataset_names
 from vehest.data.text_files import read_yaml
@@ -284,7 +290,8 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> di
         state = "stale" if changes else "up to date"
     n_not_trained = 0 if published is None else published.n_not_trained
     if n_not_trained:
-        note = "; ".join(filter(None, (f"published without {n_not_trained} trainings", note)))
+        missing = f"published without {number_of(n_not_trained, 'training')}"
+        note = "; ".join(filter(None, (missing, note)))
     return _outcome(study, state, changes, note, n_not_trained)
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from vehest.artefacts.artefact import TIMINGS, Artefact
 from vehest.artefacts.keys import Keys, changed_keys
 from vehest.artefacts.locks import Lock, held
-from vehest.data.errors import ConfigurationError, abbreviated
+from vehest.data.errors import ConfigurationError, abbreviated, number_of
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json, write_json
@@ -36,9 +36,8 @@ class Publication:
     """A study whose report goes to results/<study>."""
 
     study: str
-    absent: Mapping[
-        str, str
-    ]  # name of a part or data set that the study went on without -> the same for people
+    # name of a part or data set that the study went on without -> the same for people
+    absent: Mapping[str, str]
     keys: Keys  # `vehest.run.published.keys_of_study`
     n_not_trained: int = 0  # trainings that the report names as missing
 
@@ -115,7 +114,8 @@ def publish_study(
         return None
     n_fewer = publication.n_not_trained - former.n_not_trained
     if n_fewer > 0 and former.keys and not changed_keys(former.keys, publication.keys):
-        messages.warn(f"not published: '{folder}' shows {n_fewer} trainings that this run lacks")
+        more = number_of(n_fewer, "training")
+        messages.warn(f"not published: '{folder}' shows {more} that this run lacks")
         return None
     with held(Lock(report.folder.parents[1], "publish", publication.study), lambda: False):
         if _is_published(report, folder, publication):

@@ -65,12 +65,10 @@ class Record:
 
     inputs: str  # of its `RunCache`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
-    made: tuple[
-        tuple[str, str, str], ...
-    ]  # folder in the output root, key and digest, which is in later keys; the report last
-    notes: tuple[
-        tuple[str, str, str, str], ...
-    ]  # that the next run in full would print too: status, stage, label, detail
+    # folder in the output root, key and digest, which is in later keys; the report last
+    made: tuple[tuple[str, str, str], ...]
+    # that the next run in full would print too: status, stage, label, detail
+    notes: tuple[tuple[str, str, str, str], ...]
     summary: TerminalSummary
     publication: Publication | None
     store: str  # MLflow's local store in the output root; empty where there is none

@@ -248,6 +248,11 @@ class Stages:
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         """Make an artefact unless it is there."""
+
+        def print_waiting(waiting: Waiting) -> None:
+            self.messages.end(plan.stage, plan.label)
+            self.print_waiting(waiting)
+
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
         artefact = None if plan.stage in self.force else find(plan, self.messages.warn)
@@ -255,9 +260,13 @@ class Stages:
             self.messages.line("plan", plan.stage, plan.label)
             raise DryRunStop
         if artefact is None:
-            artefact = ensured(
-                plan, write, plan.stage in self.force, self.stop.requested, self.print_waiting
-            )
+            self.messages.begin(plan.stage, plan.label)
+            try:
+                artefact = ensured(
+                    plan, write, plan.stage in self.force, self.stop.requested, print_waiting
+                )
+            finally:
+                self.messages.end(plan.stage, plan.label)
             self.stop.raise_if_requested()
             assert artefact is not None
         detail = (
@@ -321,6 +330,7 @@ class Runner(Stages):
                     group = waiting[done.position]
                     outcome = done.outcome
                     bars.close(group.name)
+                    self.messages.end(TRAIN, group.name)
                     bars.step(ALL, ended, len(waiting))
                     if not isinstance(outcome, Failure):
                         members |= self._received(outcome)
@@ -443,9 +453,12 @@ class Runner(Stages):
         """Draw the progress of a group, or print for whom it waits."""
         name = groups[at].name
         if isinstance(news, Waiting):
+            self.messages.end(TRAIN, name)
             self.print_waiting(news)
         elif news is None:
             bars.step(name, 0, 1, "starting")
+            if not self.messages.console.is_terminal:  # which has the bar
+                self.messages.begin(TRAIN, name)
         else:
             note = (
                 f"{news.active}/{news.members} active, best validation loss "

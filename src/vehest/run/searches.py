@@ -120,8 +120,8 @@ def remarks_on(
             if name in study.trials:
                 continue
             for config in (job.config for job in comparison.usable):
-                is_searched = _compared(config, tried) == _compared(best, tried)
-                if is_searched and _compared(config) != _compared(best):
+                is_searched = settings_to_compare(config, tried) == settings_to_compare(best, tried)
+                if is_searched and settings_to_compare(config) != settings_to_compare(best):
                     remarks[
                         f"part '{name}' does not use what the search '{chosen.search}' chose by "
                         f"{chosen.metric} "
@@ -189,7 +189,9 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
     return float(rows["value"].iloc[0])
 
 
-def _compared(config: Config, tried: set[str] | frozenset[str] = frozenset()) -> dict[str, Any]:
+def settings_to_compare(
+    config: Config, tried: set[str] | frozenset[str] = frozenset()
+) -> dict[str, Any]:
     """What determines a training, without its seed and the options that are tried."""
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}

@@ -103,15 +103,21 @@ def _line(key: str, comment: str) -> str:
 
 
 def field_comments(described: type) -> dict[str, str]:
-    """Comments of the fields of a dataclass, within the statement of each or behind it: name ->
-    text.
+    """Comments of the fields of a dataclass: name -> text.
+
+    A field's comment is above its statement, or within the statement or behind it.
     """
     source = textwrap.dedent(inspect.getsource(described))
-    comments = {
-        token.start[0]: token.string.lstrip("# ")
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
+    comments: dict[int, str] = {}  # by line
+    above: dict[int, str] = {}  # the same of those that have their line to themselves
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            line = token.start[0]
+            comments[line] = token.string.lstrip("# ")
+            if token.line.lstrip().startswith("#"):
+                above[line] = (
+                    f"{above[line - 1]} {comments[line]}" if line - 1 in above else comments[line]
+                )
     lines = source.splitlines()
     (kind,) = ast.parse(source).body
     assert isinstance(kind, ast.ClassDef)
@@ -120,9 +126,11 @@ def field_comments(described: type) -> dict[str, str]:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             end = node.end_lineno or node.lineno
             is_closed = not lines[end : end + 1] or not lines[end].startswith("    )")
-            for line in range(node.lineno, end + (1 if is_closed else 2)):
-                if line in comments:
-                    of_fields[node.target.id] = comments[line]
+            within = range(node.lineno, end + (1 if is_closed else 2))
+            texts = [comments[line] for line in within if line in comments]
+            texts = texts or [above[line] for line in [node.lineno - 1] if line in above]
+            if texts:
+                of_fields[node.target.id] = texts[-1]
     return of_fields
 
 

@@ -113,9 +113,8 @@ class Study(PipelineFile):
     file: Path = Path()
     command: str = ""  # that makes it, without where data come from and results go
     words: tuple[str, ...] = ()  # of the command that runs it here, all of them
-    searches: dict[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # part of the file with a search -> its trials, each a part here
+    # part of the file with a search -> its trials, each a part here
+    searches: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def trials(self) -> frozenset[str]:
@@ -138,15 +137,12 @@ class Study(PipelineFile):
 class Job:
     """One training and its evaluation."""
 
-    config: (
-        Config  # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
-    )
-    label: str = (
-        ""  # its settings as a sweep names them; empty for the estimator's name and variant
-    )
-    values: Mapping[str, Value] = field(
-        default_factory=dict
-    )  # keys that a sweep varies -> its own values
+    # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
+    config: Config
+    # its settings as a sweep names them; empty for the estimator's name and variant
+    label: str = ""
+    # keys that a sweep varies -> its own values
+    values: Mapping[str, Value] = field(default_factory=dict)
     combination: int = 0  # of these values
     failure: Failure | None = None  # why it cannot be done, or failed
     training: TrainJob | None = None  # once it is planned

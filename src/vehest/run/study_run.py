@@ -114,7 +114,7 @@ def open_runner(
         try:
             yield runner
         finally:
-            messages.print_reused()
+            messages.close()
 
 
 def run_study(

@@ -56,9 +56,8 @@ class Tracker:
     warn: Callable[[str], None]  # called with one line when tracking is given up
     should_stop: Callable[[], bool] = lambda: False  # asked while another process logs
     study: str = ""  # name of the study or sweep above the runs
-    complete: bool = field(
-        default=True, init=False
-    )  # whether every artefact was logged; without MLflow too
+    # whether every artefact was logged; without MLflow too
+    complete: bool = field(default=True, init=False)
 
     @property
     def store(self) -> str:

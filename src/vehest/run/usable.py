@@ -41,9 +41,8 @@ class Missing:
 
     to_estimate: list[str]
     to_train: list[str]
-    supplies: dict[
-        str, Derivation | None
-    ]  # channel -> transforms that make it of channels that are there; None where none do
+    # channel -> transforms that make it of channels that are there; None where none do
+    supplies: dict[str, Derivation | None]
 
     @property
     def unsupplied(self) -> list[str]:
@@ -69,13 +68,11 @@ class Usability:
     gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
     settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
     without: str = ""  # the same in words, with channels that are missing even then
-    patterns: tuple[
-        str, ...
-    ] = ()  # overrides that its fit needs, since it asks for recordings by other names
+    # overrides that its fit needs, since it asks for recordings by other names
+    patterns: tuple[str, ...] = ()
     to_give: str = ""  # setting that only the user knows, or why it is unusable
-    car: tuple[
-        str, ...
-    ] = ()  # keys of the car's parameters, which are those of another car unless given
+    # keys of the car's parameters, which are those of another car unless given
+    car: tuple[str, ...] = ()
     settings_suffice: bool = False  # whether nothing is missing with ``settings``
     of_car: str = ""  # overrides with values of the car that the user has to give; empty if none
 

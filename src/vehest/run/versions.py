@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class
 from vehest.sources.base import source_class
 from vehest.studies.registry import study_module
@@ -17,6 +18,11 @@ VERSIONS = {
 }
 """Stage -> its version, raised when its numbers move."""
 FAULTS = "3"  # of an evaluation's faults, likewise
+TYRE_CHECK = "1"  # of a calibration of estimators whose tyre model bands check, likewise
+
+
+def _checks_tyres(name: str) -> bool:
+    return estimator_class(name).training_friction is not Estimator.training_friction
 
 
 def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
@@ -35,6 +41,8 @@ def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
         code += f" {name}={getattr(study_module(name), 'VERSION', '1')}"
     elif name:
         code += f" {name}={estimator_class(name).version}"
+    if stage == "calibrate" and name and _checks_tyres(name):
+        code += f" tyre_check={TYRE_CHECK}"
     if stage == "train":
         code += f" training={getattr(estimator_class(name).training_type, 'version', '1')}"
     return f"{code} faults={FAULTS}" if faults else code

@@ -67,11 +67,12 @@ class PublishedWeights:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._models: dict[str, PublishedModel] = {}
+        self.models: dict[str, PublishedModel] = {}
+        """Key of a training -> its published model, as last read or written."""
         self._read()
 
     def __contains__(self, key: str) -> bool:
-        return key in self._models
+        return key in self.models
 
     def add(self, models: Iterable[Artefact]) -> int:
         """Add models of finished trainings, in one step: whoever reads or is killed finds the file
@@ -95,19 +96,19 @@ class PublishedWeights:
         added = {
             model.key: model
             for model in models
-            if model.key not in self._models or self._models[model.key].digest != model.digest
+            if model.key not in self.models or self.models[model.key].digest != model.digest
         }
         if not added:
             return 0
         tensors = {
             name: values
-            for name, values in (load_file(self.path) if self._models else {}).items()
+            for name, values in (load_file(self.path) if self.models else {}).items()
             if name.partition("/")[0] not in added
         }
         for key, model in added.items():
             of_model = load_file(model.folder / WEIGHTS)
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
-        records = self._models | {key: _record_of(model) for key, model in added.items()}
+        records = self.models | {key: _record_of(model) for key, model in added.items()}
         about = {key: asdict(record) for key, record in sorted(records.items())}
         content = save(tensors, metadata={MODELS: json.dumps(about)})
         megabytes = len(content) / 1e6
@@ -118,7 +119,7 @@ class PublishedWeights:
         remove_leftovers(self.path.parent)
         with written_aside(self.path) as aside:
             aside.write_bytes(content)
-        self._models = records
+        self.models = records
         return len(added)
 
     def write(self, key: str, folder: Path) -> None:
@@ -130,7 +131,7 @@ class PublishedWeights:
         DataError
             The model is not the one that was published.
         """
-        record = self._models[key]
+        record = self.models[key]
         try:
             for name in FILES:
                 if name in record.files:
@@ -160,11 +161,11 @@ class PublishedWeights:
     def _read(self) -> None:
         """Read the models from the file, if there is one."""
         if not self.path.is_file():
-            self._models = {}
+            self.models = {}
             return
         try:
             with safe_open(self.path, framework="np") as file:
-                self._models = TypeAdapter(dict[str, PublishedModel]).validate_json(
+                self.models = TypeAdapter(dict[str, PublishedModel]).validate_json(
                     file.metadata()[MODELS]
                 )
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,20 +45,16 @@ class Flags:
     spun: bool  # the car slid beyond the validity of its equations of rolling
     left_road: bool = False  # it was further beside its line than the manoeuvre's half_width
     stood: bool = False  # it stands at the end
-    completed: (
-        bool  # the manoeuvre came to its own end, and was not cut off because it took too long
-    )
-    gave_up_at: float | None = (
-        None  # when the driver began to stop because of a spin or beside the road [s]; none if never
-    )
-    largest_lateral_error: float | None = (
-        None  # distance from the line [m]; none where there is no line
-    )
+    # the manoeuvre came to its own end, and was not cut off because it took too long
+    completed: bool
+    # when the driver began to stop because of a spin or beside the road [s]; none if never
+    gave_up_at: float | None = None
+    # distance from the line [m]; none where there is no line
+    largest_lateral_error: float | None = None
     largest_sideslip: float  # above 1 m/s, either sign [rad]
     largest_ay: float  # either sign [m/s²]
-    stability_share: float | None = (
-        None  # of the recorded time in which stability control intervened; none where it is off
-    )
+    # of the recorded time in which stability control intervened; none where it is off
+    stability_share: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +62,8 @@ class Trip:
     """True motion and outcome of a drive."""
 
     motion: Motion  # true motion, first sample after the settling time
-    lateral_error: (
-        FloatArray  # the car's place left of its line [m], (T,); NaN where there is no line
-    )
+    # the car's place left of its line [m], (T,); NaN where there is no line
+    lateral_error: FloatArray
     flags: Flags  # how it went
     drawn: dict[str, Any]  # values that the seed drew
 
@@ -147,7 +142,23 @@ def recording_of(
     sensors: SensorLevels,
     seed: int,
 ) -> Recording:
-    """The recording of a trip; its provenance is ``about``, then seed, sensors and flags."""
+    """The recording of a trip.
+
+    Parameters
+    ----------
+    id, vehicle : str
+        Of the recording.
+    trip : Trip
+        True motion and outcome.
+    channels : dict
+        Measured channels [SI], (T,) each, as `measure` returns them.
+    about : dict
+        First entries of the provenance: plant, manoeuvre, surface. Seed, sensors and flags follow.
+    sensors : SensorLevels
+        Levels of errors by which the channels were measured.
+    seed : int
+        Of the drive.
+    """
     provenance = {
         **about,
         "seed": seed,
@@ -177,8 +188,36 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion; raises `ConfigurationError` or,
-    where it rolls over, `SimulationError`.
+    """Drive a car through a manoeuvre.
+
+    Parameters
+    ----------
+    plant : MultiBodyPlant
+        The car.
+    manoeuvre : Manoeuvre
+        Makes the driver for the car, the surface and the seed.
+    seed : int
+        Of the driver and of patches on the surface.
+    rate_hz : float
+        Rate of the recorded motion [Hz]; its samples lie on steps of the plant.
+    surface : Surface
+        Friction of the road.
+    stability_control : bool
+        Whether the car has one that brakes single wheels.
+    stint : Stint or None
+        Loss of grip over the drive, unknown to the driver.
+
+    Returns
+    -------
+    Trip
+        True motion from the end of the settling time on, and outcome.
+
+    Raises
+    ------
+    ConfigurationError
+        A rate does not fit the plant's step, or the car cannot do the manoeuvre.
+    SimulationError
+        The car rolled over, or a state is not finite.
     """
     per_command = steps_per_tick(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = steps_per_tick(rate_hz, plant.step, "sampling")
@@ -243,7 +282,8 @@ class _Ride:
         observation = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
         decision = self._controller.command(time, observation)
         if self._stint is not None:
-            decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
+            friction = decision.friction * self._stint.friction_at(time)
+            decision = replace(decision, friction=friction)
         self.decision = decision
         self._judge(time, decision)
         if self._is_over(time, decision):
@@ -346,13 +386,27 @@ class _Ride:
 
 
 def steps_per_tick(rate_hz: float, step: float, rate_name: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate; raises `ConfigurationError` where they
-    are not whole; ``what`` names the rate.
+    """Number of the plant's steps between two ticks of a rate.
+
+    Parameters
+    ----------
+    rate_hz : float
+        The rate [Hz].
+    step : float
+        Of the plant [s].
+    rate_name : str
+        Name of the rate in the error.
+
+    Raises
+    ------
+    ConfigurationError
+        The number is not whole.
     """
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(
-            f"the {rate_name} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a whole number of steps must "
-            f"lie between two samples (with 0.001 s: 10, 20, 25, 40, 50, 100, 125, 200, 250, 500 or 1000 Hz)"
+            f"the {rate_name} rate of {rate_hz} Hz does not fit the plant's step of {step} s: a "
+            "whole number of steps must lie between two samples (with 0.001 s: 10, 20, 25, 40, "
+            "50, 100, 125, 200, 250, 500 or 1000 Hz)"
         )
     return n_steps

@@ -6,6 +6,6 @@ from vehest.data.errors import VehestError
 
 
 class SimulationError(VehestError):
-    """A simulated drive that came to no usable end: the plant blew up, stalled, or lost its course."""
+    """A simulated drive without a usable end: the plant diverged, stalled, or left its course."""
 
     exit_code = 3

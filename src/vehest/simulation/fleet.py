@@ -37,12 +37,14 @@ class Variation:
 
     parameters: tuple[str, ...]  # the library's names, ``tire.p_dy1`` for one of a group
     factor: Scales  # lowest and highest scale, drawn uniformly for every drive
-    log: bool = False  # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
+    # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
+    log: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 < self.factor[0] <= self.factor[1]:
             raise ConfigurationError(
-                f"vary: a factor is a pair [lowest, highest] of positive scales, not {list(self.factor)}"
+                "vary: a factor is a pair [lowest, highest] of positive scales, not "
+                f"{list(self.factor)}"
             )
 
     def drawn(self, generator: np.random.Generator) -> float:
@@ -66,8 +68,12 @@ def variations_from_config(entries: Any) -> tuple[Variation, ...]:
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
-    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing
-    varies; raises `ConfigurationError`.
+    """The vehicle with parameters scaled as the seed draws them; the same one if nothing varies.
+
+    Raises
+    ------
+    ConfigurationError
+        A variation names no parameter of the plant, or one that is no number.
     """
     if not variations:
         return vehicle
@@ -91,8 +97,12 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
-    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no
-    parameter of the plant.
+    """`varied` for a car of the planar plant.
+
+    Raises
+    ------
+    ConfigurationError
+        A variation names no parameter of the plant.
     """
     return scaled_car(
         car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()}
@@ -116,10 +126,10 @@ class SensorVariation:
     error.
     """
 
-    factors: Mapping[
-        str, tuple[float, float]
-    ]  # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
-    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it
+    # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
+    factors: Mapping[str, tuple[float, float]]
+    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the
+    # sensors have it
     roll_share: tuple[float, float] | None = None
 
     @classmethod
@@ -130,7 +140,8 @@ class SensorVariation:
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
             raise ConfigurationError(
-                f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}"
+                f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of "
+                f"scales, not {entries}"
             )
         factors = {
             str(kind): _range(value) for kind, value in entries.items() if kind != "roll_share"

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, number_of
 from vehest.data.limits import check_limit
 from vehest.data.recording import HIGHEST_RATE
 
@@ -110,7 +110,7 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
         if bad.any():
             first = int(np.argmax(bad)) + 1
             return (
-                f"time {fault} {bad.sum()} times, first at sample {first} "
+                f"time {fault} {number_of(bad.sum(), 'time')}, first at sample {first} "
                 f"({stamps[first]:.12g} s); {fix}"
             )
     return ""
@@ -122,10 +122,8 @@ def unevenness(stamps: FloatArray) -> str:
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
-        gaps = (
-            f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after "
-            f"{stamps[longest]:.12g} s"
-        )
+        number = number_of((steps > GAP * step).sum(), "gap")
+        gaps = f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
         return f"{gaps} (interval {step:.6g} s)"
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
@@ -148,7 +146,8 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, locat
     steps = np.diff(times)
     if len(bad):
         fault = (
-            f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s "
+            f"{number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
+            f"{times[bad[-1]]:.6g} s "
             "that are marked invalid or no finite numbers"
         )
         raise DataError(

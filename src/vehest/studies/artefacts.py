@@ -146,9 +146,8 @@ class PartArtefacts:
     # ranges of the split
     references: Mapping[tuple[str, str], Path]
     facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
-    failed: Mapping[str, str] = field(
-        default_factory=dict
-    )  # name of what is left out, since it failed or is not there -> why
+    # name of what is left out, since it failed or is not there -> why
+    failed: Mapping[str, str] = field(default_factory=dict)
 
     def reference(self, span: Span, channels: Iterable[str] | None = None) -> Recording:
         """The recording of a range at the evaluation rate, with all or some of its channels."""
@@ -250,20 +249,17 @@ class StudyArtefacts:
     title: str  # its title
     about: str  # a paragraph on what is compared or shown, from the pipeline file
     command: str  # the command that makes this report
-    titles: Mapping[str, str] = field(
-        default_factory=dict
-    )  # part -> title, of all there are in the pipeline file
+    # part -> title, of all there are in the pipeline file
+    titles: Mapping[str, str] = field(default_factory=dict)
     # part -> what was compared in it; a study that is not in parts has one without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
     absent: Sequence[str] = ()  # parts whose raw files were not here
-    not_trained: Mapping[str, Sequence[str]] = field(
-        default_factory=dict
-    )  # part -> names of trainings that are planned and not done; also of parts that are not here
+    # part -> names of trainings that are planned and not done; also of parts that are not here
+    not_trained: Mapping[str, Sequence[str]] = field(default_factory=dict)
     trials: Sequence[Trial] = ()  # of searches, which are in no part
     search_remarks: Sequence[str] = ()  # on parts that do not use what a search chose
-    datasets: Sequence[
-        StoredDataset
-    ] = ()  # of a study of recordings alone, in the order of the pipeline file
+    # of a study of recordings alone, in the order of the pipeline file
+    datasets: Sequence[StoredDataset] = ()
     absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
     report_command: str = ""  # that draws this report again, with all of its overrides
     # overrides, as text for a shell, that say where raw files come from and results go; in no

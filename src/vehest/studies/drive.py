@@ -111,11 +111,12 @@ class Additions:
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
-    """The verdict on each test set as lines of plain text."""
+    """The verdict on each test set as lines of plain text, a line a sentence."""
     part = artefacts.first
     return [
-        plain_text(" ".join(recommendation_of(part, test_set).describe()))
+        plain_text(sentence)
         for test_set in part.split.tests
+        for sentence in recommendation_of(part, test_set).describe()
     ]
 
 
@@ -359,7 +360,7 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
 
 
 def data_of_parts(parts: Mapping[str, PartArtefacts]) -> dict[str, pd.DataFrame]:
-    """Ranges, method and notes of all parts, for the CSV files ``ranges``, ``method``, ``notes``."""
+    """Ranges, method and notes of all parts, for the CSV files of these names."""
     lines = {name: method_lines(part) for name, part in parts.items()}
     notes = {name: warnings_of(part) for name, part in parts.items()}
     ranges = [ranges_of(part).assign(part=name) for name, part in parts.items()]

@@ -71,10 +71,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
-    """The verdict as lines of plain text, next commands last."""
+    """The verdict as lines of plain text, a line a sentence, next commands last."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    lines = [plain_text(" ".join(sentences)) for sentences, _ in verdicts.values()]
+    lines = [plain_text(sentence) for sentences, _ in verdicts.values() for sentence in sentences]
     commands = _commands(artefacts, verdicts)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 

@@ -185,9 +185,8 @@ class Curve:
     title: str  # of the first of its parts
     test_set: str  # that was tested on
     points: Sequence[Point]  # by estimator, start and minutes
-    ranking: (
-        Ranking  # of all of them, whose intervals are missing where the test is too short for them
-    )
+    # of all of them, whose intervals are missing where the test is too short for them
+    ranking: Ranking
 
 
 def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:

@@ -52,9 +52,8 @@ class SweepArtefacts:
     """Everything that tables and figures of a sweep are made from."""
 
     part: PartArtefacts  # the comparison of all combinations
-    keys: Sequence[
-        str
-    ]  # those that take several values, the seed aside, in the order of the command
+    # those that take several values, the seed aside, in the order of the command
+    keys: Sequence[str]
     # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status``
     # (``done`` or ``failed``), ``error``,
     # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for

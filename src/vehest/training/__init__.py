@@ -1,1 +1,1 @@
-"""Fitting: supervised training of members side by side, early stopping, checkpoints, direct search."""
+"""Fitting: supervised training in batches, early stopping, checkpoints, direct search."""

@@ -1,4 +1,4 @@
-"""State of one member's unfinished training, kept so that a killed one goes on to the same result."""
+"""State of one member's unfinished training, from which a killed run reaches the same result."""
 
 from __future__ import annotations
 

@@ -28,12 +28,10 @@ class Progress:
 class FitContext:
     """Surroundings of a fit."""
 
-    checkpoint_folders: Sequence[
-        Path
-    ] = ()  # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
-    should_stop: Callable[[], bool] = lambda: (
-        False
-    )  # asked after every batch; True ends the fit cleanly with the best so far
+    # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
+    checkpoint_folders: Sequence[Path] = ()
+    # asked after every batch; True ends the fit cleanly with the best so far
+    should_stop: Callable[[], bool] = lambda: False
     on_progress: Callable[[Progress], None] = lambda progress: None  # called after every epoch
 
 
@@ -43,9 +41,8 @@ class FitRecord:
 
     # column -> values, one row an epoch or a search; empty where there is nothing to show
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    metrics: Mapping[str, float] = field(
-        default_factory=dict
-    )  # figures such as ``epochs`` and ``train_seconds``
+    # figures such as ``epochs`` and ``train_seconds``
+    metrics: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False  # whether the fit was stopped before it was over
 
 

@@ -7,11 +7,16 @@ exactly as it would alone.
 A network is any ``nn.Module`` whose forward maps prepared windows to the lateral velocity [m/s] one
 step after them, (B, N, C) -> (B,) or (B, 1). It may have besides:
 
-- ``prepared(series)``: the series as it consumes it (scaled, say), (T, C) -> (T, C), asked for once; else as it was measured, in SI;
-- ``reset(generator)``: draws initial weights; else they are those that torch draws when it is built, under the member's seed;
-- ``constrain(parameters)``: brings parameters (M, ...) back into their admissible range, in place; else all are admissible;
-- ``compiled_members(parameters, prepared, starts)``: forward of M members on their own windows, (M, B), by a compiled recursion;
-- ``compiled_descent(...)``: several steps of Adam on the mean squared error, see `vehest.estimators.networks.compiled.CompiledNetwork`.
+- ``prepared(series)``: the series as the network consumes it, for example scaled, (T, C) -> (T, C),
+  called once; else as it was measured, in SI;
+- ``reset(generator)``: draws initial weights; else they are those that torch draws when it is
+  built, under the member's seed;
+- ``constrain(parameters)``: brings parameters (M, ...) back into their admissible range, in place;
+  else all are admissible;
+- ``compiled_members(parameters, prepared, starts)``: forward of M members on their own windows,
+  (M, B), by a compiled recursion;
+- ``compiled_descent(...)``: several steps of Adam on the mean squared error, see
+  `vehest.estimators.networks.compiled.CompiledNetwork`.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from typing import Any
 from weakref import WeakSet
 
 import torch
@@ -27,7 +33,7 @@ from torch import Tensor, nn
 from vehest.data.errors import ConfigurationError
 
 # evaluated at once where no gradient is wanted: each is laid out by itself in memory
-MOST_WINDOWS = 1024
+MAX_WINDOWS_TOGETHER = 1024
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
@@ -50,7 +56,7 @@ def is_plain(network: nn.Module) -> bool:
 
 @contextmanager
 def random_numbers(seed: int) -> Iterator[None]:
-    """Let torch draw from this seed on the CPU, and go on afterwards as if nothing had been drawn."""
+    """Let torch draw from this seed on the CPU; restores its random state afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         yield
@@ -152,10 +158,11 @@ def predict_members(
         The network returns another shape.
     """
     if compiled and not is_plain(network):
-        result: Tensor = network.compiled_members(parameters, prepared, starts)  # type: ignore[operator]
-        return result
+        compiled_members: Any = network.compiled_members
+        predictions: Tensor = compiled_members(parameters, prepared, starts)
+        return predictions
     offsets = torch.arange(n_window, device=starts.device)
-    pieces = [starts] if torch.is_grad_enabled() else starts.split(MOST_WINDOWS, dim=1)
+    pieces = [starts] if torch.is_grad_enabled() else starts.split(MAX_WINDOWS_TOGETHER, dim=1)
     return torch.cat(
         [
             _plain(network, parameters, prepared[piece.unsqueeze(-1) + offsets], seeds)
@@ -178,8 +185,9 @@ def _plain(
         predicted = torch.func.functional_call(network, dict(member_parameters), (batch,))
         if predicted.shape not in (batch.shape[:1], (*batch.shape[:1], 1)):
             raise ConfigurationError(
-                f"{type(network).__name__} maps windows of shape {tuple(batch.shape)} to {tuple(predicted.shape)}; "
-                f"it must return one lateral velocity a window, ({len(batch)},)"
+                f"{type(network).__name__} maps windows of shape {tuple(batch.shape)} to "
+                f"{tuple(predicted.shape)}; it must return one lateral velocity a window, "
+                f"({len(batch)},)"
             )
         return predicted.reshape(len(batch))
 

@@ -20,7 +20,7 @@ from vehest.training.search import (
     optuna_search,
 )
 
-LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
+MIN_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,9 @@ class NoiseTuningSettings(Group):
     version: ClassVar[str] = "1"
     method: Literal["data", "nelder_mead", "optuna"] = setting(
         "nelder_mead",
-        "data: sensors' levels are read off measured signals, the rest is assumed; nelder_mead, optuna (extra tuning): those with the "
-        "smallest error of sideslip on the training recordings",
+        "data: sensors' levels are read off measured signals, the rest is assumed; nelder_mead, "
+        "optuna (extra tuning): those with the smallest error of sideslip on the training "
+        "recordings",
     )
     curves_from: str = setting(
         "*", "pattern of the ids of those training recordings that axle curves are fitted to"
@@ -77,8 +78,8 @@ class IdentificationSettings(NoiseTuningSettings):
     group = "identification"
     method: Literal["data", "nelder_mead", "optuna"] = setting(
         "optuna",
-        "data: nothing is searched, process noise is the paper's; nelder_mead, optuna (extra tuning): levels with the smallest error of "
-        "sideslip on the training recordings",
+        "data: nothing is searched, process noise is the paper's; nelder_mead, optuna (extra "
+        "tuning): levels with the smallest error of sideslip on the training recordings",
     )
     trials: int = setting(60, "evaluations of Optuna in all stages together", least=1)
     stages: int = setting(
@@ -98,20 +99,22 @@ class IdentificationSettings(NoiseTuningSettings):
     generations: int = setting(200, "of each, at most", least=1)
     most_process_yaw_rate: float = setting(
         10.0,
-        "upper limit of the search for the yaw rate's process noise, of one sample's step; with a level far beyond the yaw rate's own "
-        "changes a filter follows the gyroscope whatever its model says",
+        "upper limit of the search for the yaw rate's process noise, of one sample's step; with a "
+        "level far beyond the yaw rate's own changes a filter follows the gyroscope whatever its "
+        "model says",
         unit="rad/s",
-        above=LEAST_PROCESS_YAW_RATE,
+        above=MIN_PROCESS_YAW_RATE,
     )
     error: Literal["samples", "recordings"] = setting(
         "samples",
-        "what searches, and the choice of an epoch behind a filter, make small: the mean squared error over all samples, or the squared "
-        "mean of the recordings' root mean squared errors, which one recording decides less",
+        "what searches, and the choice of an epoch behind a filter, make small: the mean squared "
+        "error over all samples, or the squared mean of the recordings' root mean squared errors, "
+        "which one recording decides less",
     )
     error_limit: float = setting(
         0.0,
-        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's loss), in all that error makes small; "
-        "0: none, as in the paper",
+        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's "
+        "loss), in all that error makes small; 0: none, as in the paper",
         unit="deg",
         least=0.0,
     )
@@ -120,5 +123,6 @@ class IdentificationSettings(NoiseTuningSettings):
         super().__post_init__()
         if self.stages > self.trials:
             raise ConfigurationError(
-                f"identification.stages must be at most its trials ({self.trials}), not {self.stages}"
+                f"identification.stages must be at most its trials ({self.trials}), not "
+                f"{self.stages}"
             )

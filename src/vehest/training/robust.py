@@ -1,4 +1,4 @@
-"""Squared errors whose influence is bounded: Huber's loss, for training data with a few large errors."""
+"""Huber's loss: squared errors of bounded influence, for training data with a few large errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def robust_squares(errors: Tensor, limit: float) -> Tensor:
     limit : float
         c, in the same unit; 0: plain squares.
 
-    Source: Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35 (1), 1964.
+    Source: Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35
+    (1), 1964.
     """
     if not limit:
         return errors.square()
@@ -45,7 +46,7 @@ def robust_squares_of_array(errors: FloatArray, limit: float) -> FloatArray:
 def robust_criterion(
     limit: float,
 ) -> Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]:
-    """Mean of `robust_squares` as a `Criterion` of one output; ``limit`` in units of the network."""
+    """Mean of `robust_squares` as a `Criterion` of one output; ``limit`` in the network's units."""
 
     def criterion(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
         errors = outputs[:, 0] - targets

@@ -42,7 +42,8 @@ class SampleSettings(Group):
     batch_size: int = setting(1024, "samples in a batch", least=1)
     loss_limit: float = setting(
         0.0,
-        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's loss); of squared errors only; 0: none",
+        "error of the sideslip angle beyond which its square is continued by its tangent (Huber's "
+        "loss); of squared errors only; 0: none",
         unit="deg",
         least=0.0,
     )

@@ -18,7 +18,7 @@ from vehest.data.errors import DataError, MissingError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
-FIRST_STEP = 0.05
+INITIAL_STEP_SHARE = 0.05
 UNUSABLE_COST = 1e6  # instead of a cost that is not finite: a search goes on elsewhere
 MAX_GRID = 1000  # starts along a parameter
 Cost = Callable[[FloatArray], float]
@@ -118,8 +118,8 @@ def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> 
     best = table[np.argmin(table[:, -1])]
     if best[-1] >= UNUSABLE_COST:
         raise DataError(
-            f"none of the {evaluations} sets of values that were tried gives a finite estimate of the "
-            "training recordings; check the estimator's settings and the recordings' units"
+            f"none of the {evaluations} sets of values that were tried gives a finite estimate of "
+            "the training recordings; check the estimator's settings and the recordings' units"
         )
     n = len(best) // 2
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
@@ -131,7 +131,7 @@ def _simplex(start: FloatArray, box: Box) -> FloatArray:
     """
     vertices = np.tile(start, (len(start) + 1, 1))
     for k, (low, high) in enumerate(box):
-        step = FIRST_STEP * (high - low)
+        step = INITIAL_STEP_SHARE * (high - low)
         vertices[k + 1, k] += step if start[k] + step <= high else -step
     return vertices
 
@@ -180,7 +180,8 @@ def optuna_search(
         import optuna
     except ImportError:
         raise MissingError(
-            "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set method=nelder_mead in its settings"
+            "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set "
+            "method=nelder_mead in its settings"
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     rows: list[FloatArray] = []

@@ -1,6 +1,7 @@
 """Training by gradient descent in consecutive phases, on sequences or on pairs of samples.
 
-    Phase (module, batches, loss, validation) --train_phases--> PhaseRecord, best parameters in the module
+    Phase (module, batches, loss, validation) --train_phases--> PhaseRecord
+                                                                best parameters in the module
 
 Within a phase: batches of an epoch -> loss -> gradient -> clipping -> AdamW -> validation -> best
 parameters. The state is stored as a `Checkpoint`, from which a killed run continues to the same
@@ -75,19 +76,15 @@ class Phase:
     name: str  # for people and for the checkpoint; unique among the phases of a training
     settings: PhaseSettings  # step size, epochs, patience, clipping
     module: nn.Module  # its parameters are changed in place
-    batches: Callable[
-        [torch.Generator], Iterable[Any]
-    ]  # of one epoch; random numbers are drawn from the generator and from no other
+    # of one epoch; random numbers are drawn from the generator and from no other
+    batches: Callable[[torch.Generator], Iterable[Any]]
     loss: Callable[[Any], Tensor]  # scalar to minimise, of one batch; ``backward`` is called on it
-    validation: Callable[
-        [], float
-    ]  # loss on the validation data with the parameters as they stand; called without gradients
-    trainable: Callable[[str], bool] | None = (
-        None  # which parameters learn, by name, while the others are frozen; all if None
-    )
-    prepare: Callable[[], None] | None = (
-        None  # called once before the first validation; may set parameters that this phase starts from
-    )
+    # loss on the validation data with the parameters as they stand; called without gradients
+    validation: Callable[[], float]
+    # which parameters learn, by name, while the others are frozen; all if None
+    trainable: Callable[[str], bool] | None = None
+    # called once before the first validation; may set parameters that this phase starts from
+    prepare: Callable[[], None] | None = None
 
 
 @dataclass
@@ -95,19 +92,15 @@ class PhaseRecord:
     """How a phase goes; plain values, which a checkpoint keeps as they are."""
 
     name: str  # of the phase
-    best_epoch: int = (
-        0  # epoch (from 1) whose parameters were kept; 0 if none was better than the start
-    )
+    # epoch (from 1) whose parameters were kept; 0 if none was better than the start
+    best_epoch: int = 0
     best_loss: float = math.inf  # validation loss of the parameters that were kept
-    start_loss: float = (
-        math.nan
-    )  # validation loss before the first epoch; NaN if it was stopped before
-    train_loss: list[float] = field(
-        default_factory=list
-    )  # mean over the batches of each epoch, skipped ones left out
-    validation_loss: list[float] = field(
-        default_factory=list
-    )  # after each epoch; NaN where not validated
+    # validation loss before the first epoch; NaN if it was stopped before
+    start_loss: float = math.nan
+    # mean over the batches of each epoch, skipped ones left out
+    train_loss: list[float] = field(default_factory=list)
+    # after each epoch; NaN where not validated
+    validation_loss: list[float] = field(default_factory=list)
     seconds: float = 0.0  # wall time, earlier runs that a checkpoint continues included [s]
     skipped_steps: int = 0  # batches whose loss or gradient was not finite
     skipped_in_a_row: int = 0  # the last of them
@@ -216,7 +209,8 @@ def train_phases(
     """
     if len({phase.name for phase in phases}) != len(phases):
         raise ConfigurationError(
-            f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}"
+            "training: phases must have different names, not "
+            f"{', '.join(phase.name for phase in phases)}"
         )
     folders = [
         context.checkpoint_folders[i]
@@ -271,7 +265,8 @@ class _Run:
         }
         if not self.learning:
             raise ConfigurationError(
-                f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable"
+                f"training: phase '{phase.name}' has no parameters to learn; correct which of them "
+                "are trainable"
             )
         self.adam = self._new_adam()
 
@@ -307,8 +302,8 @@ class _Run:
         if now.epochs and not math.isfinite(now.best_loss) and not now.interrupted:
             raise DataError(
                 now.problem
-                or f"training: phase '{phase.name}' had no finite validation loss in {now.epochs} epochs; "
-                f"lower its learning_rate or check the data with 'vehest data check'"
+                or f"training: phase '{phase.name}' had no finite validation loss in {now.epochs} "
+                "epochs; lower its learning_rate or check the data with 'vehest data check'"
             )
         is_trained = any(record.best_epoch for record in self.records)
         if now.problem and not is_trained and not now.interrupted:
@@ -399,8 +394,9 @@ class _Run:
         now.skipped_in_a_row += 1
         if now.skipped_in_a_row >= SKIPS_ALLOWED:
             self._return_to_best(
-                f"training: phase '{now.name}', {place}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
-                f"lower its learning_rate or check the data with 'vehest data check'"
+                f"training: phase '{now.name}', {place}: loss ({value:g}) or gradient not finite "
+                f"{SKIPS_ALLOWED} times in a row; lower its learning_rate or check the data with "
+                "'vehest data check'"
             )
         return None
 

@@ -3,8 +3,8 @@
     windows -> `_Prepared` -> batches -> `_Run._descend` or `_Run._step` -> validation -> `_Member`
 
 Members (networks of one shape) train as one batch. `_Run` has the weights, their average and Adam's
-moments of those that still train, one row each; a `_Member` has what does not depend on the batch: best
-weights, losses, the order of windows. A member trains to the same bits as it would alone.
+moments of those that still train, one row each; a `_Member` has what does not depend on the batch:
+best weights, losses, the order of windows. A member trains to the same bits as it would alone.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ class _Batch:
     def predict(
         self, weights: Tensor, data: _Prepared, starts: Tensor, seeds: Sequence[int] = ()
     ) -> Tensor:
-        """Predictions of all members with weights (M, K) on windows from ``starts`` (M, B): (M, B)."""
+        """Predictions (M, B) of all members, weights (M, K), on windows from ``starts`` (M, B)."""
         return predict_members(
             self.network,
             {**self.layout.views(weights), **self.fixed},
@@ -249,7 +249,7 @@ class _Batch:
         return losses.detach().double() * windows.shape[1]
 
     def descend(self, data: _Prepared, windows: Tensor) -> Tensor:
-        """The steps of several batches by compiled code; arguments and result as those of `step`."""
+        """Steps on several batches by compiled code; arguments and result as those of `step`."""
         settings = self.settings
         weights = self.weights.detach()
         state = self.adam.state[self.weights]
@@ -277,9 +277,10 @@ class _Batch:
         return losses
 
     def _update_average(self) -> None:
-        """Add the weights after step t to their average θ̄ₜ = (1 - a)/(1 - aᵗ) Σᵢ aᵗ⁻ⁱ θᵢ, i = 1 … t.
+        """Add the weights after step t to their average.
 
-        The factor makes the weights of the sum add up to one from the first step on.
+        θ̄ₜ = (1 - a)/(1 - aᵗ) Σᵢ aᵗ⁻ⁱ θᵢ, i = 1 … t. The factor makes the weights of the sum add up
+        to one from the first step on.
         """
         if self.average is None:
             self.average = self.weights.detach().clone()
@@ -289,7 +290,7 @@ class _Batch:
         self.average.lerp_(self.weights.detach(), (1.0 - decay) / (1.0 - decay**step))
 
     def _dropout_seeds(self) -> list[int]:
-        """One seed a member for layers of plain networks that draw; compiled networks draw nothing."""
+        """One seed a member for random layers of plain networks; compiled networks draw nothing."""
         if not is_plain(self.network):
             return []
         return [
@@ -438,8 +439,9 @@ class _Run:
             return False
         if not member.best_epoch:
             raise DataError(
-                f"training: the validation loss of training {index} is {validation_loss} after epoch "
-                f"{self.epoch}; lower training.learning_rate or check the data with 'vehest data check'"
+                f"training: the validation loss of training {index} is {validation_loss} after "
+                f"epoch {self.epoch}; lower training.learning_rate or check the data with 'vehest "
+                "data check'"
             )
         member.has_diverged = True
         return False

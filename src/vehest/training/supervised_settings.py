@@ -22,12 +22,14 @@ class SupervisedSettings(Group):
     )
     epoch_steps: int = setting(
         0,
-        "steps of an epoch, on windows drawn anew without replacement; 0: as many as use every window once",
+        "steps of an epoch, on windows drawn anew without replacement; 0: as many as use every "
+        "window once",
         least=0,
     )
     averaging: float = setting(
         0.0,
-        "decay a step of an exponential moving average of the weights, corrected for its start, which is then validated and kept; 0: none",
+        "decay a step of an exponential moving average of the weights, corrected for its start, "
+        "which is then validated and kept; 0: none",
         least=0.0,
         below=1.0,
     )

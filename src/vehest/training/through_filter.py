@@ -51,7 +51,8 @@ class ThroughFilterSettings(Group):
     one_step_batch: int = setting(2048, "pairs of samples in a batch", least=1)
     through: PhaseSettings = setting(
         PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine"),
-        "model and noise together, through the filter, for models that learn so; paper: constant step size 5e-4, 1000 epochs of one batch each",
+        "model and noise together, through the filter, for models that learn so; paper: constant "
+        "step size 5e-4, 1000 epochs of one batch each",
     )
     noise: PhaseSettings = setting(
         PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine"),
@@ -67,7 +68,8 @@ class ThroughFilterSettings(Group):
     )
     curriculum: tuple[int, ...] = setting(
         (),
-        "lengths of shorter sequences to begin with, such as [100, 250], each for curriculum_epochs",
+        "lengths of shorter sequences to begin with, such as [100, 250], each for "
+        "curriculum_epochs",
     )
     curriculum_epochs: int = setting(100, "see curriculum", least=1)
     truncate_steps: int = setting(
@@ -77,7 +79,8 @@ class ThroughFilterSettings(Group):
     validation_drop_steps: int = setting(200, "first samples of it that do not count", least=0)
     start_spread: float = setting(
         0.2,
-        "by how much the last state (friction) is off at the start of a training sequence, at most, up or down; paper: 0",
+        "by how much the last state (friction) is off at the start of a training sequence, at "
+        "most, up or down; paper: 0",
         least=0.0,
     )
     mirrored: float = setting(
@@ -88,13 +91,15 @@ class ThroughFilterSettings(Group):
     )
     likelihood: float = setting(
         0.0,
-        "weight of the mean negative log-likelihood of the errors of those states that epochs are judged by, under the filter's own "
-        "covariance [nat], in the loss: it teaches a filter how sure to be; 0 leaves it out, as in the paper",
+        "weight of the mean negative log-likelihood of the errors of those states that epochs are "
+        "judged by, under the filter's own covariance [nat], in the loss: it teaches a filter how "
+        "sure to be; 0 leaves it out, as in the paper",
         least=0.0,
     )
     start_noise: Literal["residuals", "given"] = setting(
         "residuals",
-        "residuals: noise starts from those of the pre-trained model and learns in units of them; given: the authors' values",
+        "residuals: noise starts from those of the pre-trained model and learns in units of them; "
+        "given: the authors' values",
     )
     dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
@@ -103,11 +108,13 @@ class ThroughFilterSettings(Group):
         super().__post_init__()
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
             raise ConfigurationError(
-                "training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps"
+                "training: more steps are dropped than a sequence has; lower drop_steps or "
+                "validation_drop_steps"
             )
         if any(steps <= self.drop_steps for steps in self.curriculum):
             raise ConfigurationError(
-                f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}"
+                f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not "
+                f"{self.curriculum}"
             )
 
 
@@ -276,7 +283,8 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
 def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
     if not starts:
         raise DataError(
-            f"no drive is {steps} samples long, as a sequence for training through a filter is; lower training.steps"
+            f"no drive is {steps} samples long, as a sequence for training through a filter is; "
+            "lower training.steps"
         )
     return Drive(
         *(

@@ -23,7 +23,7 @@ from vehest.data.errors import DataError
 OUTLIER = 8.0  # robust standard deviations
 # of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no
 # noise
-LEAST_DEVIATION = 1e-7
+MIN_DEVIATION = 1e-7
 LEVELS = (0.2, 5.0)  # between which the noise may change with the speed
 ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
 
@@ -76,7 +76,7 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
     for _ in range(2):
         left = _least_squares(regressors[is_regular], targets[is_regular], max_order * n_channels)
         residual = targets - left[0] - regressors @ left[1:]
-        robust = 1.4826 * np.median(np.abs(residual), axis=0) + LEAST_DEVIATION
+        robust = 1.4826 * np.median(np.abs(residual), axis=0) + MIN_DEVIATION
         robust = np.maximum(
             robust,
             0.2
@@ -97,7 +97,7 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
             - fitted[0]
             - regressors[is_regular][:, : order * n_channels] @ fitted[1:]
         )
-        covariance = residual.T @ residual / len(residual) + LEAST_DEVIATION**2 * np.eye(n_channels)
+        covariance = residual.T @ residual / len(residual) + MIN_DEVIATION**2 * np.eye(n_channels)
         criterion = len(residual) * float(
             np.linalg.slogdet(covariance)[1]
         ) + fitted.size * math.log(len(residual))

@@ -7,9 +7,9 @@
 
 s is a local scale that training ranges give: s² is a combination, with weights that are not
 negative, of the estimator's inputs at the instant and of its estimate; of a filter s² = a (P +
-floor²) with its own variance P. q_p is the level's quantile of |error|/(s w) on validation ranges,
-each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens outside the training's
-domain.
+floor²) with its own variance P, and what `vehest.trust.tyre_check` finds is added. q_p is the
+level's quantile of |error|/(s w) on validation ranges, each turn or manoeuvre counting once (split
+conformal, blocked). w ≥ 1 widens outside the training's domain.
 
 The rule of w was fixed before any of its effects was looked at: with m the 99.9th percentile of |f|
 in training, w is the largest of 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre
@@ -39,6 +39,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number, check_numbers
+from vehest.trust.tyre_check import TyreCheck
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)
 CHANNEL_LEVEL = 0.9  # of the channels band_vy and band_sideslip
@@ -63,7 +64,7 @@ MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
 MIN_TERM = 1e-30  # of the terms' sizes that are not 0
 MAX_TERM = 1e12  # of these and of weights
 FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
-HEAD_LENGTH = 5  # numbers before the weights in a `PackedBands`
+HEAD_LENGTH = 7  # numbers before the weights in a `PackedBands`
 
 Blocks = Literal["range", "turn"]
 
@@ -117,6 +118,7 @@ class Bands:
     vy: Quantity  # the band of v
     sideslip: Quantity  # the band of β
     cars: tuple[CarValues, ...] = ()  # values of the vehicles, as far as their data sets have any
+    tyre_check: TyreCheck | None = None  # of the estimator's tyre model; None: it has none
 
     def __post_init__(self) -> None:
         check_channels("bands.channels", self.channels)
@@ -163,20 +165,27 @@ class Bands:
             for quantity in (self.vy, self.sideslip)
             for name in TERMS
         ]
-        numbers = np.array(
-            [*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)]
-        )
+        tyre_weights = (0.0, 0.0) if self.tyre_check is None else self.tyre_check.weights
+        head += [LOWEST_SPEED, *tyre_weights]
+        numbers = np.array([*head, *weights, *(self.largest.get(name, 0.0) for name in TERMS)])
         return PackedBands(_columns(self.channels), numbers)
 
     def half_widths(
-        self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False
+        self,
+        rows: FloatArray,
+        vy: FloatArray,
+        variance: FloatArray,
+        tyre_error: FloatArray | None = None,
+        *,
+        elsewhere: bool = False,
     ) -> FloatArray:
         """Half widths at `CHANNEL_LEVEL`, (T, 2): v [m/s] and β [rad].
 
-        NaN where there is no estimate. Arguments as of `band_rows`.
+        NaN where there is no estimate. Arguments as of `band_rows`; no ``tyre_error``: 0.
         """
         bands = np.empty((len(vy), 2))
-        band_rows(rows, vy, variance, *self.packed(elsewhere=elsewhere), bands)
+        added = np.zeros(len(vy)) if tyre_error is None else tyre_error
+        band_rows(rows, vy, variance, added, *self.packed(elsewhere=elsewhere), bands)
         return bands
 
 
@@ -193,16 +202,19 @@ class PackedBands(NamedTuple):
 
     # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
     columns: NDArray[np.int64]
-    # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their
-    # largest sizes, (29,)
+    # factors, squared floors of v and β, lowest speed, weights of the tyre check for v and β,
+    # weights of `TERMS` for v and β, their largest sizes, (31,)
     numbers: FloatArray
 
 
 @entry(nogil=True)
-def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-untyped-def]
+def band_rows(  # type: ignore[no-untyped-def]
+    rows, vy, variance, tyre_error, columns, numbers, bands
+):
     """Write ``bands`` of one level, (T, 2), v [m/s] and β [rad].
 
-    Inputs are ``rows`` (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
+    Inputs are ``rows`` (T, C), estimates [m/s] and their variances [m²/s²] or NaN, and the mean
+    squared errors of the tyre check [m²/s²], 0 without one.
 
     NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and
     ``numbers`` are of `PackedBands`.
@@ -222,8 +234,8 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
         terms[5] = rows[k, columns[3]] * vx if columns[3] >= 0 else math.nan
         terms[6] = rows[k, columns[4]] * vx if columns[4] >= 0 else math.nan
         terms[7] = vy[k]
-        squared_vy = 0.0
-        squared_sideslip = 0.0
+        squared_vy = numbers[5] * tyre_error[k]
+        squared_sideslip = numbers[6] * tyre_error[k]
         wider = 1.0
         for j in range(n_terms):
             largest = numbers[HEAD_LENGTH + 2 * n_terms + j]
@@ -249,7 +261,8 @@ def with_bands(
 ) -> Estimate:
     """Add 90 % half widths ``band_vy`` [m/s] and ``band_sideslip`` [rad] to an estimate."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
-    half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
+    error = tyre_error_of(bands.tyre_check, estimate)
+    half = bands.half_widths(rows, vy, variance, error, elsewhere=elsewhere)
     return replace(
         estimate,
         channels={
@@ -283,6 +296,13 @@ def band_inputs(
     return rows, np.ascontiguousarray(estimate["vy"], dtype=np.float64), variance
 
 
+def tyre_error_of(check: TyreCheck | None, estimate: Estimate) -> FloatArray:
+    """Mean squared errors of the tyre check over an estimate, (T,) [m²/s²]; 0 without a check."""
+    if check is None:
+        return np.zeros(len(estimate))
+    return check.squared_errors(estimate["vx"], estimate["friction"])
+
+
 def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
     return np.array(
         [channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64
@@ -304,6 +324,7 @@ class Piece:
     errors: FloatArray
     yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
     rate_hz: float  # of the samples [Hz]
+    tyre_error: FloatArray | None = None  # of the tyre check, (T,) [m²/s²]; None without one
 
     @property
     def has_error(self) -> NDArray[np.bool_]:
@@ -380,17 +401,27 @@ def calibrated(
         vy=scales[0],
         sideslip=scales[1],
     )
-    half = [
-        bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.has_error]
-        for piece in validation
-    ]
-    scores = np.abs(
-        np.concatenate([piece.errors[piece.has_error] for piece in validation])
-    ) / np.concatenate(half)
+    scores = _scores(bands, validation)
+    if bands.tyre_check is not None:
+        unchecked = (pooled_quantile(score, blocks, CHANNEL_LEVEL)[0] for score in scores.T)
+        vy_factor, sideslip_factor = unchecked
+        check = bands.tyre_check.scaled_by((vy_factor, sideslip_factor))
+        bands = replace(bands, tyre_check=check)
+        scores = _scores(bands, validation)
     vy, sideslip = (
         _with_factors(scale, score, blocks) for scale, score in zip(scales, scores.T, strict=True)
     )
     return replace(bands, vy=vy, sideslip=sideslip)
+
+
+def _scores(bands: Bands, pieces: Sequence[Piece]) -> FloatArray:
+    """Errors of v and β over half widths whose factors are 1, (N, 2)."""
+    half = [
+        bands.half_widths(piece.rows, piece.vy, piece.variance, piece.tyre_error)[piece.has_error]
+        for piece in pieces
+    ]
+    errors = [piece.errors[piece.has_error] for piece in pieces]
+    return np.abs(np.concatenate(errors)) / np.concatenate(half)
 
 
 def terms_of(

@@ -16,10 +16,11 @@ from vehest.data.car import UNKNOWN_CAR
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.trust.bands import Piece, band_inputs, calibrated
+from vehest.trust.bands import Piece, band_inputs, calibrated, tyre_error_of
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
+from vehest.trust.tyre_check import tyre_check_of
 
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
@@ -64,6 +65,7 @@ def learn_trust(
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
             horizon_steps=estimator.horizon_steps,
+            tyre_check=tyre_check_of(estimator),
             cars=tuple(
                 dict.fromkeys(
                     stretch.recording.car
@@ -95,6 +97,7 @@ def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]
     Raises `DataError` where a recording lacks a channel.
     """
     pieces: list[Piece] = []
+    check = tyre_check_of(estimator)
     estimates = estimator.estimate(
         [stretch.recording.without_references() for stretch in stretches]
     )
@@ -103,6 +106,7 @@ def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]
         rows, vy, variance = band_inputs(
             estimate, recording, tuple(estimator.channels), estimator.horizon_steps
         )
+        tyre_error = tyre_error_of(check, estimate)
         scored = slice(*recording.index_range(stretch.start + SKIP_SECONDS, recording.end_time))
         turned = estimate["sideslip"] - np.arctan2(recording["vy_ref"], recording["vx"])
         errors = np.stack(
@@ -117,6 +121,7 @@ def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]
                 errors[scored],
                 yaw_rate,
                 recording.rate_hz,
+                tyre_error[scored],
             )
         )
     return pieces

@@ -35,6 +35,7 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, Stepper
+from vehest.trust.bands import tyre_error_of
 from vehest.trust.clock import REPEATED, STOPPED, SampleClock
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import (
@@ -145,6 +146,7 @@ class GuardedRun:
         self.marks = np.zeros(steps, np.int8)
         self.vx = np.full(steps, np.nan)
         self.variance = np.full(steps, np.nan)
+        self.tyre_error = np.zeros(steps)
         self.extra_quantities = {name: np.full(steps, np.nan) for name in self.extra_quantities}
         if self.covariance is not None:
             self.covariance = np.full((steps, *self.covariance.shape[1:]), np.nan)
@@ -235,6 +237,7 @@ class GuardedRun:
                 self.covariance = np.full((len(self.out), *estimate.covariance.shape[1:]), np.nan)
                 self.covariance_of = estimate.covariance_of
             self.covariance[start:end] = estimate.covariance[shift]
+        self.tyre_error[start:end] = tyre_error_of(self.monitor.tyre_check, estimate)[shift]
         for name, values in estimate.channels.items():
             if name not in ("vy", "sideslip"):
                 self.extra_quantities.setdefault(name, np.full(len(self.out), np.nan))[
@@ -273,7 +276,12 @@ class GuardedRun:
         vx = vx[np.maximum.accumulate(np.where(np.isnan(vx), 0, np.arange(len(vx))))][1:]
         self._speed = vx[-1:]
         bands = monitor.after(
-            verdict, Watched(self.out, self.marks, lost=False), self.cleaned, vx, self.variance
+            verdict,
+            Watched(self.out, self.marks, lost=False),
+            self.cleaned,
+            vx,
+            self.variance,
+            self.tyre_error,
         )
 
         def later(name: str, values: FloatArray) -> FloatArray:
@@ -371,6 +379,7 @@ class GuardedStepper(Stepper):
         self._raw = np.empty(1)
         self._vx = np.full(1, np.nan)
         self._variance = np.full(1, np.nan)
+        self._tyre_error = np.zeros(1)
         self._places = [
             estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
         ]
@@ -463,7 +472,9 @@ class GuardedStepper(Stepper):
         vy = float(watched.vy[0])
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
-        bands = self.monitor.after(verdict, watched, cleaned, self._vx, self._variance)
+        bands = self.monitor.after(
+            verdict, watched, cleaned, self._vx, self._variance, self._tyre_error
+        )
         vx = float(self._vx[0])
         quantities = {
             **self._extra_quantities,
@@ -481,6 +492,7 @@ class GuardedStepper(Stepper):
         """The estimator on a row: v, its own vx and the variance of v's error."""
         flow = cleaned.flow[0]
         self._extra_quantities = {}
+        self._tyre_error = np.zeros(1)
         if flow == WAIT:
             return math.nan, math.nan, math.nan
         if flow == RESTART and not self._fresh:
@@ -492,6 +504,10 @@ class GuardedStepper(Stepper):
         self._extra_quantities = {
             name: value for name, value in quantities.items() if name not in ("vy", "vy_variance")
         }
+        check = self.monitor.tyre_check
+        if check is not None:
+            vx, friction = (np.array([quantities[name]]) for name in ("vx", "friction"))
+            self._tyre_error = check.squared_errors(vx, friction)
         return (
             quantities["vy"],
             quantities.get("vx", math.nan),

@@ -18,14 +18,14 @@ from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 ORDER = 4
 CUTOFF = 0.4  # of the estimator's rate, below its Nyquist frequency
 NOISE_BAND = (0.3, 0.4)  # of the model's rate, where the density of a channel's noise is taken
-USUAL_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
+TYPICAL_RATE_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
 SLACK = 1e-9
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     """Channels (T, C) at the model's rate as the filter passes them from a faster bus.
 
-    The bus is `USUAL_RATIO` times as fast; NaN is bridged.
+    The bus is `TYPICAL_RATE_RATIO` times as fast; NaN is bridged.
 
     They are brought to that rate without phase, then filtered causally and thinned out again; the
     filter starts as in a steady signal. What lay above the model's Nyquist frequency is gone in
@@ -41,20 +41,24 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
         for is_measured, column in zip(measured_columns, samples.T, strict=True)
     ]
     together = np.stack(full, axis=1)
-    fast = scipy.signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
+    fast = scipy.signal.resample_poly(together, TYPICAL_RATE_RATIO, 1, axis=0, padtype="line")
     band = scipy.signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
     density = scipy.signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (
         NOISE_BAND[1] - NOISE_BAND[0]
     )
-    noise = np.sqrt(0.5 * USUAL_RATIO * density) * np.random.default_rng(0).standard_normal(
+    noise = np.sqrt(0.5 * TYPICAL_RATE_RATIO * density) * np.random.default_rng(0).standard_normal(
         fast.shape
     )
     fast += scipy.signal.sosfilt(
-        scipy.signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0
+        scipy.signal.butter(8, 0.5, btype="highpass", fs=TYPICAL_RATE_RATIO, output="sos"),
+        noise,
+        axis=0,
     )
-    sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
+    sections = scipy.signal.butter(
+        ORDER, CUTOFF * rate_hz, fs=TYPICAL_RATE_RATIO * rate_hz, output="sos"
+    )
     start = scipy.signal.sosfilt_zi(sections)[:, :, None] * fast[0]
-    filtered = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
+    filtered = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::TYPICAL_RATE_RATIO]
     return np.asarray(np.where(np.isnan(samples), np.nan, filtered), dtype=np.float64)
 
 

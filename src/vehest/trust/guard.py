@@ -29,9 +29,9 @@ from vehest.trust.checks import check_channels, check_number
 
 BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
 PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is accepted
-MARGIN = 3.0  # beyond what was seen in training
-LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training may do so
-LEAST_RUN = 0.3  # s
+MAX_OVER_TRAINING = 3.0  # times the largest value in training that counts as plausible
+MAX_RUN_SECONDS = 5.0  # s; a channel that stands still for longer in training may do so
+MIN_RUN_SECONDS = 0.3  # s
 STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
 NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
 
@@ -56,7 +56,7 @@ STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steerin
 
 ENDLESS = 1e300  # stops of channels that have none
 
-MAX_TOP_SPEED = MARGIN * CHANNELS["vx"].high  # [m/s] that can be learnt
+MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that can be learnt
 TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
 MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that can be learnt
 
@@ -124,7 +124,7 @@ def learn_limits(
 ) -> GuardLimits:
     """Limits from drives at the estimator's rate, with references where they have them.
 
-    A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump
+    A range is that of any car or, if more, `MAX_OVER_TRAINING` times the largest value; a jump
     likewise; a channel may stand still for twice its longest run while the car moved.
     """
     channel_limits = {}
@@ -137,9 +137,9 @@ def learn_limits(
         size = _largest(parts)
         jump = _largest([np.diff(part) for part in parts])
         channel_limits[name] = ChannelLimits(
-            low=max(table.low, min(usual.low, -MARGIN * size)),
-            high=min(table.high, max(usual.high, MARGIN * size)),
-            jump=max(_fastest(name, rate_hz), MARGIN * jump),
+            low=max(table.low, min(usual.low, -MAX_OVER_TRAINING * size)),
+            high=min(table.high, max(usual.high, MAX_OVER_TRAINING * size)),
+            jump=max(_fastest(name, rate_hz), MAX_OVER_TRAINING * jump),
             run=_run_limit(having, name, stops),
             stops=stops,
         )
@@ -154,7 +154,7 @@ def learn_limits(
     tangents = _largest([_tan_sideslip(recording) for recording in recordings])
     return GuardLimits(
         channel_limits,
-        MARGIN * top if top > 0 else GuardLimits.top_speed,
+        MAX_OVER_TRAINING * top if top > 0 else GuardLimits.top_speed,
         max(1.0, TAN_MARGIN * tangents),
     )
 
@@ -206,7 +206,7 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
             & (samples < stops[1])
         )
         longest = max(longest, longest_run(is_frozen) / recording.rate_hz)
-    return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
+    return 0.0 if longest > MAX_RUN_SECONDS else max(2.0 * longest, MIN_RUN_SECONDS)
 
 
 def longest_run(flags: NDArray[np.bool_]) -> int:

@@ -158,6 +158,8 @@ def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
     del content["about"]["model"]
     if content["bands"] and not content["bands"]["cars"]:
         del content["bands"]["cars"]
+    if content["bands"] and not content["bands"]["tyre_check"]:
+        del content["bands"]["tyre_check"]
     content["about"] |= {"model": model} if model else {}
     (folder / TRUST).write_text(
         yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8"

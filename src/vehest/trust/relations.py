@@ -59,8 +59,8 @@ FEATURES = (
     "v r",
 )
 RATE = "du/dt"
-SLIDE = "v r"
-DRAG = ("r²", "u²", SLIDE)
+SIDESLIP_DRAG = "v r"
+DRAG = ("r²", "u²", SIDESLIP_DRAG)
 _SYMBOLS = dict(
     zip(
         FEATURES,
@@ -86,8 +86,8 @@ _SYMBOLS[RATE] = "u"
 
 LOW_PASS_SECONDS = 0.5
 HUBER = 1.5  # robust standard deviations
-LEAST_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
-LEAST_ROWS = 50
+MIN_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
+MIN_ROWS = 50
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
         if angle in has and "ay" in has:
             declared.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
     if "ax" in has:
-        slide = (SLIDE,) if {"ay", "yaw_rate"} <= has else ()
+        slide = (SIDESLIP_DRAG,) if {"ay", "yaw_rate"} <= has else ()
         declared.append(
             ("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False)
         )
@@ -198,7 +198,7 @@ def without_spikes(samples: FloatArray) -> FloatArray:
 
     Their second difference exceeds ten times its 99.9 % quantile.
     """
-    if len(samples) < LEAST_ROWS:
+    if len(samples) < MIN_ROWS:
         return samples
     deviation = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
     finite_deviation = deviation[np.isfinite(deviation)]
@@ -231,7 +231,7 @@ def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> 
     if speed is None:
         return 1.0
     return max(
-        LEAST_SPEED_SHARE
+        MIN_SPEED_SHARE
         * float(
             np.nanmedian(np.abs(np.concatenate([recording[speed] for recording in recordings])))
         ),
@@ -298,15 +298,17 @@ def learn_relations(
     joined = {name: smoothed(name) for name in parts[0]}
     relations: list[Relation] = []
     for target, partner, features, instant in relations_among(channels):
-        if SLIDE in features:
+        if SIDESLIP_DRAG in features:
             for part in parts:
-                part[SLIDE] = (
+                part[SIDESLIP_DRAG] = (
                     slide_of(part, relations[0], rate_hz) if relations else np.zeros_like(part["r"])
                 )
-            joined[SLIDE] = smoothed(SLIDE)
-        free = [name for name in features if name != SLIDE]
-        target_values = joined[f"channel {target}"] + (joined[SLIDE] if SLIDE in features else 0.0)
-        if len(target_values) >= LEAST_ROWS:
+            joined[SIDESLIP_DRAG] = smoothed(SIDESLIP_DRAG)
+        free = [name for name in features if name != SIDESLIP_DRAG]
+        target_values = joined[f"channel {target}"] + (
+            joined[SIDESLIP_DRAG] if SIDESLIP_DRAG in features else 0.0
+        )
+        if len(target_values) >= MIN_ROWS:
             terms = dict(
                 zip(
                     free,
@@ -318,7 +320,10 @@ def learn_relations(
             )
             relations.append(
                 Relation(
-                    target, partner, terms | ({SLIDE: -1.0} if SLIDE in features else {}), instant
+                    target,
+                    partner,
+                    terms | ({SIDESLIP_DRAG: -1.0} if SIDESLIP_DRAG in features else {}),
+                    instant,
                 )
             )
     return relations

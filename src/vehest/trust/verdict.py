@@ -92,6 +92,7 @@ class Monitor:
         self._state = health.start() if health is not None else np.empty(0)
         self.packed_bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
         self.has_bands = bands is not None
+        self.tyre_check = bands.tyre_check if bands is not None else None
         self.largest_vy = bands.largest.get("vy", 0.0) if bands is not None else 0.0
         self.channel_numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
@@ -129,6 +130,7 @@ class Monitor:
         cleaned: Cleaned,
         vx: FloatArray,
         variance: FloatArray,
+        tyre_error: FloatArray,
     ) -> FloatArray:
         """Complete the verdict of `before`, in place, and return half widths, (T, 2).
 
@@ -142,6 +144,8 @@ class Monitor:
             Speed of the estimate, (T,) [m/s].
         variance : array
             Of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
+        tyre_error : array
+            Mean squared error by the tyre check, (T,) [m²/s²]; 0 without one.
         """
         verdict_rows(
             watched.vy,
@@ -155,7 +159,7 @@ class Monitor:
         )
         bands = np.full((len(watched.vy), 2), np.nan)
         if self.packed_bands is not None:
-            band_rows(cleaned.rows, watched.vy, variance, *self.packed_bands, bands)
+            band_rows(cleaned.rows, watched.vy, variance, tyre_error, *self.packed_bands, bands)
             widen_rows(
                 verdict.status,
                 verdict.reason,

@@ -38,9 +38,8 @@ class Watched(NamedTuple):
 
     vy: FloatArray  # (T,) [m/s]; NaN before the first estimate only
     marks: NDArray[np.int8]  # sum of marks at each row, (T,)
-    lost: (
-        bool  # whether the estimator diverged at the last row, behind which the others are left out
-    )
+    # whether the estimator diverged at the last row, behind which the others are left out
+    lost: bool
 
 
 class Watch:

@@ -3,11 +3,11 @@
 State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed,
 road-wheel angle, longitudinal acceleration.
 
-    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz                             (Eq. 2)
-    α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u)
-    F = C tan α f(λ),   λ = μ F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0)
-    f = λ (2 - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10)
-    F_zF = m (g l_R - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
+    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz
+    (Eq. 2) α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u) F = C tan α f(λ),   λ = μ
+    F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0) f = λ (2
+    - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10) F_zF = m (g l_R
+    - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
 
 Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is
 infinite at α = 0 and its gradient is not a number, though F is as smooth as C tan α there; λ is
@@ -30,10 +30,10 @@ from vehest.vehicle.parameters import check_parameters
 
 TRACK_STATES = ("vy", "yaw_rate")
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
-LARGEST_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
-LEAST_SHARE = 0.2  # of the friction that sliding leaves
-LEAST_LOAD = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
-LEAST_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
+MAX_FORCE_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
+MIN_FRICTION_SHARE = 0.2  # of the friction that sliding leaves
+MIN_LOAD_SHARE = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
+MIN_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
 
 Tyres = Literal["plain", "smooth"]
 
@@ -55,9 +55,8 @@ class LoadedCar:
     yaw_inertia: float = 3498.0  # about the vertical axis through the centre of gravity [kg m²]
     cg_to_front_axle: float = 1.47  # distance from the centre of gravity [m]
     cg_to_rear_axle: float = 1.41  # the same [m]
-    cg_height: float = (
-        0.52  # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
-    )
+    # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
+    cg_height: float = 0.52
 
     def __post_init__(self) -> None:
         check_parameters(self)
@@ -71,9 +70,9 @@ class LoadedCar:
         front, rear = (
             GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle)
         )
-        return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (
+        return self.mass * (front - transfer).clamp(min=MIN_LOAD_SHARE * front), self.mass * (
             rear + transfer
-        ).clamp(min=LEAST_LOAD * rear)
+        ).clamp(min=MIN_LOAD_SHARE * rear)
 
 
 BMW_545I = LoadedCar()  # BMW 545i of Bertipaglia et al. 2024
@@ -97,11 +96,11 @@ class DugoffAxle(NamedTuple):
         slide = tangent.abs()
         half = (
             self.friction
-            * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE)
+            * (1.0 - self.reduction * vx * slide).clamp(min=MIN_FRICTION_SHARE)
             * load
             / (2.0 * self.cornering_stiffness)
         )
-        ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
+        ratio = half / torch.maximum(slide, half.detach() / MAX_FORCE_RATIO[tyres])
         force_share = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
         force: Tensor = self.cornering_stiffness * tangent * force_share
         return force
@@ -133,7 +132,7 @@ class DugoffTrack:
         course_front = (states[..., 0] + self.car.cg_to_front_axle * states[..., 1]) / vx
         course_rear = (states[..., 0] - self.car.cg_to_rear_axle * states[..., 1]) / vx
         turned = torch.tan(steer)
-        front = (turned - course_front) / (1.0 + turned * course_front).clamp(min=LEAST_COSINE)
+        front = (turned - course_front) / (1.0 + turned * course_front).clamp(min=MIN_COSINE)
         of_front = self.front.force(front, load_front, vx, self.tyres) * torch.cos(steer)
         return of_front, self.rear.force(-course_rear, load_rear, vx, self.tyres)
 

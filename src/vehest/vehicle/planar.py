@@ -45,7 +45,8 @@ class Motion(NamedTuple):
     """Rates of a planar car."""
 
     rates: Tensor  # dx/dt, (..., 4)
-    ax: Tensor  # longitudinal acceleration that a sensor at the centre of gravity reads (...) [m/s²]
+    # longitudinal acceleration that a sensor at the centre of gravity reads (...) [m/s²]
+    ax: Tensor
     ay: Tensor  # the lateral one (...) [m/s²]
 
 

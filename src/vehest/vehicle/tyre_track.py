@@ -33,8 +33,10 @@ TYRE_PARAMETERS = ("c1_front", "c2_front", "c1_rear", "c2_rear", "friction")
 class TyreTrack:
     """A single track whose tyre parameters may be part of its state."""
 
-    car: SingleTrackParameters  # mass, inertia and the places of the axles; its cornering stiffnesses are not used
-    # c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of `TYRE_PARAMETERS`
+    # mass, inertia and the places of the axles; its cornering stiffnesses are not used
+    car: SingleTrackParameters
+    # c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of
+    # `TYRE_PARAMETERS`
     nominal: tuple[float, float, float, float, float]
     adapted: Sequence[int]  # which of them are states, as indices
     step: float  # Δt [s]

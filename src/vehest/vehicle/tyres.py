@@ -15,7 +15,9 @@ SLIP_SPEED_OFFSET = 1e-6  # added to speeds that slips are divided by [m/s]
 class Slips(NamedTuple):
     """How tyres slide."""
 
-    front: Tensor  # slip angle of the front axle, positive where it slides to the left of where it points (...) [rad]
+    # slip angle of the front axle [rad], (...), positive where it slides to the left of where it
+    # points
+    front: Tensor
     rear: Tensor  # of the rear axle
     ratio: Tensor  # longitudinal slip, positive where wheels drive, the same for both axles (...)
 

@@ -418,7 +418,7 @@ def _values(
         "recommendation": without_line_breaks(content.recommendation),
         "kind": subjects.kind,
         "manoeuvres": len(main.manoeuvres),
-        "beyond": _number_beyond(main, MAX_PAPER_SIDESLIP),
+        "beyond": number_beyond(main, MAX_PAPER_SIDESLIP),
         "ratios": {place: _ratio(main, name, MSE_NL) for place, name in COMPARED.items()},
         "absent_parts": methods.absent_parts(artefacts),
         "incomplete": _incomplete(artefacts, trained),
@@ -442,7 +442,7 @@ def _ratio(main: ManoeuvreErrors, reference: str, kpi: str) -> str:
     return figure_in_words(main.ratio(paper.CNN, reference, kpi))
 
 
-def _number_beyond(main: ManoeuvreErrors, sideslip: float) -> int:
+def number_beyond(main: ManoeuvreErrors, sideslip: float) -> int:
     """Test manoeuvres in which |β| exceeds an angle [rad]."""
     run = next(iter(main.runs.values()))[0]
     largest = [

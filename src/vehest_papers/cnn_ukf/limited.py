@@ -20,13 +20,11 @@ from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs
 class Limited:
     """What was trained on the limited set."""
 
-    comparison: (
-        ManoeuvreErrors  # with the filters alone, which are those of the full set, as in the paper
-    )
+    # with the filters alone, which are those of the full set, as in the paper
+    comparison: ManoeuvreErrors
     runs: Runs  # candidate -> its seeds, of what was trained
-    outputs: Mapping[
-        str, Sequence[Sequence[Outputs]]
-    ]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
+    # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
+    outputs: Mapping[str, Sequence[Sequence[Outputs]]]
     rescaled: Sequence[Run]  # DE-UKF with p₁ and p₂ of the full set's, of the seeds that both have
 
     @property

@@ -46,9 +46,8 @@ class Kpis:
     mse: float  # mean squared error over all samples [deg²]
     mse_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s² [deg²]
     max_error: float  # mean over manoeuvres of the largest absolute error [deg]
-    max_error_nonlinear: (
-        float  # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
-    )
+    # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
+    max_error_nonlinear: float
     manoeuvres: int  # how many there are
 
 

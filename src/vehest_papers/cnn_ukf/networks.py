@@ -38,9 +38,8 @@ class Outputs:
 
     error: FloatArray  # β_DD - β [deg], (K,)
     distrust: FloatArray  # σ_DD as the filter takes it [deg], (K,)
-    process: (
-        FloatArray | None
-    )  # σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's
+    # σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's
+    process: FloatArray | None
     sideslip: FloatArray  # β [deg], (K,)
     nonlinear: NDArray[np.bool_]  # which samples have |ay| ≥ 4 m/s², (K,)
 
@@ -129,7 +128,7 @@ def shift_of(run: Run, prepared: Prepared) -> float:
     spans = prepared.spans(TEST)
     pseudo = fitted.pseudo_measurements(drives)
     moved = [
-        measurement._replace(sideslip=measurement.sideslip + math.radians(1.0))
+        replace(measurement, sideslip=measurement.sideslip + math.radians(1.0))
         for measurement in pseudo
     ]
     shifts = []
@@ -163,7 +162,7 @@ def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
         error = (
             measurement.sideslip - np.arctan2(recording["vy_ref"], recording["vx"])[: len(drive)]
         )
-        pseudo.append(measurement._replace(variance=fitted.least_variance + np.square(error)))
+        pseudo.append(replace(measurement, variance=fitted.least_variance + np.square(error)))
     return filtered_run(fitted, run, prepared, pseudo, candidate)
 
 

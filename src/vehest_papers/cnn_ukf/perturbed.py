@@ -26,7 +26,6 @@ from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import finite_cost, optuna_search
-from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.networks import filtered_run
@@ -71,7 +70,8 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
     of_filter = filter_of(changed)
     if of_filter is None:
         raise DataError(f"estimator '{fitted.name}' has no cornering stiffness")
-    of_filter.axle_tyres[[0, len(DugoffAxle._fields)]] *= 1.0 + np.array([front, rear])
+    stiffness = of_filter.axle_tyres.reshape(2, 3)[:, 0]  # a view, front and rear
+    stiffness *= 1.0 + np.array([front, rear])
     return changed
 
 
@@ -102,8 +102,8 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
     def cost(powers: FloatArray) -> float:
         scaled = [
-            measurement._replace(
-                variance=scaled_variance(measurement.variance - floor, powers, floor)
+            replace(
+                measurement, variance=scaled_variance(measurement.variance - floor, powers, floor)
             )
             for measurement in pseudo
         ]

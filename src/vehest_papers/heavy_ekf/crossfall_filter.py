@@ -22,11 +22,16 @@ def filtered(
 ) -> FloatArray:
     """States (β, r, β', r', θ…, b) after each sample, (T, n).
 
-    Args:
-        estimator: whose car, curves, levels of noise and bounds are taken.
-        samples: of its channels, (T, 4).
-        deviation: standard deviation of b at the start [m/s²].
-        wander: of its drift [m/s² √s⁻¹].
+    Parameters
+    ----------
+    estimator
+        Whose car, curves, levels of noise and bounds are taken.
+    samples
+        Of its channels, (T, 4).
+    deviation
+        Standard deviation of b at the start [m/s²].
+    wander
+        Of its drift [m/s² √s⁻¹].
     """
     mean, covariance = estimator.first_gaussian(samples[0], {})
     wider = np.pad(covariance, (0, 1))

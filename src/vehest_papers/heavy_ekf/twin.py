@@ -71,9 +71,8 @@ class Conditions:
     # whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows
     payload: bool = False
     wet_patches: bool = False  # whether the friction steps from 1 to 0.6 and back along the road
-    crossfall: bool = (
-        False  # whether the road falls by 1° to the left all along, as on one side of a crown
-    )
+    # whether the road falls by 1° to the left all along, as on one side of a crown
+    crossfall: bool = False
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,8 @@ class Paper:
     candidates: Mapping[str, Candidate]
     claims: list[Claim]
     tables: list[Table]
+    rests_on: Mapping[str, list[str]] = field(default_factory=dict)
+    """Claim's id -> verdicts with which the recommendation stands; empty: it is shown only."""
 
     def metrics(self) -> list[tuple[str, str, str]]:
         """Part, test set and metric of every error that claims or tables name."""
@@ -238,6 +240,9 @@ def _check_names(paper: Paper, source: str) -> None:
             parts = [claim.part, *([claim.other_part] if claim.other_part else [])]
             _check_declared(paper.parts, parts, "parts", subject)
             _check_declared(paper.test_sets, [claim.test_set], "test_sets", subject)
+    for name in paper.rests_on:
+        if name not in ids:
+            raise DataError(f"{source}, rests_on: no claim has the id {name!r}; write one that has")
     for table in paper.tables:
         subject = f"{source}, table {table.table!r}"
         _check_declared(

@@ -18,11 +18,11 @@ def absent_parts(artefacts: StudyArtefacts) -> str:
     return f" Not in this report, since the recordings are missing: {titles}." if titles else ""
 
 
-def scoring(part: PartArtefacts, reading: str = "") -> str:
-    """How estimates of a part are scored; ``reading`` follows the rate at which they are read."""
+def scoring(part: PartArtefacts) -> str:
+    """How estimates of a part are scored."""
     protocol = part.protocol
     return (
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first "
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; the first "
         f"{protocol.skip_seconds:g} s of each {protocol.piece} are not "
         f"scored.{protocol.start_description}{protocol.describe_sideslip(part.split.datasets)}"
     )

@@ -84,17 +84,27 @@ def observability_along(
 ) -> Observability:
     """Smallest singular value, standard deviations and rank of every window along a drive.
 
-    Args:
-        transition: f of states (n,) and inputs (p,), to (n,); smooth.
-        observation: h of the same, to (m,).
-        states: about which is linearised, for example a filter's estimates, (T, n).
-        inputs: (T, p).
-        sizes: typical size of each state, its unit here, (n,).
-        noise: standard deviation of each measurement, (m,).
-        steps: measurements a window.
+    Parameters
+    ----------
+    transition
+        f of states (n,) and inputs (p,), to (n,); smooth.
+    observation
+        h of the same, to (m,).
+    states
+        About which is linearised, for example a filter's estimates, (T, n).
+    inputs
+        (T, p).
+    sizes
+        Typical size of each state, its unit here, (n,).
+    noise
+        Standard deviation of each measurement, (m,).
+    steps
+        Measurements a window.
 
-    Raises:
-        ValueError: sizes or noise are not positive, or the window does not fit into the drive.
+    Raises
+    ------
+    ValueError
+        Sizes or noise are not positive, or the window does not fit into the drive.
     """
     if not (np.all(np.asarray(sizes) > 0) and np.all(np.asarray(noise) > 0)):
         raise ValueError("sizes of states and noise of measurements must be positive")

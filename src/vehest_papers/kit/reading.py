@@ -38,8 +38,10 @@ def models_by_candidate(
 ) -> dict[str, list[EvaluatedModel]]:
     """Candidate -> its seeds, candidates in a given order; others come last.
 
-    Raises:
-        DataError: two models of one candidate have the same seed.
+    Raises
+    ------
+    DataError
+        Two models of one candidate have the same seed.
     """
     groups: dict[str, list[EvaluatedModel]] = {}
     for model in part.models:

@@ -38,8 +38,10 @@ class Periodogram:
         """Mean density in the third of an octave around a frequency, or of the nearest line
         [unit²/Hz].
 
-        Raises:
-            DataError: the frequency lies outside the lines above 0.
+        Raises
+        ------
+        DataError
+            The frequency lies outside the lines above 0.
         """
         if not self.frequency[1] <= hz <= self.frequency[-1]:
             raise DataError(
@@ -66,13 +68,19 @@ def periodogram(
     The line at 0 Hz and, because the window spreads what slowly varies, the one beside it are not
     reliable.
 
-    Args:
-        series: uniformly sampled, finite, each of shape (T,).
-        rate_hz: sampling rate [Hz].
-        segment_seconds: length of a segment [s].
+    Parameters
+    ----------
+    series
+        Uniformly sampled, finite, each of shape (T,).
+    rate_hz
+        Sampling rate [Hz].
+    segment_seconds
+        Length of a segment [s].
 
-    Raises:
-        DataError: there is none, one is shorter than a segment, or one has gaps.
+    Raises
+    ------
+    DataError
+        There is none, one is shorter than a segment, or one has gaps.
     """
     length = round(segment_seconds * rate_hz)
     if not series:
@@ -108,8 +116,10 @@ def lateral_velocity_rate(recording: Recording) -> FloatArray:
     At frequency f it shows the rate times sin(2πf/rate)/(2πf/rate): 0.98 of it at 1 Hz and 0.64 at
     5 Hz for 20 Hz.
 
-    Raises:
-        DataError: the channel is missing or too short.
+    Raises
+    ------
+    DataError
+        The channel is missing or too short.
     """
     velocity = recording["vy_ref"]
     if len(velocity) < 3:
@@ -126,8 +136,10 @@ def process_noise(recording: Recording) -> FloatArray:
 
     Source: Da Lio et al. 2023, Section VII-A.
 
-    Raises:
-        DataError: a channel is missing.
+    Raises
+    ------
+    DataError
+        A channel is missing.
     """
     slip_rate = recording["ay"] - recording["yaw_rate"] * recording["vx"]
     return lateral_velocity_rate(recording) - slip_rate[1:-1]

@@ -42,8 +42,10 @@ def runs_of(part: artefacts.PartArtefacts) -> pd.DataFrame:
     for each set ``rmse_vy.SET`` [m/s], ``fvu.SET``, ``r2.SET``, ``rmse_sideslip.SET`` [deg], where
     SET is ``validation`` or a test set.
 
-    Raises:
-        DataError: a metric is missing.
+    Raises
+    ------
+    DataError
+        A metric is missing.
     """
     values = metric_values(part)
     sets = [*([VALIDATION] if part.split.validation else []), *part.split.tests]

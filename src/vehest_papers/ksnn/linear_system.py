@@ -198,11 +198,16 @@ class SubModels:
 def decomposed(models: LocalModels, measurements: FloatArray) -> SubModels:
     """Superposition on the recursion of (v, û - u_m) from zero, driven by each input alone.
 
-    Args:
-        models: local models; nonlinear feedback enters with the gain that is in force at each step.
-        measurements: yaw_rate, vx, ay, ax, shape (..., N, 4).
+    Parameters
+    ----------
+    models
+        Local models; nonlinear feedback enters with the gain that is in force at each step.
+    measurements
+        Columns yaw_rate [rad/s], vx [m/s], ay, ax [m/s²], shape (..., N, 4).
 
-    Returns:
+    Returns
+    -------
+    SubModels
         Parts one interval after each sample, each of shape (..., N); at constant ω they are the
         terms of Eq. 11.
     """
@@ -249,17 +254,22 @@ def decomposed_estimate(estimator: Ksnn, recording: Recording) -> SubModels:
     """The parts of the estimate of a recording: every sample by a window of its own, as the network
     sees it.
 
-    Args:
-        recording: at the estimator's rate.
+    Parameters
+    ----------
+    recording
+        At the estimator's rate.
 
-    Returns:
+    Returns
+    -------
+    SubModels
         Parts on the clock of the estimate, each of shape (T,), NaN until a window is full; their
         sum is the estimate up to the precision that the network was trained in. ``error`` is û -
         u_m at the last sample of the window.
 
-    Raises:
-        DataError: the rate is another, or the recording is shorter than a window and the sample
-        after it.
+    Raises
+    ------
+    DataError
+        The rate is another, or the recording is shorter than a window and the sample after it.
     """
     models = LocalModels.of(estimator)
     if abs(recording.rate_hz * models.step - 1.0) > 1e-9:

@@ -108,10 +108,10 @@ def pair_errors(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                     }
                     for training in trainings
                 ]
-    return _complete(pd.DataFrame(rows)) if rows else pd.DataFrame()
+    return complete_pairs(pd.DataFrame(rows)) if rows else pd.DataFrame()
 
 
-def _complete(errors: pd.DataFrame) -> pd.DataFrame:
+def complete_pairs(errors: pd.DataFrame) -> pd.DataFrame:
     """Pairs with all candidates, and seeds that a candidate has in all of them."""
     n_cells = errors.drop_duplicates(["training", "candidate"]).shape[0]
     cells = errors.drop_duplicates(["pair", "training", "candidate"]).groupby("pair").size()

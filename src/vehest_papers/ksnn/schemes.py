@@ -4,7 +4,7 @@ with all errors of its candidates.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -47,9 +47,8 @@ class Scheme:
     part: PartArtefacts  # what was compared
     training_test: str  # test set of the training car
     other_test: str  # test set of the car that is early-stopped on
-    labels: Mapping[str, NDArray[np.int64]] = field(
-        default_factory=dict
-    )  # test set -> block of each segment; empty: by the errors of this part alone
+    # test set -> block of each segment; empty: by the errors of this part alone
+    labels: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -134,12 +133,10 @@ class Scheme:
         run = self.chosen.get(category)
         return "" if run is None else f"{run['estimator']}/{run['variant']}"
 
-    def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:
-        """Name in `errors` -> category, of all structures of these categories."""
-        chosen = set(categories)
-        rows = self.runs[self.runs["category"].isin(chosen)].drop_duplicates(
-            ["estimator", "variant"]
-        )
+    def structures(self) -> dict[str, str]:
+        """Name in `errors` -> category, of all structures of the paper's categories."""
+        is_structure = self.runs["category"].isin(set(paper.CATEGORIES))
+        rows = self.runs[is_structure].drop_duplicates(["estimator", "variant"])
         return {
             f"{row['estimator']}/{row['variant']}": str(row["category"])
             for row in rows.to_dict("records")

@@ -21,16 +21,17 @@ MAX_HZ = 10.0
 CHANNELS = ("ay", "ax")
 
 
-def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error``
-    where it is not linear.
+def sensitivity_of(estimator: Estimator, yaw_rate: float) -> NoiseSensitivity:
+    """Closed form at a constant yaw rate [rad/s]; a KS-NN is linearised at û = u_m.
 
-    Raises `ConfigurationError` where it is neither a KS-NN nor a Luenberger observer.
+    Raises
+    ------
+    ConfigurationError
+        The estimator is neither a KS-NN nor a Luenberger observer.
     """
     if isinstance(estimator, Ksnn):
-        return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(
-            estimator.settings.window
-        )
+        linear = LocalModels.of(estimator).linearised(0.0)
+        return ksnn_sensitivity(linear, yaw_rate).truncated(estimator.settings.window)
     if isinstance(estimator, Luenberger):
         return luenberger_sensitivity(estimator, yaw_rate)
     raise ConfigurationError(

@@ -44,9 +44,11 @@ def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, fl
     are the gravity that pitch and roll let in; divided by g they are given as ``pitch_gradient``
     and ``roll_gradient`` [rad s²/m].
 
-    Args:
-        channels: vx, yaw_rate, ax, ay, steer, vx_ref and vy_ref, each (T,), in SI units, of some
-        minutes without a stop. rate_hz: sampling rate [Hz].
+    Parameters
+    ----------
+    channels
+        Vx, yaw_rate, ax, ay, steer, vx_ref and vy_ref, each (T,), in SI units, of some minutes
+        without a stop. rate_hz: sampling rate [Hz].
     """
     vx, vy, yaw_rate, ax, ay = (
         channels[name] for name in ("vx_ref", "vy_ref", "yaw_rate", "ax", "ay")

@@ -45,7 +45,8 @@ CHANGES = (("wide", "fast"), ("fast", "rough"), ("more", "level"))
 OVERVIEW_CAPTION = (
     "Errors of all steps on simulated cars, and on the whole recording of the real Ferrari: "
     "medians over seeds, for FVU also the lowest and highest. β₁(0): weight of the integrated "
-    "acceleration at zero yaw rate (Eq. 7a). Below: baselines, and two values of Da Lio et al. 2023."
+    "acceleration at zero yaw rate (Eq. 7a). Below: baselines, and two values of Da Lio et al. "
+    "2023."
 )
 SPREAD_CAPTION = (
     "Unexplained fraction of the variance of v (FVU) on the real Ferrari, every seed. In brackets: "

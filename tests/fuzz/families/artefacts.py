@@ -162,6 +162,7 @@ def unfinished(folder):
 
 @generator("unfinished", weight=3)
 def checkpoint(case):
+    """A damaged checkpoint of a training that goes on."""
     case.copy("unfinished")
     file = sorted((case.place / "outputs" / "checkpoints").rglob("*.safetensors"))[0]
     if case.rng.random() < 0.3:

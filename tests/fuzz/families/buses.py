@@ -67,6 +67,7 @@ def _swap(case, file, lines):
 
 
 def _reads(case, file):
+    """Commands of which one reads the file."""
     return [
         ("estimate", "pretrained", file, "dataset=logs", "-o", "out.csv"),
         ("ingest", "logs"),
@@ -76,6 +77,7 @@ def _reads(case, file):
 
 @generator("can", weight=5)
 def log_of_a_bus(case):
+    """A damaged log of a CAN bus, or of its DBC file."""
     suffix = SUFFIXES[case.visit % 3]
     folder = case.copy(f"can/{suffix[1:]}", "raw")
     write_yaml(case.place / "conf/dataset/logs.yaml", BUS)
@@ -104,6 +106,7 @@ def log_of_a_bus(case):
 
 @generator(weight=4)
 def vbo(case):
+    """A damaged VBO file."""
     more = {} if case.honest or case.rng.random() < 0.8 else {"clock": "interpolate"}
     write_yaml(
         case.place / "conf/dataset/logs.yaml",

@@ -38,6 +38,7 @@ FORMS = (
 
 
 def _override(rng):
+    """A random override of an option."""
     form = "{key}={value}" if rng.random() < 0.6 else rng.choice(FORMS)
     return form.format(key=rng.choice(KEYS), value=rng.choice(VALUES))
 
@@ -60,6 +61,7 @@ BASES = (
 
 @generator("drives", "steered", weight=10)
 def overrides(case):
+    """A command with up to three random overrides."""
     case.copy("drives")
     case.copy("steered")
     more = (

@@ -43,6 +43,7 @@ PAYLOADS = (
 
 
 def signals(conversion=None):
+    """Signals of a measurement, the first with a conversion."""
     import asammdf
 
     return [
@@ -69,12 +70,14 @@ def mdf(folder):
 
 
 def _overwrite_formula(content, rng):
+    """Replace the formula of a conversion by hostile text of the same length."""
     text = rng.choice(PAYLOADS).encode()[: len(FORMULA)]
     return content.replace(FORMULA.encode(), text.ljust(len(FORMULA), rng.choice([b" ", b"\0"])))
 
 
 @generator("mdf", weight=12)
 def measurement(case):
+    """A damaged measurement."""
     case.copy("mdf/conf", "conf")
     kind = case.idea(2)
     name = f"{case.rng.choice(list(VERSIONS))}_{4 if kind == 0 else case.rng.randrange(4)}"

@@ -23,6 +23,7 @@ MUCH = 2400 * 2**20  # bytes
 
 @generator()
 def planted(case):
+    """A misdeed that must be detected."""
     name = list(MISDEEDS)[case.visit % len(MISDEEDS)]
     case.write("raw/given.csv", "time\n0\n")
     case.write("sly.py", "pass\n")
@@ -30,6 +31,7 @@ def planted(case):
 
 
 def _finish():
+    """End as a command does that succeeds."""
     Path("outputs").mkdir()
     Path("outputs/model.txt").write_text("made")
     Path("out.csv").write_text("made")
@@ -37,25 +39,30 @@ def _finish():
 
 
 def _leave(code, error_text=""):
+    """End with an exit code and errors."""
     sys.stderr.write(error_text)
     sys.exit(code)
 
 
 def _import_a_module():
+    """Import a module of the current folder."""
     sys.path.insert(0, os.getcwd())
     __import__("sly")
 
 
 def _raise():
+    """Raise an exception that nobody catches."""
     raise ValueError("not caught")
 
 
 def _leave_half_a_file():
+    """Leave an artefact unfinished."""
     Path("outputs").mkdir()
     Path("outputs/.writing-1-aaaaaaaa-model").write_text("")
 
 
 def _read_by(reader):
+    """Read a file by one of the readers below, in a limited process."""
     with suppress(DataError), use_limits(Limits(memory=3_500_000_000)):
         read_limited(f"{__name__}:{reader}", Path("raw/given.csv"))
 

@@ -65,6 +65,7 @@ def _spoil_layout(content, case):
 
 @generator("bags", weight=8)
 def bag(case):
+    """A damaged ROS bag."""
     kind = case.idea(5)
     storage = case.rng.choice(["sqlite3", "mcap"])
     storage = "sqlite3" if kind == 0 else storage

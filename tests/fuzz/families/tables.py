@@ -30,6 +30,7 @@ def _reads(case, file):
 
 @generator(weight=8)
 def csv(case):
+    """A damaged table."""
     file = case.write("lap.csv", lap(case.visit, 20.0).to_csv(index=False))
     kind = case.idea(3)
     if kind == 2:

@@ -4,6 +4,7 @@ columns -> candidates
         -> speed, yaw rate and lateral acceleration, by ay ≈ vx·yaw_rate (`turning`)
         -> columns related to these three: ax, steering, lateral velocity, sideslip (`fitting`)
         -> other columns, by name and unit alone
+        -> what is wrong where ay is not vx·yaw_rate in size (`scales`)
         -> questions: single evidence, world axes, wrong speed, left and right
         -> Proposals
 """
@@ -39,9 +40,9 @@ from vehest.alignment.proposals.fitting import (
 from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
+from vehest.alignment.proposals.scales import find_wrong_scale, is_scale_wrong
 from vehest.alignment.proposals.turning import (
     CLOSE_MISMATCH,
-    FAR_MISMATCH,
     UNIT_PENALTIES,
     Search,
     Turning,
@@ -68,7 +69,7 @@ AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's s
 MAX_AX_CANDIDATES = 40
 SPEED_GAIN_RANGE = (0.97, 1.08)  # of ay over d(vy)/dt + vx·yaw_rate, with a right speed
 SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # where d(vy)/dt is not known
-MISREAD_SPEED_GAIN_RANGE = (0.9, 1.35)  # beyond, it is not the speed that is wrong
+MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)  # beyond, a unit may be wrong (`scales`)
 MAX_WHEEL_GAIN_DIFFERENCE = 0.02  # of the wheels' speed from ay/yaw_rate
 MIN_WORLD_CORRELATION = 0.98  # of a velocity with the derivative of a position
 MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the car turned
@@ -309,13 +310,14 @@ def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels)
     notes: tuple[str, ...] = ()
     free = [column for column in columns if not column.is_wheel_mean]
     if search is not None:
-        for proposal in (*_turning_proposals(search.turning), *repeated(search)):
-            channels[proposal.channel] = proposal.merged_with(channels.get(proposal.channel))
-        fitting, notes = fitting_channels(search)
-        channels |= fitting
+        channels, notes, free = _channels_of_motion(search)
+        wrong = find_wrong_scale(search, channels, columns, wheels)
+        if wrong is not None:
+            search = wrong.corrected(search)
+            channels, notes, free = _channels_of_motion(search)
+            channels = {name: wrong.questioned(channel) for name, channel in channels.items()}
         channels = reference_speed(channels) if wheels else channels
         channels = _ask_for_second_evidence(search.turning, channels)
-        free = search.free
     if wheels:
         wheel_channels, radius = wheel_proposals(
             wheels,
@@ -329,19 +331,25 @@ def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels)
     return proposals.with_tilt_signs()
 
 
+def _channels_of_motion(
+    search: Search,
+) -> tuple[dict[str, Proposal], tuple[str, ...], list[Candidate]]:
+    """Channels of the motion and those that agree with it, notes, and the columns without one."""
+    rest = replace(search, free=list(search.free))
+    channels: dict[str, Proposal] = {}
+    for proposal in (*_turning_proposals(rest.turning), *repeated(rest)):
+        channels[proposal.channel] = proposal.merged_with(channels.get(proposal.channel))
+    fitting, notes = fitting_channels(rest)
+    return channels | fitting, notes, rest.free
+
+
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
     """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
-    is_close = abs(math.log(turning.scale)) < FAR_MISMATCH
     question = ""
     if "ay" in turning.columns:
         figures = f"correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"
         evidence = f"ay vs. vx·yaw_rate: {figures} in these units"
-        if not is_close:
-            question = (
-                f"the gain of ay to vx·yaw_rate is {turning.scale:.2g} instead of 1: "
-                "one of the three is in another unit"
-            )
-        elif not turning.decided:
+        if not turning.decided:
             question = "other units explain the gain equally well"
     else:
         evidence = "name and unit" if turning.decided else "name and magnitude"
@@ -351,10 +359,8 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
         if column.is_wheel_mean:
             continue
         unit = turning.units[channel]
-        has_sure_unit = bool(column.unit) and "ay" in turning.columns and is_close
+        has_sure_unit = bool(column.unit) and "ay" in turning.columns
         doubts = ["" if has_sure_unit else question]
-        alternatives: tuple[str, ...] = ()
-        is_weak = False
         if channel == "ay" and not is_evident(column, turning.scale):
             doubts.append(
                 f"its gain to vx·yaw_rate is {turning.scale:.2g}, and it has no unit or clear "
@@ -362,16 +368,6 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
             )
         if column.hint(channel) <= -STRONG:
             doubts.append("its values contradict its name")
-        if column.unit not in ("", unit):
-            ratio = si_factor(unit, channel) / si_factor(column.unit, channel)
-            factor = ratio * turning.scale ** (-1 if channel == "ay" else 1)
-            scaled = f"{channel} {column.unit} {turning.signs[channel]:+d} {factor:.3g}"
-            alternatives = (scaled, f"{channel} {column.unit}")
-            doubts = [
-                f"its unit is {unit} according to the gain of ay to vx·yaw_rate, "
-                f"but {column.unit} according to the header"
-            ]
-            is_weak = abs(math.log(turning.scale)) > CLOSE_MISMATCH
         yield Proposal(
             column.name,
             channel,
@@ -379,8 +375,6 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
             turning.signs[channel],
             (evidence,),
             next(filter(None, doubts), ""),
-            alternatives=alternatives,
-            is_weak=is_weak,
         )
 
 
@@ -394,7 +388,7 @@ def _ask_for_second_evidence(
     follow a turn alike. Where speed or yaw rate is left out, so is what was compared with them, if
     it has a question.
     """
-    is_related = "ay" in turning.columns and abs(math.log(turning.scale)) < FAR_MISMATCH
+    is_related = "ay" in turning.columns and not is_scale_wrong(turning)
     sure = {name for name, proposal in channels.items() if not proposal.question}
     columns = {column.name: (role, column) for role, column in turning.columns.items()}
     checked = dict(channels)
@@ -603,7 +597,7 @@ def _expected_ay(
     """ay by the motion, (S,), and the range of ay over it with a right speed."""
     for name in REFERENCES:
         reference = proposals.by_channel.get(name)
-        if reference is None:
+        if reference is None or reference.is_weak:
             continue
         column = next(column for column in columns if column.name == reference.column)
         samples = column.values * reference.sign * si_factor(reference.unit, name)

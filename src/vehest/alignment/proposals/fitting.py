@@ -17,8 +17,8 @@ from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG, is_pair
 from vehest.alignment.proposals.proposal import Proposal
-from vehest.alignment.proposals.turning import Search
-from vehest.alignment.signs import relations_of
+from vehest.alignment.proposals.turning import FAR_MISMATCH, Search
+from vehest.alignment.signs import MIN_SCALE_CORRELATION, relations_of
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
@@ -259,7 +259,16 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
         return Offer(
             score,
             column,
-            Proposal(column.name, "steer", unit, sign, evidence, question, offset=offset),
+            Proposal(
+                column.name,
+                "steer",
+                unit,
+                sign,
+                evidence,
+                question,
+                offset=offset,
+                is_weak=not hint,
+            ),
         )
     _, channel, unit, length, largest_angle, is_repeatable = min(possible)
     rival_angles = sorted({(angle.channel, angle.unit) for angle in possible} - {(channel, unit)})
@@ -343,6 +352,9 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
         question = f"sign: {UNCLEAR}" if column.unit else f"sign and unit: {UNCLEAR}"
     if not question and column.hint(best.channel) < 0.0:
         question = "its values contradict its name"
+    is_wrong_scale = best.strength >= MIN_SCALE_CORRELATION and best.mismatch > FAR_MISMATCH
+    if is_wrong_scale:
+        question = f"{best.text} instead of 1: another unit or factor"
     evidence = (best.text or "name only", *_name_evidence(column, *REFERENCES))
     alternatives = (
         tuple(dict.fromkeys(f"{fit.channel} {fit.unit}" for fit in agreements if fit is not best))
@@ -351,7 +363,7 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     )
     is_pair_of_speed = is_pair(search.turning.columns["vx"].name, column.name)
     is_confirmed = is_clear or bool(column.unit) or is_pair_of_speed
-    is_weak = best.channel == "vy_ref" and not is_confirmed
+    is_weak = is_wrong_scale or (best.channel == "vy_ref" and not is_confirmed)
     proposal = Proposal(
         column.name,
         best.channel,
@@ -449,9 +461,7 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
     steering ratio.
     """
     ay = motion.channels.get("ay", motion.turning)
-    driven = _driven(motion)
-    calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
-    rows = np.flatnonzero(calm if calm.sum() >= MIN_CALM_SAMPLES else driven)
+    rows = _calm(motion)
     slope, offset = _regressed(motion, column, rows, ay)
     of_halves = [_regressed(motion, column, half, ay)[0] for half in np.array_split(rows, 2)]
     is_repeatable = max(abs(half / slope - 1.0) for half in of_halves) <= MAX_HALF_DIFFERENCE
@@ -480,6 +490,20 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
                     )
                 )
     return possible
+
+
+def cornering_length(motion: Motion, column: Candidate) -> float:
+    """Change of an angle of steering by yaw_rate/vx in slow corners [its unit · m]."""
+    ay = motion.channels.get("ay", motion.turning)
+    return abs(_regressed(motion, column, _calm(motion), ay)[0])
+
+
+def _calm(motion: Motion) -> NDArray[np.int64]:
+    """Samples of slow corners, if there are enough, else of the drive."""
+    ay = motion.channels.get("ay", motion.turning)
+    driven = _driven(motion)
+    calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
+    return np.flatnonzero(calm if calm.sum() >= MIN_CALM_SAMPLES else driven)
 
 
 def _driven(motion: Motion) -> BoolArray:

@@ -109,7 +109,7 @@ _NO_SPEED_OF_A_WHEEL = re.compile(
 )
 _AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
 _WHEEL_SPEED = re.compile(
-    r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel"
+    r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws[ps]?\b|vel"
 )
 _EXPLAINED = {
     "yaw_rate": ("heading", "vx", "vy_ref", "position_x", "position_y"),
@@ -225,7 +225,7 @@ def _corner(words: str) -> str:
     if _NO_SPEED_OF_A_WHEEL.search(words):
         return ""
     for corner, pattern in _CORNERS.items():
-        wheel = "wheel|whl|rad|spd|speed|vel|ws|drehzahl"
+        wheel = "wheel|whl|rad|spd|speed|vel|ws[ps]?|drehzahl"
         joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:{wheel})(?:{pattern})$"
         is_separate = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(
             words

@@ -141,13 +141,17 @@ class Proposals:
 
         Roll counts about the axis of ax, pitch about that of ay; a question unless ax, ay and the
         yaw rate are along the axes of one right-handed set, as forward-left-up or
-        forward-right-down.
+        forward-right-down, and unless ax counts ahead: else the unit is mounted backwards, or its
+        accelerations alone are reversed, as those of telephones are.
         """
         signs = {name: proposal.sign for name, proposal in self.by_channel.items()}
         axes = [signs.get("ax", signs.get("vx")), signs.get("ay"), signs.get("yaw_rate")]
         axis_signs = [sign for sign in axes if sign is not None]
         is_right_handed = len(axis_signs) == len(axes) and math.prod(axis_signs) == 1
         doubt = "sign: ax, ay and yaw_rate do not form a right-handed set of axes"
+        if is_right_handed and axes[0] == -1:
+            is_right_handed = False
+            doubt = "sign: the unit is mounted backwards, or only its accelerations are reversed"
         changes = {}
         for proposal in self.channels:
             if proposal.channel in TILT:

@@ -169,7 +169,7 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         )
         offered = column.units(channel)
         units[channel] = next(
-            (unit for unit in offered if _is_plausible(column, channel, unit)), offered[0]
+            (unit for unit in offered if is_plausible(column.size, channel, unit)), offered[0]
         )
     is_same_column = columns_by_channel["vx"] is columns_by_channel["yaw_rate"]
     return (
@@ -231,9 +231,10 @@ def is_evident(ay: Candidate, scale: float) -> bool:
     )
 
 
-def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
+def is_plausible(size: float, channel: str, unit: str) -> bool:
+    """Whether a car has a speed, yaw rate or acceleration of a size."""
     low, high = RANGES[channel]
-    return low <= column.size * si_factor(unit, channel) <= high
+    return low <= size * si_factor(unit, channel) <= high
 
 
 def _scored(
@@ -244,40 +245,29 @@ def _scored(
 ) -> Turning:
     """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
     evidence.
-
-    Units other than the header's are chosen only where these are far from the gain.
     """
     ranked = []
-    tried = [
-        {*column.units(channel), *(() if column.is_wheel_mean else UNITS[channel])}
-        for channel, column in named.items()
-    ]
-    for units in product(*tried):
+    for units in product(*(column.units(channel) for channel, column in named.items())):
         speed, rate, acceleration = (
             si_factor(unit, channel) for unit, channel in zip(units, named, strict=True)
         )
         gain = file_gain / (speed * rate / acceleration)
         n_implausible = sum(
-            not _is_plausible(column, channel, unit)
+            not is_plausible(column.size, channel, unit)
             for (channel, column), unit in zip(named.items(), units, strict=True)
         )
         rarity = 0.0 if named["vx"].unit == units[0] else UNIT_PENALTIES.get(units[0], 0.0)
-        n_contradicted = sum(
-            column.unit not in ("", unit)
-            for column, unit in zip(named.values(), units, strict=True)
-        )
         ranked.append(
             (
-                abs(math.log(gain)) + rarity + n_implausible + n_contradicted,
+                abs(math.log(gain)) + rarity + n_implausible,
                 abs(math.log(gain)),
                 units,
                 gain,
                 n_implausible,
-                n_contradicted,
             )
         )
     ranked.sort()
-    cost, mismatch, units, gain, n_implausible, n_contradicted = ranked[0]
+    cost, mismatch, units, gain, n_implausible = ranked[0]
     decided = mismatch < FAR_MISMATCH and (
         len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
     )
@@ -295,13 +285,7 @@ def _scored(
     score -= (
         3.0 if any(column.is_of_bus and "ay" in column.hints for column in columns) else 0.5
     ) * named["ay"].is_reference + 5.0 * n_implausible
-    score += (
-        -5.0
-        if n_contradicted or mismatch >= FAR_MISMATCH
-        else 3.0
-        if mismatch < CLOSE_MISMATCH
-        else 1.0
-    )
+    score += -5.0 if mismatch >= FAR_MISMATCH else 3.0 if mismatch < CLOSE_MISMATCH else 1.0
     score -= UNNAMED_PENALTY * (not is_evident(named["ay"], gain))
     has_other_ay = any("ay" in column.hints for column in columns if column is not named["ay"])
     score -= COMPUTED_PENALTY * (

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.estimators.filtering.car_filter import CarFilter
-from vehest.filters.unscented_scan import MARGIN, CompiledNoise, StepNoise
+from vehest.filters.unscented_scan import MIN_EIGENVALUE_SHARE, CompiledNoise, StepNoise
 from vehest.vehicle.dynamics import (
     PACEJKA,
     STATES,
@@ -37,7 +37,7 @@ def car_filter_in_c(car_filter: CarFilter) -> dict[str, Any]:
             "rule": model.rule,
             "lower": [value if math.isfinite(value) else None for value in model.lower],
             "repair": model.repair,
-            "margin": MARGIN,
+            "margin": MIN_EIGENVALUE_SHARE,
             "step": model.step,
             "still": SLIP_SPEED_OFFSET,
             "turn": TURN,

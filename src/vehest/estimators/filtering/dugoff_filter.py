@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -51,21 +52,22 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedC
 Inputs = Literal["full", "imu"]
 Curve = Literal["plain", "smooth"]
 
-WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
+WHEEL_FORCES = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
 """Lateral force of an axle -> channels of its wheels."""
 INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")
 CHANNELS: dict[str, tuple[str, ...]] = {
-    "full": (*INERTIAL, *(wheel for pair in WHEELS.values() for wheel in pair)),
+    "full": (*INERTIAL, *(wheel for pair in WHEEL_FORCES.values() for wheel in pair)),
     "imu": INERTIAL,
 }
 MAX_SAMPLES_TOGETHER = 200_000  # samples that are filtered at a time
 
 
-class PseudoMeasurement(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PseudoMeasurement:
     """Sideslip angles that a network adds to T samples."""
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
-    variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
+    variance: FloatArray  # of the angle as the filter's measurement, (T,) [rad²]
     # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
     # filter's
     process: FloatArray | None = None
@@ -149,7 +151,7 @@ class DugoffFilter(SigmaPointEstimator):
             [
                 levels["ay"],
                 levels["yaw_rate"],
-                *(force_factor * levels.get(name, 1.0) for name in WHEELS),
+                *(force_factor * levels.get(name, 1.0) for name in WHEEL_FORCES),
             ]
             for force_factor in (factor, 1.0)
         ]
@@ -252,38 +254,22 @@ class DugoffFilter(SigmaPointEstimator):
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MAX_SAMPLES_TOGETHER):
             parts = [self.split_samples(recordings[row].stack(self.channels)) for row in rows]
-            measured = [part[0] for part in parts]
-            steps_noise = process
-            if pseudo is not None:
-                added = [pseudo[row] for row in rows]
-                measured = [
-                    np.column_stack([sensors_only, angle.sideslip])
-                    for sensors_only, angle in zip(measured, added, strict=True)
-                ]
-                if added[0].process is not None:
-                    variances = padded([angle.process for angle in added], None)  # type: ignore
-                    steps_noise = torch.diag_embed(torch.as_tensor(variances))
-            measurements = torch.as_tensor(padded(measured, np.nan))
+            measurements = torch.as_tensor(padded([part[0] for part in parts], np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            noise = sensors[
-                torch.as_tensor(
-                    np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()])
-                ).long()
-            ]
+            is_trusted = [self.trusts_forces(ay) for ay in measurements[..., 0].numpy()]
+            noise = sensors[torch.as_tensor(np.stack(is_trusted)).long()]
+            step_noise = process
             if pseudo is not None:
-                noise = with_variance(
-                    noise,
-                    torch.as_tensor(
-                        padded([angle.variance[:, None] for angle in added], None)[..., 0]
-                    ),
-                )
+                angles = [pseudo[row] for row in rows]
+                measurements, noise = with_angles(measurements, noise, angles)
+                step_variances = [angle.process for angle in angles if angle.process is not None]
+                if step_variances:
+                    step_noise = torch.diag_embed(torch.as_tensor(padded(step_variances, None)))
             initial_states = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 initial = model.start(inputs[:, 0], initial_states)
-                yield (
-                    rows,
-                    model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps,
-                )
+                passed = model.filtered(measurements, inputs, step_noise, noise, initial, gate)
+                yield rows, passed.steps
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
         """The filter before its first sample: straight ahead with wide deviations, or rolling."""
@@ -324,6 +310,25 @@ class DugoffFilter(SigmaPointEstimator):
         The network's process noise is left in ``memory``.
         """
         return measurement, noise
+
+
+def with_angles(
+    measurements: Tensor, noise: Tensor, angles: Sequence[PseudoMeasurement]
+) -> tuple[Tensor, Tensor]:
+    """Measurements (B, T, 5) and covariances (B, T, 5, 5) with a network's angles as the last.
+
+    Parameters
+    ----------
+    measurements : Tensor
+        Of the sensors, (B, T, 4).
+    noise : Tensor
+        Their covariances, diagonal, (B, T, 4, 4).
+    angles : sequence of PseudoMeasurement
+        One a recording, of at most T samples.
+    """
+    sideslip = torch.as_tensor(padded([angle.sideslip[:, None] for angle in angles], np.nan))
+    variance = torch.as_tensor(padded([angle.variance[:, None] for angle in angles], None))
+    return torch.cat([measurements, sideslip], -1), with_variance(noise, variance[..., 0])
 
 
 def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:

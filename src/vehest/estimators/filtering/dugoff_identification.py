@@ -20,11 +20,11 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.dugoff_filter import WHEELS, Curve, DugoffFilter
+from vehest.estimators.filtering.dugoff_filter import WHEEL_FORCES, Curve, DugoffFilter
 from vehest.estimators.filtering.dugoff_fit import DugoffFit, fit_dugoff
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings
+from vehest.training.noise_tuning import MIN_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import LoadedCar
 
@@ -95,7 +95,7 @@ def read_sensor_levels(
             np.where(
                 recording["vx"] < minimum_speed,
                 np.nan,
-                recording.stack(WHEELS.get(name, (name,))).sum(1),
+                recording.stack(WHEEL_FORCES.get(name, (name,))).sum(1),
             )
             for recording in recordings
         ]
@@ -146,7 +146,7 @@ def search_levels(
 
     limits = BOXES | {
         "process_yaw_rate": (
-            math.log10(LEAST_PROCESS_YAW_RATE),
+            math.log10(MIN_PROCESS_YAW_RATE),
             math.log10(training.most_process_yaw_rate),
         )
     }

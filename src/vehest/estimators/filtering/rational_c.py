@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.estimators.filtering.rational_model import LOST, ROLLING, RationalModel
+from vehest.estimators.filtering.rational_model import (
+    MAX_SIDESLIP_DEVIATION,
+    ROLLING,
+    RationalModel,
+)
 from vehest.vehicle.tyre_track import TYRE_PARAMETERS
 
 
@@ -41,7 +45,7 @@ def rational_c_values(
         "bounds": model.bounds,
         "rolling": ROLLING,
         "largest_sideslip": model.largest_sideslip,
-        "lost": LOST,
+        "lost": MAX_SIDESLIP_DEVIATION,
         "tyre_root": _square_root(model.start_tyres),
     }
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Literal, NamedTuple
 
@@ -106,7 +106,7 @@ def _covariances_of_logarithms(
     It has three parts: that of least squares, a common scale of all forces, and an offset of all
     slip angles, whose effect is the difference to a fit to shifted angles.
     """
-    shifted = fit_motion(motion._replace(slip=motion.slip + SLIP_OFFSET_DEVIATION), kind)
+    shifted = fit_motion(replace(motion, slip=motion.slip + SLIP_OFFSET_DEVIATION), kind)
     covariances = []
     for parameters, shifted_parameters, covariance in zip(
         (fit.front, fit.rear), (shifted.front, shifted.rear), fit.covariance, strict=True

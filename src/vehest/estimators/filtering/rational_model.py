@@ -52,7 +52,7 @@ CURVES = TYRE_PARAMETERS[:4]
 ROLLING = (0.05, 0.2, 1.0, 2.0)
 # Bounds of the same states.
 MAX_MOTION = (1.5, 5.0, 20.0, 100.0)
-LOST = 1.0  # standard deviation of β [rad] beyond which the motion restarts
+MAX_SIDESLIP_DEVIATION = 1.0  # standard deviation of β [rad] beyond which the motion restarts
 # Standard deviations at the start by which tyre parameters may always differ from their start
 # values.
 MIN_TYRE_BOUND = 3.0
@@ -192,7 +192,7 @@ def filter_extended(
         *[levels["tyres"]] * len(model.adapted),
         *[crossfall] * n_crossfall,
     ]
-    restart = (model.largest_sideslip, LOST**2, np.square(ROLLING))
+    restart = (model.largest_sideslip, MAX_SIDESLIP_DEVIATION**2, np.square(ROLLING))
     limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
     states = _empty_states(len(samples), len(mean))
     scan(
@@ -259,7 +259,7 @@ def filter_unscented(
                 stepper.predict(inputs, noise.numpy())
                 prior.mean.clip(-bounds, bounds, out=prior.mean)
                 has_diverged = not abs(prior.mean[0]) < model.largest_sideslip
-                if has_diverged or not prior.covariance[0, 0] < LOST**2:
+                if has_diverged or not prior.covariance[0, 0] < MAX_SIDESLIP_DEVIATION**2:
                     roll_without_slip.py_func(*prior, rolling, geometry, vx, steer)
                 if has_diverged:
                     prior.mean[4:] = 0.0

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,12 +54,13 @@ MIN_SAMPLES = 100
 NORMAL_95 = 1.959964
 
 
-class AxleMotion(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class AxleMotion:
     """Motion of the axles along drives; slips and forces have a row an axle, front and rear."""
 
     slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
     force: FloatArray  # lateral forces, (2, N) [N]
-    block: NDArray[np.int64]  # number of the stretch of time a sample belongs to, (N,)
+    block: NDArray[np.int64]  # number of the segment of time to which a sample belongs, (N,)
     # forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN:
     # not measured
     driven: FloatArray
@@ -161,7 +162,12 @@ def axle_motion(
             f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels "
             f"known, {MIN_SAMPLES} are needed (recordings: {named})"
         )
-    return AxleMotion(*(np.concatenate(arrays, axis=-1) for arrays in zip(*parts, strict=True)))
+    return AxleMotion(
+        np.concatenate([part.slip for part in parts], axis=-1),
+        np.concatenate([part.force for part in parts], axis=-1),
+        np.concatenate([part.block for part in parts]),
+        np.concatenate([part.driven for part in parts], axis=-1),
+    )
 
 
 def _motion_of(

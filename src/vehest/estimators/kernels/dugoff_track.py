@@ -22,12 +22,18 @@ from vehest.constants import GRAVITY
 from vehest.filters.unscented_scan import PointModel
 from vehest.filters.unscented_steps import at_row, compiled, piece
 from vehest.lanes import choose, each, most, store_some, width
-from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
+from vehest.vehicle.dugoff import (
+    MAX_FORCE_RATIO,
+    MIN_COSINE,
+    MIN_FRICTION_SHARE,
+    MIN_LOAD_SHARE,
+    DugoffTrack,
+)
 
 # rows of inputs (speed, steering angle, longitudinal acceleration) before saved derivatives
 DRIVEN = 3
-PLAIN = LARGEST_RATIO["plain"]
-SMOOTH = LARGEST_RATIO["smooth"]
+PLAIN = MAX_FORCE_RATIO["plain"]
+SMOOTH = MAX_FORCE_RATIO["smooth"]
 
 
 class CompiledDugoffTrack(PointModel):
@@ -73,7 +79,7 @@ def _input_terms(inputs, b, car):
     gravity = car.dtype.type(GRAVITY)
     front = gravity * rear_arm / wheelbase
     rear = gravity * front_arm / wheelbase
-    min_load_share = car.dtype.type(LEAST_LOAD)
+    min_load_share = car.dtype.type(MIN_LOAD_SHARE)
     steer = at_row(inputs, 1, b)
     load_front = mass * most(front - transfer, min_load_share * front)
     load_rear = mass * most(rear + transfer, min_load_share * rear)
@@ -91,7 +97,7 @@ def _axle(tangent, load, vx, axle, smooth):
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
     unity = axle.dtype.type(1.0)
-    min_share = axle.dtype.type(LEAST_SHARE)
+    min_share = axle.dtype.type(MIN_FRICTION_SHARE)
     slide = abs(tangent)
     share = unity - reduction * vx * slide
     per_slide = choose(share < min_share, 0.0, -reduction * vx)
@@ -124,7 +130,7 @@ def _forces(points, s, b, input_terms, track):
     course_front = (vy + car[2] * yaw_rate) / vx
     course_rear = (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
-    min_cosine = axles.dtype.type(LEAST_COSINE)
+    min_cosine = axles.dtype.type(MIN_COSINE)
     tangent = (turned - course_front) / choose(across > min_cosine, across, min_cosine)
     by_course = choose(
         across > min_cosine, -(1 + turned * turned) / (across * across), -1 / min_cosine

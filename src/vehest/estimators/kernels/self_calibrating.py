@@ -1,10 +1,16 @@
-"""The bank of filters of the self-calibrating estimator and the check that weighs it against others, compiled.
+"""Compiled recursion of the self-calibrating estimator: a bank of filters, and its comparison.
 
-samples -> network, lags -> filters, side by side in vectors: predict, measured speed, rear axle -> weights by likelihood
-    -> residuals of the candidates -> weights -> vy
+    samples -> network, lagged signals
+            -> filters, one in each lane of a vector: predict, measured speed, rear axle
+            -> weights of the filters by likelihood
+            -> residuals of the candidates -> weights of the candidates -> vy
 
-A state is [v, u, β_y, β_x, κ, b, C, e]: velocities of the inertial unit, offsets of the accelerometer, roll leakage of ay, distance and
-compliance of the rear axle, and the axle's correlated error in units of its size.
+A state is [v, u, β_y, β_x, κ, b, C, e]: velocities of the inertial unit [m/s], offsets of the
+accelerometer [m/s²], roll leakage of ay, distance [m] and compliance [rad s²/m] of the rear axle,
+and the axle's correlated error in units of its size. Candidates for v are the bank, the network
+that comes with vehest, and steady cornering.
+
+Source: equations in `vehest.estimators.self_calibrating`.
 """
 
 from __future__ import annotations
@@ -22,15 +28,26 @@ STATES = 8
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
-# lagged signals: those of the axle's equation, those of the candidates' residuals, and the mean square of the axle's
-# error s e over the last moments
+# lagged signals: those of the axle's equation, those of the candidates' residuals, and the mean
+# square of the axle's error s e over the last moments
 LAGS = 16
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
 SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE = range(10, LAGS)
-# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, and last v
+# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals,
+# and last v
 MOMENTS = 8
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(MOMENTS)
-# rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
+# Rows of the bank, with a filter in each lane: states, the upper triangle of the covariances, then
+# those below.
+TRIANGLE = STATES * (STATES + 1) // 2  # numbers of a covariance
+GRIP = STATES + TRIANGLE  # grip limit [m/s²]
+WEIGHT = GRIP + 1  # weight among all filters
+COST = GRIP + 2  # two rows, one a measurement: decrease of the log likelihood
+VARIANCE = GRIP + 4  # two rows, one a measurement: variance of the residual
+DERIVATIVE = GRIP + 6  # derivatives of a measurement by the states
+SHARED = DERIVATIVE + STATES  # covariances of a measurement with the states
+BANK_ROWS = SHARED + STATES
+# index in the bank of a covariance's first lane, by row and column
 AT = np.array(
     [
         [min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)]
@@ -38,16 +55,10 @@ AT = np.array(
     ]
 )
 AT = (STATES + AT) * (BYTES // 8)
-GRIP, WEIGHT = range(STATES + 36, STATES + 38)  # grip limit, weight among all filters
-COST = STATES + 38  # of both measurements: what lowers the log likelihood
-TOTAL = STATES + 40  # of both measurements: variance of the residual
-ROW = STATES + 42
-SHARED = STATES + 50
-ROWS = STATES + 58  # derivatives of a measurement, its covariances with the states
-LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
-ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
+MIN_GRIP_SHARE = 0.3  # of a grip limit that remains at any longitudinal acceleration
+ROLLING_DEVIATION = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
+# of |e|, in deviations of its prior, above which b stays: a slide does not show the unit's place
 MAX_ERROR_OF_PLACE = 1.0
-"""Of |e|, in deviations of its prior, above which b stays: a slide is not the unit's place."""
 
 
 class State(NamedTuple):
@@ -60,32 +71,34 @@ class State(NamedTuple):
     candidates: FloatArray  # (3, 8)
     weights: FloatArray  # (3,), of the candidates
     last: FloatArray  # (4,), the sample before
-    window: FloatArray  # (N, 4), the last samples, the oldest first; the first sample stands for those before it
+    # (N, 4), the last samples, the oldest first; those before the first sample repeat it
+    window: FloatArray
 
 
 @part()
-def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
+def _rear_slip(f, lags, turning, n):
     """φ and dφ/da of the rear axle, and its acceleration beyond the limit.
 
-    φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a, a_m what the longitudinal acceleration leaves of the grip limit.
+    φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a; a_m is the grip limit that the longitudinal
+    acceleration leaves.
     """
     lanes = width(f)
     grip = load(f, GRIP * lanes)
     force = (lags[AY] - load(f, OFFSET_Y * lanes)) * (1.0 - load(f, LEAKAGE * lanes)) - load(
         f, REAR * lanes
     ) * turning
-    limit = root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip))
-    rest = 1.0 - least(abs(force) / limit, n.largest_share)
-    store(f, SHARED * lanes, rest)
+    limit = root(most(grip * grip - lags[AX] ** 2, MIN_GRIP_SHARE**2 * grip * grip))
+    reserve = 1.0 - least(abs(force) / limit, n.largest_share)
+    store(f, SHARED * lanes, reserve)
     for k in range(SHARED * lanes, (SHARED + 1) * lanes):
         f[k] **= n.exponent
-    left = load(f, SHARED * lanes)
-    slip = limit * (1.0 - left) / n.exponent
-    return choose(force < 0.0, -slip, slip), left / rest, most(abs(force) - limit, 0.0)
+    reserve_power = load(f, SHARED * lanes)
+    slip = limit * (1.0 - reserve_power) / n.exponent
+    return choose(force < 0.0, -slip, slip), reserve_power / reserve, most(abs(force) - limit, 0.0)
 
 
 @part()
-def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # type: ignore[no-untyped-def]
+def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):
     """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
     lanes = width(f)
     v = load(f, V * lanes)
@@ -120,55 +133,59 @@ def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # t
 
 
 @part()
-def _of_two(f, one, other, factor, measured, variance):  # type: ignore[no-untyped-def]
+def _measured_sum(f, first, second, factor, measured, variance):
     """A state plus a factor times another, as measured: residual and its variance."""
     lanes = width(f)
     for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, one]) + factor * load(f, AT[i, other]))
-    whole = load(f, (SHARED + one) * lanes) + factor * load(f, (SHARED + other) * lanes) + variance
-    return measured - load(f, one * lanes) - factor * load(f, other * lanes), whole
+        store(f, (SHARED + i) * lanes, load(f, AT[i, first]) + factor * load(f, AT[i, second]))
+    residual_variance = (
+        load(f, (SHARED + first) * lanes) + factor * load(f, (SHARED + second) * lanes) + variance
+    )
+    return measured - load(f, first * lanes) - factor * load(f, second * lanes), residual_variance
 
 
 @part()
-def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-def]
-    """0 = v - b ω + C u φ(a_r) + s e at the rear axle, low-passed: v - τ dv/dt stands for the low-passed v.
+def _axle(f, n, lags, turning, speed, size, states):
+    """0 = v - b ω + C u φ(a_r) + s e at the rear axle, with all signals low-passed.
 
-    Returns the residual, its variance, and half the square of what the grip limit rules out, over a sample.
+    The low-passed v is v - τ dv/dt. Returns the residual, its variance, and the cost of a sample
+    for the acceleration beyond the grip limit, half the square in deviations.
     """
     lanes = width(f)
     offset = load(f, OFFSET_Y * lanes)
     rear = load(f, REAR * lanes)
     compliance = load(f, COMPLIANCE * lanes)
-    own = 1.0 - load(f, LEAKAGE * lanes)
+    ay_share = 1.0 - load(f, LEAKAGE * lanes)
     slip, slope, excess = _rear_slip(f, lags, turning, n)
-    smooth = load(f, V * lanes) - lags[SUM_AY] * own + offset * lags[SUM_ONE] + lags[SUM_TURN]
+    smooth = load(f, V * lanes) - lags[SUM_AY] * ay_share + offset * lags[SUM_ONE] + lags[SUM_TURN]
     residual = (
         rear * lags[YAW_RATE] - compliance * speed * slip - size * load(f, ERROR * lanes) - smooth
     )
     gain = compliance * speed * slope
-    store(f, (ROW + V) * lanes, 1.0)
-    store(f, (ROW + OFFSET_Y) * lanes, lags[SUM_ONE] - gain * own)
-    store(f, (ROW + LEAKAGE) * lanes, lags[SUM_AY] - gain * (lags[AY] - offset))
-    store(f, (ROW + REAR) * lanes, -lags[YAW_RATE] - gain * turning)
-    store(f, (ROW + COMPLIANCE) * lanes, speed * slip)
-    store(f, (ROW + ERROR) * lanes, size)
+    store(f, (DERIVATIVE + V) * lanes, 1.0)
+    store(f, (DERIVATIVE + OFFSET_Y) * lanes, lags[SUM_ONE] - gain * ay_share)
+    store(f, (DERIVATIVE + LEAKAGE) * lanes, lags[SUM_AY] - gain * (lags[AY] - offset))
+    store(f, (DERIVATIVE + REAR) * lanes, -lags[YAW_RATE] - gain * turning)
+    store(f, (DERIVATIVE + COMPLIANCE) * lanes, speed * slip)
+    store(f, (DERIVATIVE + ERROR) * lanes, size)
     variance = 0.0 * slip + n.axle_white**2 + n.axle_white_share * size**2
     for i in range(states):
         shared = 0.0 * slip
         for c in range(states):
-            shared += load(f, AT[i, c]) * load(f, (ROW + c) * lanes)
+            shared += load(f, AT[i, c]) * load(f, (DERIVATIVE + c) * lanes)
         store(f, (SHARED + i) * lanes, shared)
-        variance += load(f, (ROW + i) * lanes) * shared
+        variance += load(f, (DERIVATIVE + i) * lanes) * shared
     surplus = least(excess / n.grip_excess, n.gate)
     return residual, variance, 0.5 * n.dt * surplus * surplus
 
 
 @part()
-def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-untyped-def]
-    """Take a measurement whose covariances with the states are known; returns half the square of its normalised residual.
+def _update(f, residual, variance, gate, learns, states):
+    """Update with a measurement, whose covariances with the states are in the rows `SHARED`.
 
-    Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: all parameters where the filter does not
-    learn, b where the axle slides.
+    Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: all
+    parameters where the filter does not learn, b where the axle slides. Returns half the square of
+    the normalised residual.
     """
     lanes = width(f)
     limit = gate * root(variance)
@@ -176,21 +193,24 @@ def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-unt
     residual = most(least(residual, limit), -limit)
     slides = abs(load(f, ERROR * lanes)) > MAX_ERROR_OF_PLACE
     for i in range(states):
-        held = not learns and LEAKAGE <= i <= COMPLIANCE
+        is_fixed = not learns and LEAKAGE <= i <= COMPLIANCE
         gain = load(f, (SHARED + i) * lanes) * inverse
         step = choose(slides, 0.0 * gain, gain) if i == REAR else gain
-        if not held:
+        if not is_fixed:
             store(f, i * lanes, load(f, i * lanes) + step * residual)
         for c in range(i, states):
-            if not (held and c <= COMPLIANCE):
+            if not (is_fixed and c <= COMPLIANCE):
                 share = step if c == i else gain
                 store(f, AT[i, c], load(f, AT[i, c]) - share * load(f, (SHARED + c) * lanes))
     return 0.5 * residual * residual * inverse
 
 
 @part()
-def _tanh(x):  # type: ignore[no-untyped-def]
-    """tanh to 1e-15 by Lambert's continued fraction n/d at x/8, then tanh(2y) = 2nd/(d² + n²) thrice (see `activation.rational_tanh`)."""
+def _tanh(x):
+    """tanh to 1e-15: Lambert's continued fraction n/d at x/8, then tanh(2y) = 2nd/(d² + n²) thrice.
+
+    See `activation.rational_tanh`.
+    """
     y = 0.125 * least(most(x, -20.0), 20.0)
     s = y * y
     n = y * (135135.0 + s * (17325.0 + s * (378.0 + s)))
@@ -201,34 +221,41 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _network(theta, yaw_rate_max, series, first, steps, dt):  # type: ignore[no-untyped-def]
-    """KS-NN without biases, v one step after windows that begin at sample ``first`` and those next to it, side by side.
+def _network(theta, yaw_rate_max, series, first, steps, dt):
+    """KS-NN without biases: v [m/s] one step after windows of ``steps`` samples.
 
-    Da Lio et al. 2023, Eqs. 7 and 8; rows of ``theta`` as in `kernels.ksnn`, of ``series`` as in `scan`'s samples.
+    The lanes are windows that begin at sample ``first`` and those after it. Rows of ``theta`` are
+    as in `kernels.ksnn`, rows of ``series`` the columns of `scan`'s samples.
+
+    Source: Da Lio et al. 2023, Eqs. 7 and 8.
     """
-    local = theta.shape[0]
-    half = (theta.shape[1] - 8) // 6
+    n_local = theta.shape[0]
+    n_hidden = (theta.shape[1] - 8) // 6
     row = series.shape[1]
     u = load(series, row + first)
     v = 0.0 * u
     for at in range(first, first + steps):
         yaw_rate = load(series, at)
         speed = load(series, row + at)
-        place = least(abs(yaw_rate) * ((local - 1) / yaw_rate_max), local - 1.0)
+        place = least(abs(yaw_rate) * ((n_local - 1) / yaw_rate_max), n_local - 1.0)
         slip = dt * (load(series, 2 * row + at) - speed * yaw_rate)
         thrust = dt * (load(series, 3 * row + at) + v * yaw_rate)
         error = u - speed
         next_v = 0.0 * u
         next_u = 0.0 * u
-        for m in range(local):
+        for m in range(n_local):
             share = most(1.0 - abs(place - m), 0.0)
             f1 = theta[m, 4] * error + theta[m, 5]
             f2 = theta[m, 6] * error + theta[m, 7]
-            for q in range(half):
-                one = 8 + 3 * q
-                two = 8 + 3 * (half + q)
-                f1 += theta[m, one + 2] * _tanh(theta[m, one] * error + theta[m, one + 1])
-                f2 += theta[m, two + 2] * _tanh(theta[m, two] * error + theta[m, two + 1])
+            for q in range(n_hidden):
+                lateral = 8 + 3 * q
+                longitudinal = 8 + 3 * (n_hidden + q)
+                f1 += theta[m, lateral + 2] * _tanh(
+                    theta[m, lateral] * error + theta[m, lateral + 1]
+                )
+                f2 += theta[m, longitudinal + 2] * _tanh(
+                    theta[m, longitudinal] * error + theta[m, longitudinal + 1]
+                )
             next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)
             next_u += share * (theta[m, 1] * u + theta[m, 3] * thrust - f2)
         v = next_v
@@ -237,8 +264,11 @@ def _network(theta, yaw_rate_max, series, first, steps, dt):  # type: ignore[no-
 
 
 @part()
-def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-untyped-def]
-    """Low-passed signals, and sums of (1 - g)^k dt x, which are τ times the low-passed x; returns the low-passed yaw rate's derivative."""
+def _advance_lags(lags, sample, last, n, g, g_1, g_slow):
+    """Update low-passed signals, and sums of (1 - g)^k dt x, which are τ times the low-passed x.
+
+    Returns the derivative of the low-passed yaw rate [rad/s²].
+    """
     before = lags[YAW_RATE]
     for at, value in ((YAW_RATE, sample[0]), (AY, sample[2]), (AX, sample[3])):
         lags[at] += g * (value - lags[at])
@@ -255,8 +285,8 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
 
 
 @part()
-def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
-    """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u and of u' = ax + ω v."""
+def _judge(values, moments, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
+    """Candidates' weights by their residuals of v' = (1 - κ) ay - ω u and of u' = ax + ω v."""
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
     if moving:
@@ -265,48 +295,64 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
     odds = (0.0, math.log(n.network_odds), math.log(n.steady_odds))
     floor = n.residual_floor**2
     for c in range(CANDIDATES):
-        one = own[c]
-        v = found[c]
-        one[SMOOTH] += g_1 * (v - one[SMOOTH])
-        one[SUM_TURN_V] = (1.0 - g_1) * (one[SUM_TURN_V] + n.dt * yaw_rate * (one[LAST] + v) / 2.0)
-        one[LAST] = v
-        y = v - one[SMOOTH] - lags[SUM_AY_1] + lags[SUM_TURN_1]
-        x = sample[1] - lags[SPEED] - lags[SUM_AX_1] - one[SUM_TURN_V]
-        one[SLOW_Y] += g_slow * (y - one[SLOW_Y])
-        one[SLOW_X] += g_slow * (x - one[SLOW_X])
-        y = y - one[SLOW_Y]
-        x = x - one[SLOW_X]
+        moment = moments[c]
+        v = values[c]
+        moment[SMOOTH] += g_1 * (v - moment[SMOOTH])
+        moment[SUM_TURN_V] = (1.0 - g_1) * (
+            moment[SUM_TURN_V] + n.dt * yaw_rate * (moment[LAST] + v) / 2.0
+        )
+        moment[LAST] = v
+        y = v - moment[SMOOTH] - lags[SUM_AY_1] + lags[SUM_TURN_1]
+        x = sample[1] - lags[SPEED] - lags[SUM_AX_1] - moment[SUM_TURN_V]
+        moment[SLOW_Y] += g_slow * (y - moment[SLOW_Y])
+        moment[SLOW_X] += g_slow * (x - moment[SLOW_X])
+        y = y - moment[SLOW_Y]
+        x = x - moment[SLOW_X]
         if moving:
-            one[SQUARE_Y] = one[SQUARE_Y] * keep + y * y * n.dt
-            one[CROSS_Y] = one[CROSS_Y] * keep + y * ay * n.dt
-            one[SQUARE_X] = one[SQUARE_X] * keep + x * x * n.dt
+            moment[SQUARE_Y] = moment[SQUARE_Y] * keep + y * y * n.dt
+            moment[CROSS_Y] = moment[CROSS_Y] * keep + y * ay * n.dt
+            moment[SQUARE_X] = moment[SQUARE_X] * keep + x * x * n.dt
         time = max(lags[TIME], n.dt)
         leakage = min(
-            max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage
+            max(moment[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage
         )
-        square_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0)
+        square_y = max(
+            moment[SQUARE_Y] - 2.0 * leakage * moment[CROSS_Y] + leakage**2 * lags[POWER], 0.0
+        )
         score = n.lateral_power * math.log(
             square_y / time + floor
-        ) + n.longitudinal_power * math.log(one[SQUARE_X] / time + floor)
+        ) + n.longitudinal_power * math.log(moment[SQUARE_X] / time + floor)
         weights[c] = odds[c] - 0.5 * score * lags[TIME] / (lags[TIME] + n.decision_time)
     _normalise(weights, weights, CANDIDATES)
 
 
 @entry(nogil=True)
-def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, parameters):  # type: ignore[no-untyped-def]
+def scan(n, grips, start, prior, spread, decay, theta, state, samples, estimates, parameters):
     """Go through samples; changes ``state`` in place.
 
-    Args:
-        n: numbers of the estimator, a named tuple.
-        grips: grip limits of the bank, (J,) [m/s²].
-        start: logarithms of the bank's weights at the start, (J,).
-        prior, spread: mean and standard deviation of the states at the start, (8,).
-        decay: factors by which they return to it in a sample, (8,).
-        theta: weights of the network, (P, 8 + 6 Q).
-        state: a `State`.
-        samples: yaw_rate, vx, ay, ax, (T, 4).
-        found: output, vy and its variance, (T, 2).
-        parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample alone.
+    Parameters
+    ----------
+    n
+        Numbers of the estimator, a named tuple.
+    grips
+        Grip limits of the bank, (J,) [m/s²].
+    start
+        Logarithms of the bank's weights at the start, (J,).
+    prior, spread
+        Mean and standard deviation of the states at the start, (8,).
+    decay
+        Factors by which they return to it in a sample, (8,).
+    theta
+        Weights of the network, (P, 8 + 6 Q).
+    state
+        A `State`, changed in place.
+    samples
+        Columns yaw_rate [rad/s], vx [m/s], ay, ax [m/s²], (T, 4).
+    estimates
+        Output: vy at the reference point and its variance, (T, 2).
+    parameters
+        Output: mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample
+        alone.
     """
     g = -math.expm1(-n.dt / n.axle_lag)
     g_1 = -math.expm1(-n.dt / n.residual_time)
@@ -317,15 +363,14 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
     lanes = width(grips)
     count = len(grips)
     steps = len(state.window)
-    bank = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes))
-    own = np.zeros((3, 4))
-    values = own[0]
-    sample = own[1]
-    moments = own[2]
+    bank = np.zeros(((count + lanes - 1) // lanes, BANK_ROWS * lanes))
+    scratch = np.zeros((3, 4))
+    values = scratch[0]
+    sample = scratch[1]
+    moments = scratch[2]
     last = state.last
-    for k in range(
-        len(bank) * lanes
-    ):  # lanes beyond the last filter are as that one, without weight
+    # lanes beyond the last filter repeat it, without weight
+    for k in range(len(bank) * lanes):
         j = min(k, count - 1)
         f = bank[k // lanes]
         f[GRIP * lanes + k % lanes] = grips[j]
@@ -333,9 +378,8 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
             f[i * lanes + k % lanes] = state.means[j, i]
             for c in range(i, STATES):
                 f[AT[i, c] + k % lanes] = state.covariances[j, i, c]
-    series = np.zeros(
-        (5, steps + len(samples) + lanes)
-    )  # the window and the samples after it, and the network's v
+    # the window and the samples after it, and the network's v
+    series = np.zeros((5, steps + len(samples) + lanes))
     for t in range(steps + len(samples)):
         for i in range(4):
             series[i, t] = state.window[t, i] if t < steps else samples[t - steps, i]
@@ -369,19 +413,20 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for b in range(len(bank)):
             f = bank[b]
             _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, turning * speed)
-            for k in range(
-                2
-            ):  # the speed is measured, and the rear axle, which rolls (v = b ω) where the car is slow
+            # measurements: the speed, and the rear axle, which rolls (v = b ω) at low speed
+            for k in range(2):
                 surplus = 0.0 * load(f, 0)
                 if k == 0:
-                    residual, variance = _of_two(f, U, U, 0.0, speed, n.noise_speed**2)
+                    residual, variance = _measured_sum(f, U, U, 0.0, speed, n.noise_speed**2)
                 elif moving:
                     residual, variance, surplus = _axle(
                         f, n, lags, turning, speed, size, len(prior)
                     )
                 else:
-                    residual, variance = _of_two(f, V, REAR, -sample[0], 0.0, ROLLING**2)
-                store(f, (TOTAL + k) * lanes, variance)
+                    residual, variance = _measured_sum(
+                        f, V, REAR, -sample[0], 0.0, ROLLING_DEVIATION**2
+                    )
+                store(f, (VARIANCE + k) * lanes, variance)
                 store(
                     f,
                     (COST + k) * lanes,
@@ -393,7 +438,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
                 lane = j % lanes
                 cost = f[COST * lanes + lane] + f[(COST + 1) * lanes + lane]
                 likelihood = -cost - 0.5 * math.log(
-                    f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane]
+                    f[VARIANCE * lanes + lane] * f[(VARIANCE + 1) * lanes + lane]
                 )
                 log_weights[j] = (
                     start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
@@ -419,7 +464,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         )
         _at_point(bank, n.is_moved, n.point, sample[0], moments)
         lags[SLIDE] += g_band * ((size * states[ERROR]) ** 2 - lags[SLIDE])
-        _combine(values, state.weights, lags[SLIDE], states, moments, sample, n, found[t])
+        _combine(values, state.weights, lags[SLIDE], states, moments, sample, n, estimates[t])
         for i in range(4):
             last[i] = sample[i]
     lags[PREDICTED] = series[4, len(samples)]
@@ -434,8 +479,11 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
 
 
 @part()
-def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
-    """Weights of the filters from their logarithms, of sum 1; whole arrays would double the time to compile."""
+def _weigh(bank, log_weights):
+    """Write the filters' weights, of sum 1, into the bank.
+
+    Operations on arrays instead of loops would double the time to compile.
+    """
     lanes = width(bank)
     largest = log_weights[0]
     sum_ = 0.0
@@ -450,7 +498,7 @@ def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _mixture(bank, found):  # type: ignore[no-untyped-def]
+def _mixture(bank, moments):
     """Mean and variance of the states over the bank, differences between filters included."""
     lanes = width(bank)
     for i in range(STATES):
@@ -459,15 +507,20 @@ def _mixture(bank, found):  # type: ignore[no-untyped-def]
         for b in range(len(bank)):
             mean += total(load(bank[b], WEIGHT * lanes) * load(bank[b], i * lanes))
         for b in range(len(bank)):
-            off = load(bank[b], i * lanes) - mean
-            variance += total(load(bank[b], WEIGHT * lanes) * (load(bank[b], AT[i, i]) + off * off))
-        found[i] = mean
-        found[STATES + i] = variance
+            deviation = load(bank[b], i * lanes) - mean
+            variance += total(
+                load(bank[b], WEIGHT * lanes) * (load(bank[b], AT[i, i]) + deviation * deviation)
+            )
+        moments[i] = mean
+        moments[STATES + i] = variance
 
 
 @part()
-def _at_point(bank, is_moved, point, yaw_rate, moments):  # type: ignore[no-untyped-def]
-    """Mean and variance of v + ω (point - b) over the bank, of v itself where the point is the inertial unit."""
+def _at_point(bank, is_moved, point, yaw_rate, moments):
+    """Mean and variance over the bank of v at the reference point, v + ω (point - b).
+
+    Of v itself where that point is the inertial unit (``is_moved`` 0).
+    """
     lanes = width(bank)
     lever = is_moved * yaw_rate
     mean = 0.0
@@ -478,17 +531,17 @@ def _at_point(bank, is_moved, point, yaw_rate, moments):  # type: ignore[no-unty
         mean += total(load(f, WEIGHT * lanes) * moved)
     for b in range(len(bank)):
         f = bank[b]
-        off = load(f, V * lanes) + lever * (point - load(f, REAR * lanes)) - mean
-        own = load(f, AT[V, V]) - 2.0 * lever * load(f, AT[V, REAR])
-        own += lever * lever * load(f, AT[REAR, REAR])
-        variance += total(load(f, WEIGHT * lanes) * (own + off * off))
+        deviation = load(f, V * lanes) + lever * (point - load(f, REAR * lanes)) - mean
+        variance_at_point = load(f, AT[V, V]) - 2.0 * lever * load(f, AT[V, REAR])
+        variance_at_point += lever * lever * load(f, AT[REAR, REAR])
+        variance += total(load(f, WEIGHT * lanes) * (variance_at_point + deviation * deviation))
     moments[0] = mean
     moments[1] = variance
 
 
 @part()
-def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
-    """Weights of sum 1 from the first logarithms; whole arrays would double the time to compile."""
+def _normalise(log_weights, weights, count):
+    """Weights of sum 1 from the first ``count`` logarithms; in loops as in `_weigh`."""
     largest = log_weights[0]
     total = 0.0
     for j in range(count):
@@ -501,8 +554,11 @@ def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _combine(values, weights, slide, states, moments, sample, n, found):  # type: ignore[no-untyped-def]
-    """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
+def _combine(values, weights, slide, states, moments, sample, n, estimate):
+    """vy at the reference point and its variance, of the candidates by their weights.
+
+    The network has no weight where the car rolls slowly.
+    """
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     shares = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
     of_slip = n.compliance_deviation * n.compliance * sample[1] ** 2
@@ -515,7 +571,7 @@ def _combine(values, weights, slide, states, moments, sample, n, found):  # type
     spread = 0.0
     for c in range(CANDIDATES):
         spread += shares[c] * (values[c] - mean) ** 2
-    found[0] = mean
-    found[1] = n.variance_share * ((1.0 - shares[2]) * moments[1] + shares[2] * steady + spread)
-    found[1] += n.error_share * slide + (n.angle_floor * sample[1]) ** 2
-    found[1] += (n.point_deviation * sample[0]) ** 2
+    estimate[0] = mean
+    estimate[1] = n.variance_share * ((1.0 - shares[2]) * moments[1] + shares[2] * steady + spread)
+    estimate[1] += n.error_share * slide + (n.angle_floor * sample[1]) ** 2
+    estimate[1] += (n.point_deviation * sample[0]) ** 2

@@ -38,10 +38,10 @@ without.
 """
 
 Normalisation = Literal["range", "standard"]
-NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
+NORMALISATION_SUFFIXES: dict[str, str] = {"range": "", "standard": "_standard"}
 """Normalisation -> suffix of the variant's name."""
 
-CHUNK = 50_000  # samples that are estimated at a time
+SAMPLES_TOGETHER = 50_000  # samples that are estimated at a time
 STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
@@ -206,8 +206,10 @@ class SampleNetwork(nn.Module):
         """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's units."""
         pieces = []
         with torch.no_grad():
-            for first in range(0, len(inputs), CHUNK):
-                piece = torch.as_tensor(inputs[first : first + CHUNK], dtype=self.unit.dtype)
+            for first in range(0, len(inputs), SAMPLES_TOGETHER):
+                piece = torch.as_tensor(
+                    inputs[first : first + SAMPLES_TOGETHER], dtype=self.unit.dtype
+                )
                 pieces.append(self(self.scaled(piece).unsqueeze(0)).double().numpy())
         return np.concatenate(pieces, axis=1)
 
@@ -222,8 +224,8 @@ class SampleNetwork(nn.Module):
         """Losses on samples without dropout, (M,)."""
         total = np.zeros(self.members)
         with torch.no_grad():
-            for first in range(0, len(samples.targets), CHUNK):
-                inputs, targets = (part[first : first + CHUNK] for part in samples)
+            for first in range(0, len(samples.targets), SAMPLES_TOGETHER):
+                inputs, targets = (part[first : first + SAMPLES_TOGETHER] for part in samples)
                 outputs = self(inputs.unsqueeze(0)).numpy()
                 unused = np.empty_like(outputs[0])
                 total += [

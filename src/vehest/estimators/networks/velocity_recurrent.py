@@ -37,7 +37,7 @@ from vehest.training.sequences import (
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
 """Channels and outputs that change sign in a mirror, left for right; the others stay."""
-CHUNK = 10_000  # samples that are estimated at a time
+SAMPLES_TOGETHER = 10_000  # samples that are estimated at a time
 
 TRIAL = Trial(
     11,
@@ -301,8 +301,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         ]
         pieces = []
         with torch.no_grad():
-            for first in range(0, len(samples), CHUNK):
-                values, state = self.network(inputs[:, first : first + CHUNK], state)
+            for first in range(0, len(samples), SAMPLES_TOGETHER):
+                values, state = self.network(inputs[:, first : first + SAMPLES_TOGETHER], state)
                 pieces.append(values[0].numpy())
         return dict(zip(self.outputs, np.concatenate(pieces, dtype=float).T, strict=True)), state
 
@@ -342,6 +342,14 @@ class _Batch(NamedTuple):
         return self._replace(
             goes_on=first > 0,
             **{name: part[:, first:end] for name, part in parts.items() if part is not None},
+        )
+
+    def scaled(self, input_factors: Tensor, output_factors: Tensor) -> _Batch:
+        """The batch with channels times factors, (B, C), and outputs times factors, (B, O)."""
+        return self._replace(
+            inputs=self.inputs * input_factors.unsqueeze(1),
+            targets=self.targets * output_factors.unsqueeze(1),
+            starts=self.starts * output_factors,
         )
 
 
@@ -477,11 +485,7 @@ def _phase(
             return batch
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
         inputs, outputs = (torch.where(turned, sign, 1.0) for sign in signs)
-        return batch._replace(
-            inputs=batch.inputs * inputs.unsqueeze(1),
-            targets=batch.targets * outputs.unsqueeze(1),
-            starts=batch.starts * outputs,
-        )
+        return batch.scaled(inputs, outputs)
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):

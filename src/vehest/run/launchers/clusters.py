@@ -203,9 +203,8 @@ class RayLauncher:
         self._ray: Any = None
         self._task: Any = None
         self._mark = Path()
-        self._stored: dict[Path, Any] | None = (
-            None  # artefacts in Ray's object store; none while machines are taken to share the root
-        )
+        # artefacts in Ray's object store; none while machines are taken to share the root
+        self._stored: dict[Path, Any] | None = None
 
     @property
     def cores(self) -> int:

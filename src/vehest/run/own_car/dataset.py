@@ -221,6 +221,7 @@ def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterat
     pause = dataset.get("max_gap")
     causes = [f"pauses of more than {pause:g} s"] if pause else []
     causes += ["times that go back"] if dataset.get("time_restarts") else []
+    causes += [f"each value of '{dataset['runs']}'"] if dataset.get("runs") else []
     if not causes:
         return
     durations: dict[str, list[float]] = {}

@@ -26,7 +26,7 @@ USEFUL_SHARE = 0.985
 # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins;
 # assumed
 UNSTEADY = 0.5
-MARGIN = 0.85
+MAX_GRIP_SHARE = 0.85
 """Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver
 counts as all of the grip; assumed.
 """
@@ -56,20 +56,25 @@ class Car:
     steering_rate: float  # largest steering velocity of the road wheels [rad/s]
     largest_steer: float  # of the road wheels [rad]
     lateral_acceleration: tuple[float, ...]  # (M,), from 0 to the grip [m/s²]
-    excess_steer: tuple[
-        float, ...
-    ]  # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
-    rear_slip: tuple[
-        float, ...
-    ]  # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
+    excess_steer: tuple[float, ...]
+    # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    rear_slip: tuple[float, ...]
 
     def steer_for(
         self, curvature: float, lateral_acceleration: float, friction: float = 1.0
     ) -> float:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
-        Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly
-        depends on it. Curvature [1/m] and lateral acceleration [m/s²] are positive to the left.
+        Parameters
+        ----------
+        curvature : float
+            Of the path [1/m], positive to the left.
+        lateral_acceleration : float
+            In the turn [m/s²], positive to the left.
+        friction : float
+            Scale of the tyres' friction. It scales forces and slip angles alike, because a tyre's
+            cornering stiffness hardly depends on it.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -77,14 +82,24 @@ class Car:
     def sideslip_for(
         self, curvature: float, lateral_acceleration: float, friction: float = 1.0
     ) -> float:
-        """Sideslip [rad] in the same turn."""
+        """Sideslip [rad] at the centre of gravity in the turn of `steer_for`."""
         slip = self._at(self.rear_slip, lateral_acceleration, friction)
         return (self.wheelbase * self.front_share) * curvature - math.copysign(
             friction * slip, lateral_acceleration
         )
 
     def resistance(self, speed: float, yaw_rate: float, steer: float, sideslip: float) -> float:
-        """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn."""
+        """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn.
+
+        Parameters
+        ----------
+        speed : float
+            Over the ground [m/s].
+        yaw_rate : float
+            Positive to the left [rad/s].
+        steer, sideslip : float
+            Road-wheel angle and sideslip, positive to the left [rad].
+        """
         return self.drag * speed**2 + yaw_rate * speed * (
             self.front_share * math.sin(steer) - math.sin(sideslip)
         )
@@ -127,7 +142,8 @@ def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car
     unknown = sorted(set(driver_values) - set(_DRIVER_VALUES))
     if unknown:
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_DRIVER_VALUES)}"
+            f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: "
+            f"{', '.join(_DRIVER_VALUES)}"
         )
     front_share = parameters.b / (parameters.a + parameters.b)
     driven_axle = min(
@@ -192,10 +208,11 @@ def _measure(
     )
     end = int(astray[0]) if len(astray) else len(steady) - 1
     limit = int(np.argmax(steady >= USEFUL_SHARE * steady[: end + 1].max()))
-    grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
+    grip = (MAX_GRIP_SHARE if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
         raise ConfigurationError(
-            f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow"
+            f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: "
+            "it does not follow"
         )
     ramp_values = (
         ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, Literal
 
 from vehest.simulation.driving.car import Car
@@ -38,9 +38,8 @@ class SteadyCircle(Manoeuvre):
     name: ClassVar[str] = "skidpad"
     radius: Range = (35.0, 60.0)  # [m]; the standard requires at least 30 m
     severity: Range = (0.7, 0.95)  # share of the grip at which it ends
-    ay_rate: float = (
-        0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase
-    )
+    # by which the lateral acceleration grows [m/s³]; the standard's slow increase
+    ay_rate: float = 0.25
     start_ay: float = 2.0  # at which the circle is entered [m/s²]
     hold_time: float = 2.0  # at the final speed [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
@@ -100,18 +99,20 @@ class BrakingInTurn(Manoeuvre):
 
     name: ClassVar[str] = "braking_in_turn"
     radius: Range = (60.0, 100.0)  # of the circle [m]; 100 m in the standard
+    # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
     severity: Range = (
         0.4,
         0.7,
-    )  # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
+    )
     deceleration: Range = (2.0, 5.0)  # [m/s²]
     turn_time: Range = (3.0, 5.0)  # on the circle before the brakes [s]
-    steering: Literal["held", "path"] = (
-        "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
-    )
+    # ``held`` or, for a driver who keeps to the circle, ``path``
+    steering: Literal["held", "path"] = "held"
     until_speed: float = 0.0  # at which the recording ends [m/s]; 0 is the stand
     side: Side = "either"  # ``left``, ``right`` or ``either``
-    half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes
+    # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once
+    # it brakes
+    half_width: float = 4.0
 
     limits: ClassVar = CIRCLE_LIMITS | {
         "deceleration": (0.5, 10.0),
@@ -143,9 +144,14 @@ class BrakingInTurn(Manoeuvre):
         line = circle(radius, side, run_in, speed * (turn_time + 30.0), transition)
         plan = plan_along(line, speed, surface, seed)
         drawn = {
-            "radius": radius, "severity": severity, "speed": speed, "deceleration": deceleration, "brakes_at": brakes_at,
-            "side": SIDES[side], "driver": asdict(driver),
-        }  # fmt: skip
+            "radius": radius,
+            "severity": severity,
+            "speed": speed,
+            "deceleration": deceleration,
+            "brakes_at": brakes_at,
+            "side": SIDES[side],
+            "driver": asdict(driver),
+        }
         return TurnBraker(self, plan, car, driver, drawn)
 
 
@@ -167,14 +173,12 @@ class TurnBraker(LineDriver):
         if time < self._brakes_at:
             return decision
         braking = -self._deceleration * min((time - self._brakes_at) / BRAKE_BUILD_UP, 1.0)
-        decision = decision._replace(
-            acceleration=braking, finished=observation.speed < self._until_speed
+        decision = replace(
+            decision, acceleration=braking, finished=observation.speed < self._until_speed
         )
-        return (
-            decision._replace(steering_velocity=0.0, lateral_error=math.nan)
-            if self._holds_steering
-            else decision
-        )
+        if self._holds_steering:
+            decision = replace(decision, steering_velocity=0.0, lateral_error=math.nan)
+        return decision
 
 
 BRAKE_BUILD_UP = 0.2  # time in which brakes come on [s]; assumed

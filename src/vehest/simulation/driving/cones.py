@@ -38,13 +38,13 @@ class DoubleLaneChange(Manoeuvre):
     """
 
     name: ClassVar[str] = "double_lane_change"
-    layout: Literal["iso_3888_1", "iso_3888_2"] = (
-        "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
-    )
+    # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
+    layout: Literal["iso_3888_1", "iso_3888_2"] = "iso_3888_1"
+    # share of the grip that the sharpest bend of the line takes; decides the speed
     severity: Range = (
         0.5,
         0.9,
-    )  # share of the grip that the sharpest bend of the line takes; decides the speed
+    )
     speed: Range | None = None  # [m/s], instead of the severity
     side: Side = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
     half_width: float = 1.5  # distance from the line beyond which the car has left the road [m]
@@ -96,10 +96,11 @@ class Slalom(Manoeuvre):
     name: ClassVar[str] = "slalom"
     spacing: float = 18.0  # of the cones [m]; 18 m and 30 m are customary
     cones: int = 8  # how many
+    # share of the grip that the sharpest bend of the line takes; decides the speed
     severity: Range = (
         0.5,
         0.9,
-    )  # share of the grip that the sharpest bend of the line takes; decides the speed
+    )
     speed: Range | None = None  # [m/s], instead of the severity
     side: Side = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
     half_width: float = 2.0  # distance from the line beyond which the car has left the road [m]

@@ -43,15 +43,17 @@ class Driver:
 
     preview_time: float = 0.7  # how far ahead the driver looks for lateral errors [s]
     steering_lag: float = 0.1  # time constant from the wanted to the actual steering angle [s]
-    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the one of
-    # steering.
+    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far
+    # ahead as this lag and the one of steering.
     response: float = 3.5e-3
     yaw_damping: float = 0.16  # steering angle per error of the yaw rate [s]
     countersteer: float = 0.7  # steering angle per sideslip beyond that of the turn
-    slide: float = 0.035  # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    slide: float = 0.035
     speed_gain: float = 1.5  # wanted acceleration per speed error [1/s]
     braking_share: float = 0.75  # share of the grip that is used for braking straight ahead
-    saturation: float = 1.1  # share of the grip up to which the driver asks for more lateral acceleration when off the line
+    # share of the grip up to which the driver asks for more lateral acceleration when off the line
+    saturation: float = 1.1
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ class DrivingStyle:
         high = self.grip_fraction + abs(self.grip_ripple)
         if not (low > 0.0 and high <= 1.0 + 1e-9):
             raise ConfigurationError(
-                f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1"
+                f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at "
+                "most 1"
             )
 
 
@@ -128,15 +131,15 @@ class Observation(NamedTuple):
         return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
 
 
-class Command(NamedTuple):
+@dataclass(frozen=True)
+class Command:
     """The driver's command, and the road at the car."""
 
     steering_velocity: float  # of the road wheels [rad/s]
-    acceleration: float  # wanted [m/s²]
+    acceleration: float  # requested [m/s²]
     progress: float = 0.0  # distance along the way [m]
-    lateral_error: float = (
-        math.nan
-    )  # the car's place left of its line [m]; NaN where there is no line
+    # the car's place left of its line [m]; NaN where there is no line
+    lateral_error: float = math.nan
     friction: float = 1.0  # scale of the tyres' friction at the car
     bank: float = 0.0  # of the road, positive with its left side higher [rad]
     grade: float = 0.0  # of the road, positive downhill [rad]
@@ -147,8 +150,18 @@ class Command(NamedTuple):
 def draw_style(
     seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float
 ) -> DrivingStyle:
-    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the
-    circle.
+    """The style that belongs to a seed.
+
+    Parameters
+    ----------
+    seed : int
+        Of the drive.
+    grip_range : tuple
+        Lowest and highest mean share of the grip; the style's is drawn uniformly between them.
+    ripple : float
+        Amplitude of the share's variation along the drive.
+    line_offset : float
+        Amplitude of the line's lateral offset [m].
     """
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
@@ -168,10 +181,29 @@ def plan_laps(
     friction: FloatArray,
     highest_speed: FloatArray | float,
 ) -> Plan:
-    """Line and speed profile over one whole lap or more, within the car's limits.
+    """Line and speed profile over laps, within the car's limits.
 
-    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one
-    value or one for each of the n_laps·(N - 1) + 1 samples.
+    Parameters
+    ----------
+    course : Course
+        Centre line of a closed course at N samples, of which the last repeats the first.
+    car : Car
+        Limits of the car.
+    driver : Driver
+        Share of the grip for braking.
+    style : DrivingStyle
+        Share of the grip and lateral offset of the line, both varying along the drive.
+    n_laps : int
+        Number of laps, 1 or more.
+    friction : array, shape (N,)
+        Scale of the tyres' friction on the course's samples.
+    highest_speed : array or float
+        Limit set by the driver [m/s], for each of the n_laps·(N - 1) + 1 samples or all.
+
+    Returns
+    -------
+    Plan
+        Of n_laps·(N - 1) + 1 samples.
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
@@ -322,12 +354,15 @@ class Follower:
         self._speed_at = speed_at
         self._per_metre = 1.0 / float(plan.distance[1])
         self._last_cell = len(plan.distance) - 2
-        self._x, self._y, self._heading, self._curvature, self._speed, self._acceleration, self._friction, self._bank, self._grade = (
-            values.tolist()
-            for values in (
-                plan.x, plan.y, plan.heading, plan.curvature, plan.speed, plan.acceleration, plan.friction, plan.bank, plan.grade
-            )
-        )  # fmt: skip
+        self._x = plan.x.tolist()
+        self._y = plan.y.tolist()
+        self._heading = plan.heading.tolist()
+        self._curvature = plan.curvature.tolist()
+        self._speed = plan.speed.tolist()
+        self._acceleration = plan.acceleration.tolist()
+        self._friction = plan.friction.tolist()
+        self._bank = plan.bank.tolist()
+        self._grade = plan.grade.tolist()
 
     @property
     def start(self) -> tuple[float, float, float, float]:
@@ -443,7 +478,17 @@ class Follower:
 
 
 def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: float) -> float:
-    """Steering velocity of the road wheels towards a wanted angle, within the car's limits [rad/s]."""
+    """Steering velocity of the road wheels towards an angle, within the car's limits [rad/s].
+
+    Parameters
+    ----------
+    car : Car
+        Largest steering angle and velocity.
+    driver : Driver
+        Time constant of the steering.
+    target_steer, steer : float
+        Requested and present road-wheel angle [rad].
+    """
     target_steer = max(-car.largest_steer, min(car.largest_steer, target_steer))
     return max(
         -car.steering_rate, min(car.steering_rate, (target_steer - steer) / driver.steering_lag)

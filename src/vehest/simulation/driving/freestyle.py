@@ -16,9 +16,11 @@ from vehest.simulation.plant.planar_car import PlanarCar
 from vehest.simulation.road.surface import Surface
 
 COMMAND_RATE_HZ = 100.0  # rate at which the driver's hands reach the car
-SLOW = 0.9  # speed below which the driver always gives gas [m/s]
-FAST = 1.0  # speed over the wanted one at which the driver brakes [m/s]
-CALM = 0.12  # sideslip angle below which the driver brakes, and has caught a slide [rad]
+MIN_SPEED = 0.9  # speed below which the driver always gives gas [m/s]
+SPEED_MARGIN = 1.0  # speed over the wanted one at which the driver brakes [m/s]
+MAX_CALM_SIDESLIP = (
+    0.12  # sideslip angle below which the driver brakes, and has caught a slide [rad]
+)
 COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle in a slide that is caught
 
 
@@ -35,10 +37,11 @@ class Freestyle(Manoeuvre):
     duration: Range = (20.0, 40.0)  # of the recording [s]
     speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest target speed [m/s]
     current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
+    # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
     sideslip: tuple[float, float] = (
         0.15,
         0.35,
-    )  # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
+    )
     brakes: float = 0.02  # share of the decisions that are a full braking
     kicks: float = 0.03  # share of the decisions that are a burst with the largest current
     straights: float = 0.15  # share of the steering decisions that are straight ahead
@@ -57,7 +60,8 @@ class Freestyle(Manoeuvre):
         super().__post_init__()
         if self.brakes + self.kicks > 1.0:
             raise ConfigurationError(
-                f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}"
+                f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and "
+                f"{self.kicks}"
             )
 
     @property
@@ -65,7 +69,9 @@ class Freestyle(Manoeuvre):
         """The longest that a recording may be drawn to be [s]."""
         return as_range(self.duration)[1]
 
-    def controller(self, car: PlanarCar, surface: Surface, seed: int) -> FreestyleDriver:  # type: ignore[override]
+    def controller(  # type: ignore[override]
+        self, car: PlanarCar, surface: Surface, seed: int
+    ) -> FreestyleDriver:
         """The driver of this seed."""
         return FreestyleDriver(self, car, OpenArea(surface, seed), Draws(seed))
 
@@ -90,17 +96,19 @@ class FreestyleDriver:
     def inputs(self, time: float, observation: Observation) -> Inputs:
         """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
         self._progress += observation.speed / COMMAND_RATE_HZ
-        sideslip = math.atan2(observation.vy, observation.vx) if observation.speed > SLOW else 0.0
+        sideslip = (
+            math.atan2(observation.vy, observation.vx) if observation.speed > MIN_SPEED else 0.0
+        )
         if not self._saves and abs(sideslip) > self._max_sideslip:
             self._saves, self._max_sideslip = True, self._draw(self._style.sideslip)
-        elif self._saves and abs(sideslip) < CALM:
+        elif self._saves and abs(sideslip) < MAX_CALM_SIDESLIP:
             self._saves = False
         steer = self._next_steer(time)
         gas = self._next_gas(time, observation)
         if self._saves:
             steer = COUNTERSTEER * sideslip
             gas = 0.0
-        elif gas < 0.0 and abs(sideslip) > CALM:
+        elif gas < 0.0 and abs(sideslip) > MAX_CALM_SIDESLIP:
             gas = 0.0
         return Inputs(steer, gas, self._area.friction_at(self._progress))
 
@@ -130,15 +138,15 @@ class FreestyleDriver:
         if time >= self._speed_until:
             self._target_speed = float(generator.uniform(*as_range(style.speed)))
             self._speed_until = time + float(generator.uniform(1.0, 4.0))
-        if observation.vx < SLOW and self._gas <= 0.0:
+        if observation.vx < MIN_SPEED and self._gas <= 0.0:
             self._gas_until = time
         if time >= self._gas_until:
             kind = generator.uniform()
             current = float(generator.uniform(*style.current))
             self._gas_until = time + float(generator.uniform(0.15, 0.6))
-            if observation.vx < SLOW:
+            if observation.vx < MIN_SPEED:
                 self._gas = max(current, 0.4 * largest)
-            elif kind < style.brakes or observation.vx > self._target_speed + FAST:
+            elif kind < style.brakes or observation.vx > self._target_speed + SPEED_MARGIN:
                 self._gas = -float(generator.uniform(0.3, 0.7)) * largest
             elif kind > 1.0 - style.kicks:
                 self._gas = float(generator.uniform(0.8, 1.0)) * largest

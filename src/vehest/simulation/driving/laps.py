@@ -170,7 +170,8 @@ class SpeedLaps(Manoeuvre):
         course_by_name(self.course)
         if not self.speeds or not all(2.0 <= speed <= 60.0 for speed in self.speeds):
             raise ConfigurationError(
-                f"manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not {list(self.speeds)}"
+                "manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not "
+                f"{list(self.speeds)}"
             )
 
     @property
@@ -210,9 +211,8 @@ class FastLap(Manoeuvre):
 
     name: ClassVar[str] = "fast_lap"
     course: str = "vairano_like"  # name of the course
-    mean_speed: float = (
-        76.0 / 3.6
-    )  # length of the course over the time of the lap [m/s]; 76 km/h in the paper
+    # length of the course over the time of the lap [m/s]; 76 km/h in the paper
+    mean_speed: float = 76.0 / 3.6
     top_speed: float = 115.0 / 3.6  # that the driver does not exceed [m/s]; 115 km/h in the paper
     line_offset: float = 0.3  # by which the line varies about the road's middle [m]
     flat: bool = False  # leaves out the course's bank and grade
@@ -251,8 +251,9 @@ class FastLap(Manoeuvre):
         high = FASTEST_SEVERITY
         if mean(high) < self.mean_speed:
             raise ConfigurationError(
-                f"manoeuvre 'fast_lap': vehicle '{car.name}' laps '{course.name}' at {mean(high):.1f} m/s at most, "
-                f"not at {self.mean_speed:.1f} m/s: choose another car, or a lower mean_speed"
+                f"manoeuvre 'fast_lap': vehicle '{car.name}' laps '{course.name}' at "
+                f"{mean(high):.1f} m/s at most, not at {self.mean_speed:.1f} m/s: choose another "
+                "car, or a lower mean_speed"
             )
         for _ in range(12):
             middle = 0.5 * (low + high)
@@ -280,9 +281,18 @@ class LapDriver(LineDriver):
     """
 
     def __init__(
-        self, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any], lap: float, end: float, *,
-        stop_time: float | None = None, end_time: float = math.inf, hands: Hands | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        drawn: dict[str, Any],
+        lap: float,
+        end: float,
+        *,
+        stop_time: float | None = None,
+        end_time: float = math.inf,
+        hands: Hands | None = None,
+    ) -> None:
         times = np.concatenate(
             [[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))]
         )
@@ -304,10 +314,9 @@ class LapDriver(LineDriver):
             self._stop = (time, observation.speed)
         begin, speed = self._stop
         rate = speed / self._stop_time
-        return decision._replace(
-            finished=False,
-            acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - observation.speed, 0.0),
-        )
+        planned_speed = speed - rate * (time - begin)
+        acceleration = -rate + 3.0 * min(planned_speed - observation.speed, 0.0)
+        return replace(decision, finished=False, acceleration=acceleration)
 
 
 def _course(name: str, flat: bool) -> Course:

@@ -49,9 +49,8 @@ class Manoeuvre(ABC):
     """Base of all manoeuvres; raises `ConfigurationError`: a parameter is outside its limits."""
 
     name: ClassVar[str]
-    limits: ClassVar[
-        Mapping[str, tuple[float, float]]
-    ] = {}  # parameter -> lowest and highest value, beside `COMMON_LIMITS`
+    # parameter -> lowest and highest value, beside `COMMON_LIMITS`
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     def __post_init__(self) -> None:
         require(self, **COMMON_LIMITS, **self.limits)
@@ -101,7 +100,8 @@ class LineDriver(Follower):
     def command(self, time: float, observation: Observation) -> Command:
         """As planned, until the end."""
         decision = super().command(time, observation)
-        return decision._replace(finished=decision.progress >= self._end or time >= self._end_time)
+        is_over = decision.progress >= self._end or time >= self._end_time
+        return replace(decision, finished=is_over)
 
 
 class OpenArea:
@@ -128,7 +128,8 @@ def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
         low, high = as_range(lowest if value is None else value)
         if not (lowest <= low <= high <= highest):
             raise ConfigurationError(
-                f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, not {value}"
+                f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, "
+                f"not {value}"
             )
 
 

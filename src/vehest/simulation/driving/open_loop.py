@@ -35,14 +35,17 @@ class StepSteer(Manoeuvre):
 
     name: ClassVar[str] = "j_turn"
     speed: Range = (15.0, 28.0)  # [m/s]; the driver holds it as far as grip and power allow
+    # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its
+    # square
     severity: Range = (
         0.4,
         1.0,
-    )  # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square
+    )
+    # in which the angle is reached, unless the steering is slower [s]
     steer_time: Range = (
         0.15,
         0.6,
-    )  # in which the angle is reached, unless the steering is slower [s]
+    )
     turn_time: Range = (5.0, 8.0)  # after the step [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
 
@@ -92,10 +95,12 @@ class Spiral(Manoeuvre):
 
     name: ClassVar[str] = "spiral"
     speed: Range = (14.0, 25.0)  # [m/s]; the driver holds it as far as grip and power allow
+    # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its
+    # square
     severity: Range = (
         0.7,
         1.0,
-    )  # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square
+    )
     ramp_time: Range = (6.0, 12.0)  # in which the angle is reached [s]
     hold_time: Range = (1.0, 2.0)  # at the angle [s]
     turns: Literal[1, 2] = 2  # 1, or 2 for a second turn to the other side
@@ -154,10 +159,12 @@ class RandomSteer(Manoeuvre):
 
     name: ClassVar[str] = "random_steer"
     speed: Range = (14.0, 30.0)  # [m/s]; the driver holds it as far as grip and power allow
+    # share of the grip that three standard deviations of the steering angle would take in a steady
+    # turn
     severity: Range = (
         0.5,
         1.0,
-    )  # share of the grip that three standard deviations of the steering angle would take in a steady turn
+    )
     band: tuple[float, float] = (0.1, 1.2)  # lowest and highest frequency [Hz]
     duration: float = 30.0  # of the recording [s]
 
@@ -167,7 +174,8 @@ class RandomSteer(Manoeuvre):
         super().__post_init__()
         if not 0.01 <= self.band[0] < self.band[1] <= 5.0:
             raise ConfigurationError(
-                f"manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not {self.band}"
+                "manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not "
+                f"{self.band}"
             )
 
     @property

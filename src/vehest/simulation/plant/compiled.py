@@ -27,6 +27,11 @@ from vehest.simulation.plant.equations import (
     multi_body,
 )
 from vehest.simulation.plant.parameters import (
+    BODY_NAMES,
+    GROUPS,
+    LONGITUDINAL_NAMES,
+    STEERING_NAMES,
+    TYRE_NAMES,
     LongitudinalValues,
     MultiBodyValues,
     SteeringValues,
@@ -55,7 +60,7 @@ from vehest.simulation.plant.regimes import (
 
 if numba.config.DISABLE_JIT:
 
-    def to_fixed_tuple(values, length):  # type: ignore[no-untyped-def]
+    def to_fixed_tuple(values, length):
         """As numba's, which runs compiled only."""
         return tuple(values[:length])
 
@@ -91,43 +96,46 @@ _kernel = numba.njit(
 
 
 # Places of the groups in a parameter vector.
-_STEERING = len(MultiBodyValues._fields) - 4
-_LONGITUDINAL = _STEERING + len(SteeringValues._fields)
-_FRONT = _LONGITUDINAL + len(LongitudinalValues._fields)
-_REAR = _FRONT + len(TyreValues._fields)
+_N_STEERING = len(STEERING_NAMES)
+_N_LONGITUDINAL = len(LONGITUDINAL_NAMES)
+_N_TYRE = len(TYRE_NAMES)
+_STEERING = len(BODY_NAMES)
+_LONGITUDINAL = _STEERING + _N_STEERING
+_FRONT = _LONGITUDINAL + _N_LONGITUDINAL
+_REAR = _FRONT + _N_TYRE
 _FRICTIONS = tuple(
-    tyre + TyreValues._fields.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1")
-)
-_LENGTHS = tuple(
-    len(values_class._fields) for values_class in (SteeringValues, LongitudinalValues, TyreValues)
+    tyre + TYRE_NAMES.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1")
 )
 
 
 @numba.njit(
     error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
 )  # it makes an array
-def _unpack(vector, friction):  # type: ignore[no-untyped-def]
+def _unpack(vector, friction):
     """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost
     as much as ten evaluations.
     """
     values = vector.copy()
     for place in _FRICTIONS:
         values[place] *= friction
-    steering = SteeringValues(*to_fixed_tuple(values[_STEERING:], _LENGTHS[0]))
-    longitudinal = LongitudinalValues(*to_fixed_tuple(values[_LONGITUDINAL:], _LENGTHS[1]))
-    front = TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2]))
-    rear = TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2]))
-    return MultiBodyValues(*to_fixed_tuple(values, _STEERING), steering, longitudinal, front, rear)  # type: ignore[call-arg]
+    steering = SteeringValues(*to_fixed_tuple(values[_STEERING:], _N_STEERING))
+    longitudinal = LongitudinalValues(*to_fixed_tuple(values[_LONGITUDINAL:], _N_LONGITUDINAL))
+    front = TyreValues(*to_fixed_tuple(values[_FRONT:], _N_TYRE))
+    rear = TyreValues(*to_fixed_tuple(values[_REAR:], _N_TYRE))
+    body_values = to_fixed_tuple(values, _STEERING)
+    return MultiBodyValues(  # type: ignore[call-arg]
+        *body_values, steering, longitudinal, front, rear
+    )
 
 
 @_kernel
-def _sliding_friction(tyre):  # type: ignore[no-untyped-def]
+def _sliding_friction(tyre):
     """Lateral force over load of an upright wheel that slips at a right angle."""
     return abs(lateral_force(0.5 * math.pi, 0.0, 1.0, tyre)[0])
 
 
 @_kernel
-def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def]
+def _right_hand_side(x, contact, p, derivatives):
     """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order
     and the wheels' axes.
     """
@@ -170,7 +178,7 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
 
 
 @_kernel
-def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
+def _engine_limit(x, acceleration, p):
     """Wanted acceleration, within power at the speed of the driven wheels; the library's limit
     takes the car's speed.
     """
@@ -186,13 +194,13 @@ def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _brake_arm(p):  # type: ignore[no-untyped-def]
+def _brake_arm(p):
     """Yaw moment per braking force on one side, shared equally by front and rear [m]."""
     return 0.25 * (p.T_f + p.T_r)
 
 
 @_kernel
-def _yaw_moment(moment, forces, p):  # type: ignore[no-untyped-def]
+def _yaw_moment(moment, forces, p):
     """The wanted moment, within the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
     right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
@@ -201,7 +209,7 @@ def _yaw_moment(moment, forces, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
+def _n_substeps(regime, x, p, step):
     """Parts of a step in which the slip of the slowest wheel is stable."""
     if regime != ROLLING:
         return 1
@@ -214,7 +222,7 @@ def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _relax(lateral_ratio, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
+def _relax(lateral_ratio, regime, forces, x, vector, part):
     """Lateral forces over load after a part of a step: while rolling they follow the slip over a
     length of the way.
 
@@ -232,7 +240,7 @@ def _relax(lateral_ratio, regime, forces, x, vector, part):  # type: ignore[no-u
             lateral_ratio[i] = forces[4 + i] / forces[8 + i]
 
 
-def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_ratio_before):  # type: ignore[no-untyped-def]
+def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_ratio_before):
     p = _unpack(vector, friction)
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     lateral_ratio = np.empty(8)
@@ -285,7 +293,7 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_rat
     return x, regime, slid or regime == SLIDING, lateral_ratio[:4].copy()
 
 
-def _evaluate(states, regimes, inputs, vector, frictions, lateral_ratios):  # type: ignore[no-untyped-def]
+def _evaluate(states, regimes, inputs, vector, frictions, lateral_ratios):
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     lateral_ratio = np.empty(8)
     n_samples = len(states)
@@ -369,25 +377,25 @@ def _digest() -> str:
     sources = (
         inspect.getsource(equations),
         inspect.getsource(regimes),
-        repr(MultiBodyValues._fields),
+        repr((*BODY_NAMES, *GROUPS)),
     )
     return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
 
 
 advance = _CachedFunction(_advance)
-"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, lateral_ratio (4,)) -> state
-(29,), regime, whether it slid, lateral_ratio (4,).
+"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, lateral_ratio (4,))
+-> state (29,), regime, whether it slid, lateral_ratio (4,).
 
-``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``lateral_ratio`` are lateral forces
-over load, where these lag.
+``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``lateral_ratio`` are
+lateral forces over load, where these lag.
 
 Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a
 rollover or NaN.
 """
 
 evaluate = _CachedFunction(_evaluate)
-"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,), lateral_ratio (T, 4)) ->
-derivatives (T, 29), forces (T, 12).
+"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,),
+lateral_ratio (T, 4)) -> derivatives (T, 29), forces (T, 12).
 
 Forces: along and across in the level body's axes, then vertical, each for the library's four wheels
 [N].

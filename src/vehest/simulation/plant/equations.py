@@ -62,7 +62,8 @@ JOINT_REAR = 28
 # velocity, heave and heave rate of an axle follow one another.
 _Axle = namedtuple(
     "_Axle",
-    "vy joint lever track mass inertia static spring damper torsion joint_height camber camber_squared",
+    "vy joint lever track mass inertia static spring damper torsion joint_height camber "
+    "camber_squared",
 )
 # Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the
 # wheels.
@@ -77,7 +78,7 @@ _kernel = numba.njit(
 
 
 @_kernel
-def steering_limit(steer, velocity, limits):  # type: ignore[no-untyped-def]
+def steering_limit(steer, velocity, limits):
     """Steering velocity [rad/s] within its limits; zero at the stops."""
     if (steer <= limits.min and velocity <= 0.0) or (steer >= limits.max and velocity >= 0.0):
         return 0.0
@@ -85,7 +86,7 @@ def steering_limit(steer, velocity, limits):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def acceleration_limit(velocity, acceleration, limits):  # type: ignore[no-untyped-def]
+def acceleration_limit(velocity, acceleration, limits):
     """Longitudinal acceleration [m/s²] within brakes, engine power and top speed."""
     if (velocity <= limits.v_min and acceleration <= 0.0) or (
         velocity >= limits.v_max and acceleration >= 0.0
@@ -98,7 +99,7 @@ def acceleration_limit(velocity, acceleration, limits):  # type: ignore[no-untyp
 
 
 @_kernel
-def _bent(stiffness, curvature, slip):  # type: ignore[no-untyped-def]
+def _bent(stiffness, curvature, slip):
     """atan(B s - E (B s - atan(B s))), whose sine or cosine the magic formula takes, times the
     shape factor.
     """
@@ -107,7 +108,7 @@ def _bent(stiffness, curvature, slip):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def longitudinal_force(slip, camber, load, tyre):  # type: ignore[no-untyped-def]
+def longitudinal_force(slip, camber, load, tyre):
     """Longitudinal force of pure slip [N]. The published model has the vertical shift inside of the
     sine.
     """
@@ -119,7 +120,7 @@ def longitudinal_force(slip, camber, load, tyre):  # type: ignore[no-untyped-def
 
 
 @_kernel
-def lateral_force(angle, camber, load, tyre):  # type: ignore[no-untyped-def]
+def lateral_force(angle, camber, load, tyre):
     """Lateral force of pure slip [N], and its friction. Both shifts change sign with the camber."""
     side = 1.0 if camber > 0.0 else (-1.0 if camber < 0.0 else 0.0)
     friction = tyre.p_dy1 * (1.0 - tyre.p_dy3 * camber**2)
@@ -131,14 +132,14 @@ def lateral_force(angle, camber, load, tyre):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _weighted(force, shape, stiffness, curvature, shift, slip):  # type: ignore[no-untyped-def]
+def _weighted(force, shape, stiffness, curvature, shift, slip):
     """A force of pure slip, reduced by slip in the other direction."""
     at_none = math.cos(shape * _bent(stiffness, curvature, shift)) if shift != 0.0 else 1.0
     return force / at_none * math.cos(shape * _bent(stiffness, curvature, slip + shift))
 
 
 @_kernel
-def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-def]
+def _tyre_forces(slip, angle, camber, load, tyre):
     """Longitudinal and lateral force of a wheel with combined slip [N]."""
     along = longitudinal_force(slip, camber, load, tyre)
     across, friction = lateral_force(angle, camber, load, tyre)
@@ -157,7 +158,7 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
 
 
 @_kernel
-def _axles(p):  # type: ignore[no-untyped-def]
+def _axles(p):
     twice_wheelbase = 2.0 * (p.a + p.b)
     return (
         _Axle(
@@ -194,7 +195,7 @@ def _axles(p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: ignore[no-untyped-def]
+def _suspension(x, axle, height, radius, joint_spring, joint_damper):
     """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump
     stops are left out.
     """
@@ -236,7 +237,7 @@ def _suspension(x, axle, height, radius, joint_spring, joint_damper):  # type: i
 
 
 @_kernel
-def _slip(velocity, turning):  # type: ignore[no-untyped-def]
+def _slip(velocity, turning):
     """Longitudinal slip of a wheel from its velocity and that of its rim [m/s]; a wheel that moves
     backwards counts as standing.
     """
@@ -247,7 +248,7 @@ def _slip(velocity, turning):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical, tyre):  # type: ignore[no-untyped-def]
+def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical, tyre):
     """Tyre forces and loads of an axle; ``vertical`` is the vertical stiffness of a tyre [N/m]."""
     roll = x[axle.vy - 2]
     roll_rate = x[axle.vy - 1]
@@ -274,7 +275,7 @@ def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical,
 
 
 @_kernel
-def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, derivatives):  # type: ignore[no-untyped-def]
+def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, derivatives):
     """Fill the derivatives of an axle's five states and its joint's play.
 
     ``across`` is the lateral force of both wheels in the body's axes; left and right are lateral
@@ -309,7 +310,7 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
 
 
 @_kernel
-def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # type: ignore[no-untyped-def]
+def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):
     """Fill the derivatives (29,) of the state x (29,); returns twelve tyre forces in the wheels'
     axes: four along, four across, four loads.
 

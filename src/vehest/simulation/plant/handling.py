@@ -11,18 +11,28 @@ from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 
 RATE_HZ = 50.0
 AY_RATE = 0.5  # by which the lateral acceleration of a neutral car would grow [m/s³]
-LONGEST = 60.0  # s
+MAX_SECONDS = 60.0  # length of a ramp
 
 
 def ramp_steer(
     plant: MultiBodyPlant, speed: float, *, friction: float = 1.0, direction: float = 1.0
 ) -> Motion:
-    """Constant speed [m/s], slowly growing steering angle, until the lateral acceleration falls by
-    3 % again; 50 Hz.
+    """Motion at constant speed under a slowly growing steering angle, at 50 Hz.
 
-    Towards the limit, where the lateral acceleration hardly grows any more, the steering angle
-    grows up to ten times faster. ``friction`` scales that of the tyres; the direction is 1 to the
-    left, -1 to the right.
+    It ends where the lateral acceleration has fallen by 3 % from its largest value, or the car
+    spins or rolls over. Towards the limit, where the lateral acceleration hardly grows any more,
+    the steering angle grows up to ten times faster.
+
+    Parameters
+    ----------
+    plant : MultiBodyPlant
+        The car.
+    speed : float
+        Forward speed that a controller keeps [m/s].
+    friction : float
+        Scale of the tyres' friction.
+    direction : float
+        1: to the left, -1: to the right.
     """
     steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
     state = plant.initial_state(0.0, 0.0, 0.0, speed)
@@ -30,7 +40,7 @@ def ramp_steer(
     states: list[PlantState] = []
     inputs: list[FloatArray] = []
     integral = largest = 0.0
-    for _ in range(round(LONGEST * RATE_HZ)):
+    for _ in range(round(MAX_SECONDS * RATE_HZ)):
         now = abs(state.vx * state.yaw_rate)
         error = speed - state.vx
         integral += error / RATE_HZ

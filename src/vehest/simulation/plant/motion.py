@@ -35,18 +35,22 @@ class Motion:
     ax: FloatArray  # acceleration dvx/dt - vy·yaw_rate [m/s²]
     ay: FloatArray  # acceleration dvy/dt + vx·yaw_rate [m/s²]
     steer: FloatArray  # road-wheel angle of the front axle [rad]
-    roll: FloatArray  # of the body against the road, positive with the left side up, as in a left turn [rad]
-    pitch: FloatArray  # of the body against its place at rest, positive with the nose down, as when braking [rad]
+    # of the body against the road, positive with the left side up, as in a left turn [rad]
+    roll: FloatArray
+    # of the body against its place at rest, positive with the nose down, as when braking [rad]
+    pitch: FloatArray
     roll_rate: FloatArray  # derivative of the roll [rad/s]
     pitch_rate: FloatArray  # derivative of the pitch [rad/s]
     wheel_speed: FloatArray  # rotational speeds (T, 4) [rad/s]
     tyre_fx: FloatArray  # forces of the road on the tyres, along the body, not the wheel (T, 4) [N]
     tyre_fy: FloatArray  # the same across the body (T, 4) [N]
     tyre_fz: FloatArray  # wheel loads, positive (T, 4) [N]
-    friction: FloatArray  # scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road
+    # scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road
+    friction: FloatArray
     bank: FloatArray  # of the road, positive with its left side higher [rad]
     grade: FloatArray  # of the road, positive downhill [rad]
-    # of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such motor
+    # of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such
+    # motor
     motor_speed: FloatArray | None = None
     motor_current: FloatArray | None = None  # its torque-producing current [A]; likewise
 

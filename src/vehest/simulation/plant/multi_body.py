@@ -86,7 +86,8 @@ class PlantState:
     values: FloatArray  # the library's states, (29,)
     regime: Regime  # which equations hold
     spun: bool = False  # whether the car has been in a spin since its start
-    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag
+    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars
+    # whose forces lag
     lateral_ratio: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     x = _state(X, "Position on the ground [m].")
@@ -160,8 +161,16 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or
-        standing.
+        """The state in equilibrium, rolling straight ahead or standing.
+
+        Parameters
+        ----------
+        x, y : float
+            Place of the centre of gravity [m].
+        yaw : float
+            Heading, positive to the left [rad].
+        vx : float
+            Forward speed [m/s].
         """
         values = self._at_rest.copy()
         values[[X, Y, YAW, VX]] = x, y, yaw, vx
@@ -171,8 +180,25 @@ class MultiBodyPlant:
     def advance(
         self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0
     ) -> PlantState:
-        """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the
-        car rolls over or diverges.
+        """The state after some steps.
+
+        Parameters
+        ----------
+        state : PlantState
+            Before the first step.
+        inputs : array, shape (5,)
+            Constant over the steps: steering velocity of the road wheels [rad/s], longitudinal
+            acceleration [m/s²], yaw moment of a stability control [N m], gravity along and across
+            the car [m/s²].
+        n_steps : int
+            Number of the plant's steps.
+        friction : float
+            Scale of the tyres' friction, constant over the steps.
+
+        Raises
+        ------
+        SimulationError
+            The car rolls over or diverges.
         """
         inputs = _writable(inputs)
         values, regime, slid, lateral_ratio = compiled.advance(
@@ -187,18 +213,31 @@ class MultiBodyPlant:
         )
         if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
             raise SimulationError(
-                f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at {_describe(values)}; lower "
-                f"the grip that is asked of it or the centre of gravity (h_s), or stiffen roll (K_tsf, K_tsr)"
+                f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at "
+                f"{_describe(values)}; lower the grip that is asked of it or the centre of gravity "
+                "(h_s), or stiffen roll (K_tsf, K_tsr)"
             )
         return PlantState(values, Regime(regime), state.spun or slid, lateral_ratio)
 
     def evaluate(
         self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for
-        motion.WHEELS [N].
+        """Derivatives of states, and tyre forces.
 
-        ``inputs`` are (T, 5); ``friction`` scales friction, (T,) or one for all.
+        Parameters
+        ----------
+        states : sequence of PlantState
+            T states.
+        inputs : array, shape (T, 5)
+            As in `advance`.
+        friction : array, shape (T,), or float
+            Scale of the tyres' friction.
+
+        Returns
+        -------
+        tuple
+            Derivatives (T, 29); forces along, across and up, (T, 3, 4) [N], in the order of
+            `motion.WHEELS`.
         """
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
@@ -260,7 +299,7 @@ class MultiBodyPlant:
 
 
 def _writable(values: ArrayLike) -> FloatArray:
-    """The values as a contiguous, writable array: any other kind would be compiled for once more."""
+    """The values as a contiguous, writable array; another layout would be compiled separately."""
     return np.require(values, dtype=np.float64, requirements=["C", "W"])
 
 
@@ -273,6 +312,6 @@ def road_gravity(bank: float, grade: float) -> tuple[float, float]:
 
 def _describe(values: FloatArray) -> str:
     return (
-        f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} rad/s, "
-        f"roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"
+        f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} "
+        f"rad/s, roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
@@ -33,7 +33,7 @@ LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter fi
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType(
     {1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"}
 )
-"""Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
+"""Sets whose multi-body values CommonRoad publishes (Althoff and Würsching 2020, appendix)."""
 
 
 def _field_names(library_class: type) -> list[str]:
@@ -42,28 +42,20 @@ def _field_names(library_class: type) -> list[str]:
 
 REAR_TYRE = "tire_rear"
 
+STEERING_NAMES = _field_names(SteeringParameters)
+LONGITUDINAL_NAMES = _field_names(LongitudinalParameters)
+TYRE_NAMES = _field_names(TireParameters)
+GROUPS = ("steering", "longitudinal", "tire", REAR_TYRE)
+"""Fields of `MultiBodyValues` that are named tuples themselves."""
+BODY_NAMES = [name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")]
+"""The other fields of `MultiBodyValues`."""
+
 # The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a
 # rear tyre. Groups stand last.
-SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
-LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
-TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
-GROUPS: Mapping[str, type] = MappingProxyType(
-    {
-        "steering": SteeringValues,
-        "longitudinal": LongitudinalValues,
-        "tire": TyreValues,
-        REAR_TYRE: TyreValues,
-    }
-)
-"""Fields of MultiBodyValues that are named tuples themselves."""
-
-MultiBodyValues = namedtuple(  # type: ignore[misc]
-    "MultiBodyValues",
-    [
-        *(name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")),
-        *GROUPS,
-    ],
-)
+SteeringValues = namedtuple("SteeringValues", STEERING_NAMES)  # type: ignore[misc]
+LongitudinalValues = namedtuple("LongitudinalValues", LONGITUDINAL_NAMES)  # type: ignore[misc]
+TyreValues = namedtuple("TyreValues", TYRE_NAMES)  # type: ignore[misc]
+MultiBodyValues = namedtuple("MultiBodyValues", [*BODY_NAMES, *GROUPS])  # type: ignore[misc]
 
 POSITIVE = (
     "m",
@@ -99,26 +91,28 @@ class Vehicle:
     name: str  # in recordings
     parameter_set: int  # number of the published set it starts from
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    driver: Mapping[str, float] = field(
-        default_factory=dict
-    )  # values of this car for its driver (car.py); the plant does not read them
+    # values of this car for its driver (car.py); the plant does not read them
+    driver: Mapping[str, float] = field(default_factory=dict)
+    # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
     relaxation: tuple[float, float] = (
         0.0,
         0.0,
-    )  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
+    )
 
     def __post_init__(self) -> None:
         parameters = library_parameters(self)
         for name in POSITIVE:
             if not getattr(parameters, name) > 0.0:
                 raise ConfigurationError(
-                    f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}"
+                    f"vehicle '{self.name}': {name} must be positive, not "
+                    f"{getattr(parameters, name)}"
                 )
         rear_tyre(self)
         for place, length in zip(("front", "rear"), self.relaxation, strict=True):
             if not 0.0 <= length < math.inf:
                 raise ConfigurationError(
-                    f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m"
+                    f"vehicle '{self.name}': relaxation {place} must be zero or positive, not "
+                    f"{length} m"
                 )
 
 
@@ -158,7 +152,8 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     shift = forward * mass / total
     if mass < 0.0 or not (p.a - shift > 0.0 and p.b + shift > 0.0):
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': a payload of {mass:g} kg at {forward:g} m puts the centre of gravity off the axles"
+            f"vehicle '{vehicle.name}': a payload of {mass:g} kg at {forward:g} m puts the centre "
+            "of gravity off the axles"
         )
     unsprung = p.m_uf + p.m_ur
     changed = {
@@ -184,7 +179,8 @@ def library_parameters(vehicle: Vehicle) -> VehicleParameters:
     if vehicle.parameter_set not in PUBLISHED_SETS:
         published_sets = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
         raise ConfigurationError(
-            f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {published_sets}"
+            f"vehicle '{vehicle.name}': there is no multi-body parameter set "
+            f"{vehicle.parameter_set}; there are {published_sets}"
         )
     parameters = deepcopy(_published(vehicle.parameter_set))
     library_overrides = {
@@ -209,8 +205,13 @@ def rear_tyre(vehicle: Vehicle) -> TireParameters:
 def compiled_parameters(vehicle: Vehicle) -> Any:
     """The same values as nested named tuples of floats (MultiBodyValues); absent ones are NaN."""
     parameters = library_parameters(vehicle)
-    rear = _as_values(TyreValues, rear_tyre(vehicle))
-    return _as_values(MultiBodyValues, parameters, **{REAR_TYRE: rear})
+    return MultiBodyValues(  # type: ignore[call-arg]
+        *_values_of(parameters, BODY_NAMES),
+        SteeringValues(*_values_of(parameters.steering, STEERING_NAMES)),
+        LongitudinalValues(*_values_of(parameters.longitudinal, LONGITUDINAL_NAMES)),
+        TyreValues(*_values_of(parameters.tire, TYRE_NAMES)),
+        TyreValues(*_values_of(rear_tyre(vehicle), TYRE_NAMES)),
+    )
 
 
 def parameter_vector(parameters: Any) -> FloatArray:
@@ -253,14 +254,7 @@ def _require_number(label: str, value: Any) -> None:
         raise ConfigurationError(f"{label} must be a finite number, not {value!r}")
 
 
-def _as_values(values_class: Any, parameters: Any, **preset: Any) -> Any:
-    values = dict(preset)
-    for name in values_class._fields:
-        if name in values:
-            continue
-        value = getattr(parameters, name)
-        if name in GROUPS:
-            values[name] = _as_values(GROUPS[name], value)
-        else:
-            values[name] = math.nan if value is None else float(value)
-    return values_class(**values)
+def _values_of(parameters: Any, names: Sequence[str]) -> list[float]:
+    """Values of these names; NaN where the library has none."""
+    values = [getattr(parameters, name) for name in names]
+    return [math.nan if value is None else float(value) for value in values]

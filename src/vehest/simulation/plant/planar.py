@@ -7,10 +7,11 @@ drives on; this one has no regimes.
 
 Tyres: magic formula without curvature of the combined slip, F = μ F_z sin(C atan(B s)) along the
 slip (Pacejka, Tire and Vehicle Dynamics, 2012, Sections 4.2 and 4.3, with the same slip stiffness
-in both directions). Slips are divided by V = max(|V_x|, |ω|R, SLOWEST): at a spinning, locked or
-standing wheel they stay finite. They follow their steady values over a relaxation length σ, ds/dt =
-V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding tyre's
-carcass bends no further; a share of the difference acts at once, as a carcass's damping does.
+in both directions). Slips are divided by V = max(|V_x|, |ω|R, MIN_SLIP_SPEED): at a spinning,
+locked or standing wheel they stay finite. They follow their steady values over a relaxation length
+σ, ds/dt = V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding
+tyre's carcass bends no further; a share of the difference acts at once, as a carcass's damping
+does.
 
 Motor: J dω/dt = K I - b0 sign(ω) - b1 ω - R ΣF_x on the mean speed of the wheels, the powertrain of
 Eq. 2 of Węgrzynowski et al. 2024.
@@ -33,13 +34,13 @@ from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
 
 # speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper,
 # not a spring
-SLOWEST = 0.3
+MIN_SLIP_SPEED = 0.3
 # speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
 STICTION_SPEED = 1.0
 
 # share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones
 # need a smaller step
-SHORTEST = 0.2
+MIN_RELAXATION_SHARE = 0.2
 
 X, Y, YAW, VX, VY, YAW_RATE = range(6)
 FIRST_WHEEL = 6
@@ -57,7 +58,7 @@ PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+def _per_slip(slip, stiffness, shape):
     """sin(C atan(B s))/s."""
     return (
         math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
@@ -65,7 +66,7 @@ def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _derivative(state, target_steer, target_current, scale, p, forces):  # type: ignore[no-untyped-def]
+def _derivative(state, target_steer, target_current, scale, p, forces):
     """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its
     load.
     """
@@ -110,13 +111,14 @@ def _derivative(state, target_steer, target_current, scale, p, forces):  # type:
         wheel_x = point_x * cosine + point_y * sine
         wheel_y = point_y * cosine - point_x * sine
         rim = p.wheel_radius * state[FIRST_WHEEL + wheel]
-        reference = max(abs(wheel_x), abs(rim), SLOWEST)
+        reference = max(abs(wheel_x), abs(rim), MIN_SLIP_SPEED)
         missing_x = (rim - wheel_x) / reference - state[FIRST_SLIP_X + wheel]
         missing_y = -wheel_y / reference - state[FIRST_SLIP_Y + wheel]
         stiffness = p.stiffness_factor_front if front else p.stiffness_factor_rear
         stored = math.hypot(state[FIRST_SLIP_X + wheel], state[FIRST_SLIP_Y + wheel])
         length = p.relaxation_length * max(
-            _per_slip(stored, stiffness, p.shape_factor) / (p.shape_factor * stiffness), SHORTEST
+            _per_slip(stored, stiffness, p.shape_factor) / (p.shape_factor * stiffness),
+            MIN_RELAXATION_SHARE,
         )
         rate[FIRST_SLIP_X + wheel] = missing_x * reference / length
         rate[FIRST_SLIP_Y + wheel] = missing_y * reference / length
@@ -169,7 +171,7 @@ def _derivative(state, target_steer, target_current, scale, p, forces):  # type:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _advance(state, target_steer, target_current, scale, p, step, n_steps):  # type: ignore[no-untyped-def]
+def _advance(state, target_steer, target_current, scale, p, step, n_steps):
     """The state (22,) after n_steps steps of a Runge-Kutta method of fourth order with constant
     inputs.
     """
@@ -225,8 +227,9 @@ class PlanarPlant:
         after: FloatArray = _advance(state, *map(float, inputs), self._values, self.step, n_steps)
         if not np.isfinite(after).all():
             raise SimulationError(
-                f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = {state[VX]:.3g} m/s, "
-                f"vy = {state[VY]:.3g} m/s, yaw rate = {state[YAW_RATE]:.3g} rad/s; use a smaller step than {self.step:g} s"
+                f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = "
+                f"{state[VX]:.3g} m/s, vy = {state[VY]:.3g} m/s, yaw rate = {state[YAW_RATE]:.3g} "
+                f"rad/s; use a smaller step than {self.step:g} s"
             )
         return after
 

@@ -38,26 +38,26 @@ class PlanarCar:
     torque_constant: Positive  # torque at the wheels, all four together, per motor current [N m/A]
     coulomb_torque: ZeroOrPositive  # friction of motor and gears, referred to the wheels [N m]
     viscous_torque: ZeroOrPositive  # the same, proportional to the speed of the wheels [N m s/rad]
-    # of the front and of the rear differential: torque per difference of a wheel's speed to its axle's mean [N m s/rad]
+    # of the front and of the rear differential: torque per difference of a wheel's speed to its
+    # axle's mean [N m s/rad]
     axle_lock: ZeroOrPositive
-    # of the centre differential: torque on a wheel per difference of its axle's mean speed to that of all [N m s/rad]
+    # of the centre differential: torque on a wheel per difference of its axle's mean speed to that
+    # of all [N m s/rad]
     centre_lock: ZeroOrPositive
     air_drag: ZeroOrPositive  # force per square of the speed [N s²/m²]
     friction: Positive  # peak friction of the tyres at a quarter of the weight [1]
-    load_sensitivity: Annotated[
-        float, Field(ge=0.0, le=0.5)
-    ]  # relative loss of friction per relative gain of load [1]
-    stiffness_factor_front: (
-        Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
-    )
-    stiffness_factor_rear: (
-        Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
-    )
+    # relative loss of friction per relative gain of load [1]
+    load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]
+    # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    stiffness_factor_front: Positive
+    # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    stiffness_factor_rear: Positive
     shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]  # its C [1]
     relaxation_length: Positive  # of the tyres [m]
     carcass_damping: Share  # share of the slip that acts at once, without relaxation [1]
     roll_share_front: Share  # share of the lateral load transfer that the front axle takes [1]
-    load_time: Positive  # time constant with which load transfer, roll and pitch follow the accelerations [s]
+    # time constant with which load transfer, roll and pitch follow the accelerations [s]
+    load_time: Positive
     roll_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
     pitch_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
     largest_steer: Positive  # road-wheel angle at the stop [rad]

@@ -3,11 +3,13 @@
 Three regimes share one state vector and one set of suspension equations; they differ in the forces
 of the tyres and in how the planar motion follows.
 
-- ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with 1/vx.
-- SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels (kinematic single track).
-  The tyres' forces are those that this motion needs, so that springs and compliant joints go on undisturbed.
-- SLIDING: after a spin the wheels are locked, and every contact patch slides against its velocity with the friction
-  that the lateral tyre formula has at a right angle. It ends at standstill.
+- ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with
+  1/vx.
+- SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels
+  (kinematic single track). The tyres' forces are those that this motion needs, so that springs and
+  compliant joints go on undisturbed.
+- SLIDING: after a spin the wheels are locked, and every contact patch slides against its velocity
+  with the friction that the lateral tyre formula has at a right angle. It ends at standstill.
 
 All functions are compiled and use the library's axes, whose vertical axis points down. A positive
 quantity to the right in them is one to the left in ISO 8855 axes; see multi_body.py.
@@ -67,7 +69,7 @@ _kernel = numba.njit(
 
 
 @_kernel
-def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
+def next_regime(regime, x, p):
     """The regime that holds from the state x on."""
     vx = x[VX]
     vy = x[VY]
@@ -88,7 +90,7 @@ def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[no-untyped-def]
+def slow_motion(x, steering_velocity, acceleration, inputs, p):
     """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes
     or a slope hold it.
     """
@@ -112,7 +114,7 @@ def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[
 
 
 @_kernel
-def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
+def wheel_velocities(x, p):
     """Velocity of the four wheels along their own planes, in the library's order [m/s]."""
     sine = math.sin(x[STEER])
     cosine = math.cos(x[STEER])
@@ -128,7 +130,7 @@ def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[no-untyped-def]
+def forces_of_contact(contact, x, u, p, along, across, loads):
     """Longitudinal and lateral forces of the four tyres in the wheels' axes.
 
     Parameters
@@ -191,7 +193,7 @@ def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[n
 
 
 @_kernel
-def _adhesion(p, front_share):  # type: ignore[no-untyped-def]
+def _adhesion(p, front_share):
     """Largest acceleration [m/s²] whose torque, split in this way, neither axle's static load fails
     to carry.
     """
@@ -202,8 +204,8 @@ def _adhesion(p, front_share):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
-    """Forces on front and rear axle in the body's axes, along and across, that slow_motion needs."""
+def _forces_needed(x, u, inputs, p):
+    """Forces on front and rear axle, along and across the body, that `slow_motion` needs."""
     vx_change, vy_change, yaw_acceleration = slow_motion(x, u[0], u[1], inputs, p)
     along = p.m * (vx_change - x[VY] * x[YAW_RATE] - inputs[3])
     across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
@@ -219,6 +221,6 @@ def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _coulomb(limit, vx, vy):  # type: ignore[no-untyped-def]
+def _coulomb(limit, vx, vy):
     scale = -limit / math.sqrt(vx**2 + vy**2 + SLIDING_SMOOTHING**2)
     return scale * vx, scale * vy

@@ -22,9 +22,8 @@ class StabilityState:
 
     reference: float = 0.0  # yaw rate that it follows [rad/s]
     active: bool = False  # whether it intervenes
-    moment: float = (
-        0.0  # yaw moment that it asks for, positive to the left [N m]; the plant's third input
-    )
+    # yaw moment that it asks for, positive to the left [N m]; the plant's third input
+    moment: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,9 @@ class StabilityControl:
     yaw_inertia: float  # [kg m²]
     grip: float  # lateral acceleration that friction allows on a dry road [m/s²]
     largest_moment: float  # that braking one side may give on a dry road [N m]
-    # moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms, and cars get all of the moment at about
-    # 7 degrees a second. With half of it, a car whose rear slides is lost before the brakes are
-    # fully on.
+    # moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms,
+    # and cars get all of the moment at about 7 degrees a second. With half of it, a car whose rear
+    # slides is lost before the brakes are fully on.
     gain: float = 20.0
     on_above: float = 0.07  # error of the yaw rate at which it intervenes [rad/s]; assumed
     off_below: float = 0.03  # error at which it lets go again [rad/s]; assumed
@@ -55,8 +54,20 @@ class StabilityControl:
         yaw_rate: float,
         friction: float = 1.0,
     ) -> StabilityState:
-        """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as
-        far as the control knows it.
+        """The state one interval later.
+
+        Parameters
+        ----------
+        before : StabilityState
+            The last state.
+        interval : float
+            Time since then [s].
+        steer : float
+            Road-wheel angle [rad].
+        vx, yaw_rate : float
+            Measured speed [m/s] and yaw rate [rad/s].
+        friction : float
+            Scale of the tyres' friction that the control assumes.
         """
         if vx < self.slowest:
             return StabilityState(reference=yaw_rate)

@@ -35,9 +35,8 @@ class Corner:
     radius: float  # of the arc [m]
     angle: float  # change of heading, positive to the left [rad]
     transition: float  # length of each clothoid [m]
-    banking: float = (
-        0.0  # of the arc, growing along the clothoids; positive with the inner side lower [rad]
-    )
+    # of the arc, growing along the clothoids; positive with the inner side lower [rad]
+    banking: float = 0.0
 
     @property
     def bank(self) -> float:

@@ -32,20 +32,19 @@ class Surface:
     """
 
     name: str = "dry"  # in recordings
-    friction: float = (
-        1.0  # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
-    )
+    # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
+    friction: float = 1.0
     patches: float | None = None  # lowest scale of a patch
     patch_length: tuple[float, float] = (20.0, 80.0)  # shortest and longest patch [m]
-    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = (
-        None  # of the patches; by default the drive's
-    )
+    # of the patches; by default the drive's
+    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None
 
     def __post_init__(self) -> None:
         lowest = self.friction if self.patches is None else self.patches
         if not 0.05 <= lowest <= self.friction <= 1.5:
             raise ConfigurationError(
-                f"surface '{self.name}': friction must lie between 0.05 and 1.5 and its patches below it, not {self.friction} and {lowest}"
+                f"surface '{self.name}': friction must lie between 0.05 and 1.5 and its patches "
+                f"below it, not {self.friction} and {lowest}"
             )
         if not 5.0 <= self.patch_length[0] <= self.patch_length[1] < math.inf:
             raise ConfigurationError(
@@ -55,10 +54,16 @@ class Surface:
     def along(
         self, distance: FloatArray, drive_seed: int, length: float | None = None
     ) -> FloatArray:
-        """Scale at each distance along the way, (N,) [m], zero or positive, uniform.
+        """Scale of the tyres' friction along the way, (N,).
 
-        The drive's seed draws the patches if the surface has none of its own; after a lap's
-        ``length`` [m] the same come again, by default never.
+        Parameters
+        ----------
+        distance : array, shape (N,)
+            Distances at which to evaluate it [m], zero or positive, uniform.
+        drive_seed : int
+            Draws the patches if the surface has no seed.
+        length : float or None
+            Of a lap, after which the same patches come again [m]; None: never.
         """
         if self.patches is None:
             return np.full(distance.shape, self.friction)

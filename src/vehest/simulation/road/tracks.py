@@ -13,10 +13,10 @@ class Layout:
     """Layout of a course."""
 
     segments: tuple[Segment, ...]  # in the order they are driven
-    crossfall: float = 0.0  # bank of the road all along, positive with the left side higher [rad]; corners add their own
-    heights: tuple[
-        tuple[float, float], ...
-    ] = ()  # (share of the lap, height [m]), in ascending order; none is a level course
+    # bank of the road all along, positive with the left side higher [rad]; corners add their own
+    crossfall: float = 0.0
+    # (share of the lap, height [m]), in ascending order; none is a level course
+    heights: tuple[tuple[float, float], ...] = ()
     # (share of the lap where it begins, where it ends, scale of the tyres' friction); 1 elsewhere
     friction: tuple[tuple[float, float, float], ...] = ()
 
@@ -128,7 +128,7 @@ FAST_CIRCUIT = Layout(
     crossfall=math.radians(1.0),
     heights=((0.0, 0.0), (0.25, 6.0), (0.55, -4.0), (0.8, 3.0)),
 )
-"""A clockwise race circuit of 3.8 km for fast cars, like no particular one; all values are assumed."""
+"""A clockwise race circuit of 3.8 km for fast cars; all values are assumed, none of a real one."""
 
 HILL_CIRCUIT = Layout(
     (

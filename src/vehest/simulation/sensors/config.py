@@ -52,7 +52,8 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
     """Levels from a data set's ``sensors``: a preset's name, or a mapping that changes a ``preset``
     (by default ``default``)::
 
-        {preset: race, reference: optical, ay: {noise: 0, offset: 0.05}, steer: off, tilt: {bank: off}, switched_off: ["*.drift"]}
+        {preset: race, reference: optical, ay: {noise: 0, offset: 0.05}, steer: off,
+         tilt: {bank: off}, switched_off: ["*.drift"]}
 
     A sensor, ``imu``, ``tilt`` and ``reference`` take a mapping of what changes, or ``off``;
     ``reference`` also takes a kind, or a mapping with one.

@@ -19,8 +19,21 @@ STREAM = 1  # first spawn key of all sensor errors; 0 is the driver's
 def sensor_signal(
     true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str
 ) -> FloatArray:
-    """Signal of a sensor for a true one, (T,), uniformly sampled; the sensor's name and the kind of
-    error choose the random stream.
+    """Signal of a sensor, (T,): delay, gain, scale, bias, offset, drift, noise, quantisation.
+
+    Parameters
+    ----------
+    true : array, shape (T,)
+        The measured quantity, uniformly sampled.
+    level : SensorLevel
+        Size of each error, in the quantity's unit.
+    rate_hz : float
+        Sampling rate [Hz].
+    seed : int
+        Of the drive. Each error has a random stream, which the sensor's name and the kind of error
+        select.
+    name : str
+        Of the sensor.
     """
     value = delayed(true, level.delay * rate_hz)
     if level.gain:

@@ -47,7 +47,9 @@ class SensorLevel(Errors):
     signed: ClassVar[tuple[str, ...]] = ("gain", "bias")
     noise: float = 0.0  # density of the white noise [unit/√Hz]
     offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
-    drift: float = 0.0  # standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit]
+    # standard deviation of a first-order Gauss-Markov process that is stationary from the first
+    # sample on [unit]
+    drift: float = 0.0
     drift_time: float = 300.0  # its correlation time [s]
     quantisation: float = 0.0  # step of the values shown [unit]
     delay: float = 0.0  # age of what is shown; the first value is held before the start [s]
@@ -72,7 +74,8 @@ class Mounting(Errors):
     roll: float = 0.0  # of its axes against the body's, right-handed [rad]
     pitch: float = 0.0  # of its axes against the body's, right-handed [rad]
     yaw: float = 0.0  # of its axes against the body's, right-handed [rad]
-    misalignment: float = 0.0  # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
+    # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
+    misalignment: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,14 @@ class Tilt(Errors):
     """
 
     signed: ClassVar[tuple[str, ...]] = ("roll_share",)
-    roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
+    # of the body against the road; also makes the gyros measure about the body's axes instead of
+    # the road's
+    roll: bool = True
     pitch: bool = True  # likewise
     bank: bool = True  # of the road
     grade: bool = True  # of the road
-    # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much a negative share
+    # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one
+    # that corrects too much a negative share
     roll_share: float = 1.0
 
 
@@ -117,20 +123,19 @@ class Reference(Errors):
     """
 
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
-    kind: str = (
-        "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
-    )
+    # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
+    kind: str = "ideal"
     vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
     vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
     yaw_rate: SensorLevel = SensorLevel()  # errors of its gyro [rad/s]
-    # errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here
+    # errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning
+    # here
     heading: SensorLevel = SensorLevel()
     lever_x: float = 0.0  # its place forward of the centre of gravity [m]
     lever_y: float = 0.0  # its place left of the centre of gravity [m]
     lever_z: float = 0.0  # its place above the centre of gravity [m]
-    lever_error: float = (
-        0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
-    )
+    # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
+    lever_error: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -289,7 +294,8 @@ def without_errors(level: Any) -> Any:
             for entry in fields(level)
             if entry.name not in NO_ERRORS
         }
-        return replace(level, **{name: without_errors(value) for name, value in values.items()})  # type: ignore[type-var]
+        ideal: dict[str, Any] = {name: without_errors(value) for name, value in values.items()}
+        return replace(level, **ideal)  # type: ignore[type-var]
     return False if isinstance(level, bool) else 0.0
 
 

@@ -9,14 +9,15 @@ from pathlib import Path
 
 from vehest.data.errors import DataError, printable
 
-_CANDUMP = re.compile(r"\s*\(\d+(\.\d+)?\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
+_CANDUMP = re.compile(r"\s*\([\d.: -]+\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
 _ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
 _NAMES_SIGNAL = re.compile(
     r"(signal|channel|sensor|kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
-    r"topic|tag|key)(_?(name|id))?|\w*_name|name",
+    r"topic|tag|key|pid|messgr(ö|oe)(ß|ss)e|bezeichnung)(_?(name|id))?|\w*_name|name",
     re.IGNORECASE,
 )
-_NAMES_VALUE = re.compile(r"(\w*_)?(value|val|wert|reading)", re.IGNORECASE)
+_NAMES_VALUE = re.compile(r"(\w*_)?(value|val|(mess)?wert|reading|data)", re.IGNORECASE)
+_LINE_PROTOCOL = re.compile(r"[^\s,]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d{10,19})?")
 _NAMES_FRAME = re.compile(
     r"((can|arb(itration)?|frame|msg|message)?[_ ]?id(entifier)?(_?hex)?)", re.IGNORECASE
 )
@@ -48,6 +49,11 @@ def require_columns_of_signals(
             f"'{file}' holds raw frames of a CAN bus as candump writes them; "
             "declare it with the bus's DBC (docs/sources/can.md), or save its decoded signals"
         )
+    if filled and all(map(_LINE_PROTOCOL.fullmatch, filled[:20])):
+        raise DataError(
+            f"'{file}' is in InfluxDB's line protocol; export a table with a column of each field, "
+            "for example by a query that ends in pivot()"
+        )
     if filled and sum(map(bool, map(_ALIGNED.fullmatch, filled))) > 0.9 * len(filled):
         raise DataError(
             f"'{file}' has columns that are aligned by blanks; put one mark between them, "
@@ -74,7 +80,7 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
         if (
             has_id
             and in_bytes
-            and all(_BYTES.fullmatch(cell) or cell.isdigit() for cell in in_bytes)
+            and any(_BYTES.fullmatch(cell) or cell.isdigit() for cell in in_bytes)
         ):
             raise DataError(
                 f"'{file}' holds raw frames of a CAN bus; decode them by the bus's DBC, or save "
@@ -90,7 +96,8 @@ def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
             n_names = len(set(names))
             is_text = not any(name.strip().lstrip("+-")[:1].isdigit() for name in names)
             has_few_names = 1 <= n_names <= len(rows) / MIN_ROWS_OF_SIGNAL
-            if is_text and has_few_names and (n_names > 1 or len(header) <= MAX_COLUMNS):
+            is_certain = n_names > 1 or len(header) <= MAX_COLUMNS or header[k] == "_field"
+            if is_text and has_few_names and is_certain:
                 raise _in_long_format(file, header[k], header[value])
 
 

@@ -1,0 +1,124 @@
+"""Smoothing of a whole drive by the self-calibrating filter."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.estimators.kernels import self_calibrating as kernel
+
+
+class FilterPass(NamedTuple):
+    """The likeliest filter of the bank over a drive of T samples."""
+
+    samples: FloatArray  # yaw rate [rad/s], u [m/s], ay, ax [m/s²] as the filter used them, (T, 4)
+    means: FloatArray  # (T, 8)
+    covariances: FloatArray  # (T, 8, 8)
+    network: FloatArray  # v of the network [m/s], (T,)
+    turning: FloatArray  # change of the low-passed yaw rate in each sample [rad/s], (T,)
+
+
+def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
+    """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
+
+    The filter that is likeliest at the drive's end is smoothed, its parameters included. Network
+    and steady cornering count by their weights at the end.
+
+    Parameters
+    ----------
+    estimator : SelfCalibrating
+        Its settings, priors and network.
+    samples : array
+        Of its channels, (T, C).
+    state : State
+        Before the first of them.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA
+    Journal 3 (8), 1965.
+    """
+    _, _, last_state = estimator.trace(samples, state)
+    likeliest = int(np.argmax(last_state.log_weights))
+    before = state.last.copy()
+    filtered = _filter_pass(estimator, samples, state, likeliest)
+    smoothed = _backward_pass(estimator, filtered, before)
+    n = estimator.numbers()
+    yaw_rate, speed = filtered.samples[:, 0], filtered.samples[:, 1]
+    rear = smoothed[:, 1]
+    shift = n.is_moved * (n.point - rear) * yaw_rate
+    bank = smoothed[:, 0] + shift
+    network = filtered.network + ((rear - n.network_rear) * yaw_rate + shift)
+    steady = yaw_rate * (rear - n.compliance * np.square(speed)) + shift
+    moving = np.clip(speed / n.minimum_speed - 1.0, 0.0, 1.0)
+    shares = last_state.weights * np.column_stack([moving, moving, np.ones(len(speed))])
+    shares[:, kernel.BANK] = 1.0 - shares[:, kernel.NETWORK] - shares[:, kernel.STEADY]
+    values = np.column_stack([bank, network, steady])
+    vy = (shares * values).sum(axis=1)
+    variance = smoothed[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
+    angle_variance = np.square(n.angle_floor * speed)
+    point_variance = np.square(n.point_deviation * yaw_rate)
+    return np.column_stack([vy, variance + angle_variance + point_variance])
+
+
+def _filter_pass(
+    estimator: Any, samples: FloatArray, state: kernel.State, likeliest: int
+) -> FilterPass:
+    """The bank's recursion, one sample after another, with the states of its likeliest filter."""
+    state = kernel.State(*(part.copy() for part in state))
+    rows = estimator.with_ax(samples).copy()
+    means = np.empty((len(rows), kernel.STATES))
+    covariances = np.empty((len(rows), kernel.STATES, kernel.STATES))
+    network = np.empty(len(rows))
+    turning = np.empty(len(rows))
+    scratch = (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
+    for k in range(len(rows)):
+        network[k] = state.lags[kernel.PREDICTED]
+        turning[k] = -state.lags[kernel.YAW_RATE]
+        sample = rows[k : k + 1]
+        kernel.scan(*estimator.recursion_arguments, estimator.network, state, sample, *scratch)
+        turning[k] += state.lags[kernel.YAW_RATE]
+        means[k] = state.means[likeliest]
+        covariances[k] = state.covariances[likeliest]
+        rows[k] = state.last
+    return FilterPass(rows, means, covariances, network, turning)
+
+
+def _backward_pass(estimator: Any, filtered: FilterPass, before: FloatArray) -> FloatArray:
+    """v at the inertial unit, b, and the variance of v at the reference point, smoothed, (T, 3).
+
+    ``before`` is the sample before the first, (4,).
+    """
+    n = estimator.numbers()
+    decay = estimator.decay
+    rows, means, covariances, _, turning = filtered
+    middle = (np.vstack([before, rows[:-1]]) + rows) / 2.0  # yaw rate, u, ay, ax
+    turn = rows[:, 0] * rows[:, 1]
+    turn = (np.append(before[0] * before[1], turn[:-1]) + turn) / 2.0
+    constant = estimator.prior[0] * (1.0 - decay)
+    constant[[kernel.V, kernel.U]] = 0.0
+    noise = np.tile(estimator.noise, (len(rows), 1))
+    noise[:, kernel.V] += n.dt * (n.noise_delay * turning / n.dt * rows[:, 1]) ** 2
+    x = means[-1].copy()
+    p = covariances[-1].copy()
+    smoothed = np.empty((len(rows), 3))
+    row = np.zeros(kernel.STATES)
+    row[kernel.V] = 1.0
+    for k in range(len(rows) - 1, -1, -1):
+        row[kernel.REAR] = -n.is_moved * rows[k, 0]
+        smoothed[k] = x[kernel.V], x[kernel.REAR], row @ p @ row
+        if k == 0:
+            break
+        step = np.eye(kernel.STATES)
+        step[kernel.V, kernel.LEAKAGE] = -n.dt * middle[k, 2]
+        step[kernel.V, kernel.OFFSET_Y] = -n.dt
+        step[kernel.U, kernel.V] = n.dt * middle[k, 0]
+        step[kernel.U, kernel.OFFSET_X] = -n.dt
+        step *= decay[:, None]
+        predicted = step @ means[k - 1] + constant
+        predicted[[kernel.V, kernel.U]] += n.dt * (middle[k, 2] - turn[k]), n.dt * middle[k, 3]
+        spread = step @ covariances[k - 1] @ step.T + np.diag(noise[k])
+        gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
+        x = means[k - 1] + gain @ (x - predicted)
+        p = covariances[k - 1] + gain @ (p - spread) @ gain.T
+    return smoothed

@@ -1,0 +1,5 @@
+"""`python -m vehest_papers.scorecard`."""
+
+from vehest_papers.scorecard.files import main
+
+main()
