@@ -16,6 +16,7 @@ from conftest import planar_drive
 from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
 from vehest.estimators.registry import estimator_names
+from vehest.inference.reading import without_references
 from vehest.run.estimate import estimate_file
 from vehest.run.estimate_summary import describe_use
 from vehest.trust.record import TRUST, read_trust
@@ -336,3 +337,22 @@ def test_damaged_trust_files_are_a_single_clear_line(saved, damage, message):
     file.write_text(damage(file.read_text(encoding="utf-8")), encoding="utf-8")
     saved.refused("estimate", "own", "lap.csv", "-o", "out.csv", code=3, says=(TRUST, message))
     assert not Path("out.csv").exists()
+
+
+def test_transforms_of_references_alone_are_left_out_with_their_channels():
+    dataset = {
+        "channels": {"vx": {"column": "u"}, "yaw_rate_ref": {"column": "r"}},
+        "transforms": [
+            {"name": "bridge_impossible"},
+            {"name": "delay_correction", "delay": 0.024, "channels": ["yaw_rate_ref"]},
+            {"name": "delay_correction", "delay": 0.1, "channels": ["vx", "vy_ref"]},
+            {"name": "offset_correction", "offsets": {"vy_ref": 0.1}},
+        ],
+    }
+    assert without_references(dataset) == {
+        "channels": {"vx": {"column": "u"}},
+        "transforms": [
+            {"name": "bridge_impossible"},
+            {"name": "delay_correction", "delay": 0.1, "channels": ["vx"]},
+        ],
+    }

@@ -56,17 +56,10 @@ def without_references(dataset: Mapping[str, Any]) -> dict[str, Any]:
     channels = dataset.get("channels")
     transforms = dataset.get("transforms")
     if isinstance(channels, dict):
-        channels = {
-            name: entry
-            for name, entry in channels.items()
-            if not str(name).endswith(REFERENCE_SUFFIX)
-        }
+        channels = {name: entry for name, entry in channels.items() if not _names_reference(name)}
     if isinstance(transforms, list | tuple):
-        transforms = [
-            entry
-            for entry in transforms
-            if not (isinstance(entry, dict) and str(entry.get("name")) in OF_REFERENCES)
-        ]
+        measured = [_of_measured(entry) for entry in transforms]
+        transforms = [entry for entry in measured if entry is not None]
     changed = {
         "channels": channels or None,
         "transforms": transforms or None,
@@ -75,6 +68,28 @@ def without_references(dataset: Mapping[str, Any]) -> dict[str, Any]:
     }
     unchanged = {key: value for key, value in dataset.items() if key not in changed}
     return unchanged | {key: value for key, value in changed.items() if value}
+
+
+def _names_reference(name: Any) -> bool:
+    return str(name).endswith(REFERENCE_SUFFIX)
+
+
+def _of_measured(transform: Any) -> Any:
+    """A transform's options for its measured channels; None where it concerns references alone."""
+    if not isinstance(transform, dict):
+        return transform
+    if str(transform.get("name")) in OF_REFERENCES:
+        return None
+    remaining = dict(transform)
+    for key in ("channels", "offsets"):
+        names = transform.get(key)
+        if isinstance(names, dict):
+            remaining[key] = {k: value for k, value in names.items() if not _names_reference(k)}
+        elif isinstance(names, list | tuple):
+            remaining[key] = [name for name in names if not _names_reference(name)]
+        if names and not remaining[key]:  # no channels would mean all measured ones
+            return None
+    return remaining
 
 
 def vehicle_of(dataset: Mapping[str, Any]) -> str:
