@@ -2,4 +2,5 @@
 
 from vehest_papers.scorecard.files import main
 
-main()
+if __name__ == "__main__":
+    main()
