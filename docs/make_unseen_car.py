@@ -28,8 +28,9 @@ from vehest.data.resampling import resampled
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.data_sheet import DataSheet
+from vehest.estimators.filtering.self_calibrating_settings import TYPICAL_REAR, TYPICAL_WHEELBASE
 from vehest.estimators.prior_map import PriorMap
-from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
+from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.inference.car_values import LIMITS, calibrated, with_settings
 from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model

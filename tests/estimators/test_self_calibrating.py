@@ -10,9 +10,10 @@ import pytest
 from slide_drive import slide_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.estimators.filtering.self_calibrating_settings import TYPICAL_REAR
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
-from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
+from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.export.program import method_files
 from vehest.inference.models import pretrained_folder
 
