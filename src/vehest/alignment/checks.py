@@ -349,7 +349,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             at = worst[0] + int(np.argmax(np.abs(samples[worst[0] : worst[1]])))
             unit = CHANNELS[name].unit
             message = (
-                f"{len(spikes)} spike{'s' if len(spikes) > 1 else ''} of at most "
+                f"{number_of(len(spikes), 'spike')} of at most "
                 f"{SPIKE_SECONDS:g} s far outside the usual range ({low:.4g} to {high:.4g} "
                 f"{unit}), "
                 f"the largest {samples[at]:.4g} {unit} at t = {recording.time[at]:.12g} s; "
@@ -365,7 +365,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             begin, end = max(jumps, key=lambda run: run[1] - run[0])
             unit = CHANNELS[name].unit
             message = (
-                f"jumps away and back {len(jumps)} time{'s' if len(jumps) > 1 else ''} within "
+                f"jumps away and back {number_of(len(jumps), 'time')} within "
                 f"{JUMP_SECONDS:g} s, the longest to {samples[begin]:.4g} {unit} for "
                 f"{(end - begin) / recording.rate_hz:.3g} s from "
                 f"t = {recording.time[begin]:.12g} s; mark these samples as missing, "
@@ -438,7 +438,7 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         runs = runs[runs[:, 1] - runs[:, 0] > DROPOUT_SECONDS * recording.rate_hz]
         if len(runs):
             message = (
-                f"{len(runs)} dropout{'s' if len(runs) > 1 else ''}: below "
+                f"{number_of(len(runs), 'dropout')}: below "
                 f"{100 * DROPOUT_SHARE:g} % of the other wheels' speed, "
                 f"the longest {_longest(runs, recording)}"
             )
@@ -459,7 +459,7 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     if len(runs):
         lowest = min(float(recording[speed][begin:end].min()) for begin, end in runs.tolist())
         message = (
-            f"reversing in {len(runs)} segment{'s' if len(runs) > 1 else ''} "
+            f"reversing in {number_of(len(runs), 'segment')} "
             f"(below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
             f"{_longest(runs, recording)}, minimum {lowest:.3g} m/s; most estimators assume "
             "forward "
@@ -495,8 +495,8 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     runs = _lasting_runs(backwards & (recording["vx"] > REVERSE_SPEED), recording)
     if len(runs):
         message = (
-            f"unsigned: positive while the car reverses in {len(runs)} "
-            f"segment{'s' if len(runs) > 1 else ''}, the longest {_longest(runs, recording)}"
+            f"unsigned: positive while the car reverses in "
+            f"{number_of(len(runs), 'segment')}, the longest {_longest(runs, recording)}"
         )
         yield Finding(
             "warning",

@@ -24,7 +24,7 @@ from safetensors.numpy import load_file, save, save_file
 from vehest.artefacts.artefact import TIMINGS, Artefact
 from vehest.artefacts.keys import hash_of
 from vehest.artefacts.locks import Lock, held
-from vehest.data.errors import DataError, VehestError
+from vehest.data.errors import DataError, VehestError, number_of
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
 from vehest.data.text_files import first_line
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS
@@ -226,6 +226,6 @@ def publish_weights(
             )
             return False
     if n_added:
-        number = f"{n_added} model{'s' if n_added > 1 else ''}"
-        messages.line("done", "publish", study, f"{number} added to {weights.path}")
+        added = f"{number_of(n_added, 'model')} added to {weights.path}"
+        messages.line("done", "publish", study, added)
     return True

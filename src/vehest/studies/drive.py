@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.data.errors import printable
+from vehest.data.errors import number_of, printable
 from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.data.store import read_recording
 from vehest.report import figures
@@ -325,14 +325,12 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = (
-        f"{counts[0]} seed{'s' * (counts[0] != 1)} each"
+        f"{number_of(counts[0], 'seed')} each"
         if len(counts) == 1
         else f"{counts[0]} to {counts[-1]} seeds each"
     )
-    words = (
-        f"{len(groups)} estimator{'s were' if len(groups) != 1 else ' was'} compared with "
-        f"{seeds}, {len(artefacts.models)} fits in all"
-    )
+    compared = f"{number_of(len(groups), 'estimator')} {'was' if len(groups) == 1 else 'were'}"
+    words = f"{compared} compared with {seeds}, {len(artefacts.models)} fits in all"
     runs = runs_of(artefacts)
     epochs = np.array(
         [of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models]

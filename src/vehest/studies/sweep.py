@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
+from vehest.data.errors import number_of
 from vehest.data.splits import VALIDATION
 from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
 from vehest.report.style import (
@@ -372,7 +373,7 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
         for name in artefacts.sets
     ]
     seeds = int(row["n_seeds"])
-    words += f", with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
+    words += f", with RMSE(β) = {', '.join(figures)}; {number_of(seeds, 'seed')}."
     mean = float(row[f"{METRIC}.{VALIDATION}"])
     half = float(row[f"{METRIC}_half.{VALIDATION}"])
     if len(table) > 1 and math.isfinite(half):

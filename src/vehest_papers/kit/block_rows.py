@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.errors import number_of
 
 BLOCKS = "blocks"
 TRAINING = "training"
@@ -155,8 +156,8 @@ def checked_training(
     words = (
         f"twice the epochs change the validation error by {100.0 * (after / before - 1.0):+.1f} %"
     )
-    number = f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
-    return TrainingRow(candidate, epochs, epochs_paper, state, f"{words}, {number}")
+    basis = f"{words}, {number_of(len(seeds), 'seed')}"
+    return TrainingRow(candidate, epochs, epochs_paper, state, basis)
 
 
 def names_of_blocks(

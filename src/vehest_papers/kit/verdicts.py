@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, number_of
 from vehest.evaluation.blocks import MIN_BLOCKS
 from vehest.evaluation.significance import (
     CONFIDENCE,
@@ -374,7 +374,7 @@ def _without_single_trainings(
     verdict = judgement.verdict
     if verdict in ("reproduced", "direction only", "contradicted", "met by a trivial baseline"):
         verdict = "no significant difference" if claim.kind == "order" else "inconclusive"
-    words = f"{' and '.join(names)} trained once: two seeds at least are needed"
+    words = f"{' and '.join(names)} with one seed: two at least are needed"
     return replace(judgement, verdict=verdict, reason=f"{judgement.reason}; {words}")
 
 
@@ -397,7 +397,7 @@ def _judge_order(
         return _not_assessed(claim, blocks)
     judgement = _described(claim, pair, blocks)
     if ordered is None:
-        reason = f"{_counted_blocks(pair.n_blocks)} with finite errors above zero: no test"
+        reason = f"{number_of(pair.n_blocks, 'block')} with finite errors above zero: no test"
         return replace(judgement, verdict="no significant difference", reason=reason)
     judgement = replace(
         judgement,
@@ -515,7 +515,9 @@ def _judge_pooled(
         contrast, figure = value_of(errors, claim.metric)
         judgement = _described_single(claim, errors, figure)
     if contrast is None:
-        reason = f"{_counted_blocks(judgement.n_blocks)} with finite errors above zero: no interval"
+        reason = (
+            f"{number_of(judgement.n_blocks, 'block')} with finite errors above zero: no interval"
+        )
         return replace(judgement, verdict="inconclusive", reason=reason)
     verdict, reason = _verdict_of_range(claim, contrast)
     if verdict in ("reproduced", "direction only") and with_baselines:
@@ -646,7 +648,7 @@ def _judge_measured(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Judgemen
     name = claim.candidate or "measured"
     judgement = Judgement(
         "inconclusive",
-        f"{_counted_blocks(measured.n_blocks)} with finite values: no interval",
+        f"{number_of(measured.n_blocks, 'block')} with finite values: no interval",
         {name: measured.figure},
         n_blocks=measured.n_blocks,
         n_seeds={name: measured.n_seeds},
@@ -742,14 +744,10 @@ def _exponential(contrast: Contrast, confidence: float) -> Figure:
     return Figure(math.exp(contrast.value), math.exp(low), math.exp(high))
 
 
-def _counted_blocks(number: int) -> str:
-    return f"{number} block" if number == 1 else f"{number} blocks"
-
-
 def _blocks_needed_text(number: int | None) -> str:
     if number is None:
         return "no number of blocks reaches 80 %: more seeds are needed"
-    return f"{_counted_blocks(number)} needed for 80 %"
+    return f"{number_of(number, 'block')} needed for 80 %"
 
 
 def _short_p(p_value: float) -> str:

@@ -12,6 +12,7 @@ import pandas as pd
 from scipy import stats
 
 from vehest.constants import FloatArray
+from vehest.data.errors import number_of
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import mean_contrast
@@ -167,8 +168,7 @@ def figure(
         grid[0].set_ylabel("friction [1]")
         legend_above(drawn, grid[0], columns=4)
     first = next(iter(next(iter(tracks.values())).values()))
-    n_seeds = len(first.mean)
-    seeds = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
+    seeds = number_of(len(first.mean), "seed")
     caption = (
         f"Friction of {paper.NNTF_UH} over time, mean of all sequences and {seeds}; shaded: 95 % "
         f"interval of the mean over sequences. Grey: not scored. Data: {data}."

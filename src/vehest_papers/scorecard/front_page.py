@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from vehest.data.errors import number_of
 from vehest.report.style import MISSING
 from vehest_papers.kit.block_rows import MAX_IMPROVEMENT
 from vehest_papers.kit.verdicts import ALPHA, TARGET_POWER, VERDICTS
@@ -52,7 +53,7 @@ def front_page(studies: Sequence[Study], results: Path) -> str:
                 "doi": study.paper.doi,
                 "recommendation": recommendation(study),
                 "evidence": evidence(study, N_EVIDENCE_CLAIMS),
-                "open": open_questions(study, _counted_names),
+                "open": open_questions(study, lambda names: number_of(len(names), "method")),
             }
             for study in studies
         ],
@@ -101,10 +102,6 @@ def _counted(claims: pd.DataFrame) -> str:
     if not len(claims):
         return MISSING
     return f"{len(claims)} ({n_provisional})" if n_provisional else str(len(claims))
-
-
-def _counted_names(names: Sequence[str]) -> str:
-    return f"{len(names)} method{'s' if len(names) > 1 else ''}"
 
 
 def _planted_truth(path: Path) -> dict[str, object]:

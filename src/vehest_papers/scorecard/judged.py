@@ -81,10 +81,11 @@ class Study:
         ]
 
     def n_seeds(self) -> dict[str, int]:
-        """Candidate -> seeds that its errors are from, of those that are trained."""
+        """Candidate -> most seeds that any of its errors is from, of those that are trained."""
         numbers: dict[str, int] = {}
         for judgement in [*self.claims.values(), *(entry[2] for entry in self.rows)]:
-            numbers |= judgement.n_seeds or {}
+            for name, number in (judgement.n_seeds or {}).items():
+                numbers[name] = max(number, numbers.get(name, 0))
         return {
             name: number
             for name, number in numbers.items()

@@ -88,7 +88,7 @@ def evidence(study: Study, n_claims: int | None = None) -> str:
         judgement = study.claims[name]
         verdict = in_italics(judgement.verdict, study.is_provisional(claim))
         if any(n_seeds.get(candidate) == 1 for candidate in claim.names):
-            verdict += ", trained once"
+            verdict += ", one seed"
         rows.append(
             (
                 verdict,

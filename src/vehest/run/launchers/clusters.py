@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.artefacts.artefact import MANIFEST, commit, library_versions, read_artefact
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError, MissingError, number_of
 from vehest.data.files import remove_leftovers, written_aside
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.console import Messages
@@ -277,7 +277,7 @@ class RayLauncher:
         self._ray, self._mark = ray, new_mark(self._output)
         self._task = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
-        machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
+        machines = f"{number_of(n_nodes, 'machine')}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _begin(self, position: int, group: Group) -> Any:

@@ -19,7 +19,7 @@ from vehest.configuration.composition import Config, compose_config, key_of
 from vehest.configuration.files import choices
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
-from vehest.data.errors import ConfigurationError, VehestError, printable
+from vehest.data.errors import ConfigurationError, VehestError, number_of, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording_summary import RecordingSummary
@@ -572,10 +572,7 @@ def _limits(drafted: Draft) -> list[str]:
     derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
     missing = [name for name in SCORED if name not in drafted.channels | derived]
     if not missing and _is_too_short(drafted):
-        lengths = (
-            f"{drafted.seconds:.0f} s in {len(drafted.durations)} "
-            f"recording{'s' if len(drafted.durations) > 1 else ''}"
-        )
+        lengths = f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')}"
         return [
             f"{lengths} are too short for training, validation and a test: record two minutes or "
             "more with bends, or three drives or more, "
