@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_planted unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_planted unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare friction_slip
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -183,6 +183,11 @@ own_car_proposals: $(INSTALLED) ## columns that vehest new proposes for twelve l
 
 front_door: $(INSTALLED) ## ten logs as users bring them, from vehest new to a verdict; needs VEHEST_DATA (40 minutes)
 	PYTHONPATH=tests/proposals $(BIN)/python tests/proposals/front_door.py
+
+friction_slip: $(INSTALLED) ## how much the estimated friction widens the learned UKF's bands: two trainings on simulated tyres, then drives on others (20 minutes)
+	VEHEST_OUTPUT=$${VEHEST_OUTPUT:-outputs}/friction_slip $(BIN)/vehest sweep split=sim_tyre_sets estimator=learned_ukf training.one_step.max_epochs=500 \
+	  training.through.max_epochs=300 training.batch_size=6 training.through.learning_rate=2.0e-3 'seed=0,1' tracking=none
+	$(BIN)/python tools/choose_friction_slip.py "$${VEHEST_OUTPUT:-outputs}"/friction_slip/train/sim_tyre_sets/*/
 
 unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that were not used for training (results/unseen_car); needs VEHEST_DATA, and committed choices
 	$(BIN)/python docs/make_unseen_car.py
