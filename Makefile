@@ -187,7 +187,7 @@ front_door: $(INSTALLED) ## ten logs as users bring them, from vehest new to a v
 friction_slip: $(INSTALLED) ## how much the estimated friction widens the learned UKF's bands: two trainings on simulated tyres, then drives on others (20 minutes)
 	VEHEST_OUTPUT=$${VEHEST_OUTPUT:-outputs}/friction_slip $(BIN)/vehest sweep split=sim_tyre_sets estimator=learned_ukf training.one_step.max_epochs=500 \
 	  training.through.max_epochs=300 training.batch_size=6 training.through.learning_rate=2.0e-3 'seed=0,1' tracking=none
-	$(BIN)/python tools/choose_friction_slip.py "$${VEHEST_OUTPUT:-outputs}"/friction_slip/train/sim_tyre_sets/*/
+	$(BIN)/python tools/choose_friction_slip.py "$${VEHEST_OUTPUT:-outputs}"/friction_slip/train/learned_ukf-nntf_uh-seed*
 
 unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that were not used for training (results/unseen_car); needs VEHEST_DATA, and committed choices
 	$(BIN)/python docs/make_unseen_car.py
