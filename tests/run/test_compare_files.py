@@ -67,6 +67,22 @@ def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_pat
     assert "outside the possible range" in message
 
 
+def test_an_angle_at_standstill_is_no_velocity_and_other_tools_have_an_angle_to_draw(
+    drive, tmp_path
+):
+    """At 0.05 m/s an angle of 89.9 degrees would be 29 m/s."""
+    is_standing = drive.time > 110.0
+    stopped = {"vx": 0.05, "vy_ref": 0.0, "yaw_rate": 0.0}
+    channels = {name: np.where(is_standing, value, drive[name]) for name, value in stopped.items()}
+    stopped_drive = replace(drive, channels={**drive.channels, **channels})
+    beta = np.where(is_standing, np.radians(89.9), np.arctan2(drive["vy_ref"], drive["vx"]))
+    file = tmp_path / "angle.csv"
+    pd.DataFrame({"time": drive.time, "beta": beta}).to_csv(file, index=False)
+    estimate = read_estimate_table(file, stopped_drive)
+    assert estimate["vy"] == pytest.approx(channels["vy_ref"], abs=1e-6)
+    assert estimate["sideslip"][~is_standing] == pytest.approx(beta[~is_standing], abs=1e-6)
+
+
 def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, tmp_path):
     """Ten seconds at standstill, at which 0.02 m/s of v are an angle of any size."""
     is_standing = drive.time > 110.0

@@ -20,19 +20,17 @@ from vehest.alignment.checks import refuse_errors
 from vehest.configuration.estimate_options import estimate_options
 from vehest.configuration.files import is_file_name
 from vehest.constants import FloatArray
-from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
 from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
 from vehest.data.resampling import resampled
-from vehest.data.schema import validated
 from vehest.data.splits import Span
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
-from vehest.inference.car_values import adapted
+from vehest.inference.car_values import adapted, stated_wheelbase
 from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
@@ -117,12 +115,7 @@ def compare_files(
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, options.same_vehicle
             )
-        wheelbase = drive.car.wheelbase
-        if "wheelbase" in settings:
-            of_command = {"wheelbase": settings["wheelbase"]}
-            wheelbase = validated(
-                CarValues, of_command, "", error=ConfigurationError, group="estimator"
-            ).wheelbase
+        wheelbase = stated_wheelbase(drive.car, settings)
         comparison = compare_estimates(drive, estimates, wheelbase, trained_here)
     for text in notes:
         note(text)
