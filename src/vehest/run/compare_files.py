@@ -54,6 +54,7 @@ from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 MIN_COMMON_SECONDS = 5.0
 MIN_RATE_HZ = 1.0  # Hz
+BASELINES = ("zero", "static_map")  # rows of every comparison
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -102,9 +103,10 @@ def compare_files(
             complain(f"warning: '{recording}': {finding}")
         _check_rows([*(file.stem for file in files), *models])
         _check_columns(named_columns, files)
-        estimates = {
+        tables = {
             file.stem: read_estimate_table(file, drive, named_columns, seconds) for file in files
         }
+        estimates = _named_by_estimator(tables, models)
         for name in models:
             folder, model, trust = open_model(name, options.output, note)
             model, trust, remarks = adapted(model, trust, drive.car, settings)
@@ -150,6 +152,20 @@ def _check_rows(names: Sequence[str]) -> None:
             )
 
 
+def _named_by_estimator(
+    tables: Mapping[str, Estimate], models: Sequence[str]
+) -> dict[str, Estimate]:
+    """Estimates by the estimator that their tables record; by the file's name where a table records
+    none, or where the estimator names another row, too.
+    """
+    names = Counter([*(estimate.estimator for estimate in tables.values()), *models, *BASELINES])
+    names.update(stem for stem, estimate in tables.items() if stem != estimate.estimator)
+    return {
+        estimate.estimator if names[estimate.estimator] == 1 else stem: estimate
+        for stem, estimate in tables.items()
+    }
+
+
 def _check_columns(columns: Sequence[NamedColumn], files: Sequence[Path]) -> None:
     """Refuse a column of ``--column`` that no file has."""
     if not columns:
@@ -190,7 +206,7 @@ def compare_estimates(
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
-    if reserved := {"zero", "static_map"} & set(estimates):
+    if reserved := set(BASELINES) & set(estimates):
         raise ConfigurationError(
             f"an estimate cannot be called '{min(reserved)}', which is a baseline; rename its file"
         )
