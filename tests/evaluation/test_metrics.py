@@ -21,7 +21,9 @@ from vehest.evaluation.metrics import (
     Protocol,
     Scored,
     accuracy,
+    is_fast_enough,
     min_sideslip_speed,
+    moves_forward,
     score,
     weighted_errors,
 )
@@ -364,3 +366,32 @@ def test_distribution_counts_errors_in_bins_of_a_quarter_of_a_degree():
         pytest.approx(3.0),
     )
     assert "no sample has a lateral acceleration" in refusal(lambda: error_distribution([CALM]))
+
+
+def test_an_estimate_moves_forward_by_its_velocity_and_angle():
+    vx = np.array([0.99, 1.01, 0.6, -3.0, 0.05, 2.0, 2.0])
+    vy = np.array([0.0, 0.0, 0.81, 0.1, 0.01, np.nan, -0.5])
+    is_forward = moves_forward(vy[2:], np.arctan2(vy, vx)[2:], 1.0)
+    assert is_forward.tolist() == [False, False, False, False, True]
+    assert moves_forward(vy[:2], np.arctan2(vy, vx)[:2], 1.0).all()  # v = 0: β = 0 at any speed
+    assert not moves_forward(np.array([0.1]), np.zeros(1), 1.0).any()  # standstill
+    assert not moves_forward(np.zeros(1), np.arctan2(np.zeros(1), -np.ones(1)), 1.0).any()
+
+
+def test_sideslip_in_reverse_is_scored_within_a_half_turn_and_not_drawn():
+    vx = np.array([5.0, -5.0, 0.2])
+    vy = np.array([0.1, 0.1, 0.1])
+    vy_ref = np.array([-0.1, -0.1, -0.1])
+    scored = Scored(
+        np.arange(3.0),
+        vy,
+        vy_ref,
+        np.arctan2(vy, vx),
+        np.arctan2(vy_ref, vx),
+        np.zeros(3),
+        is_fast_enough(vx, vy_ref, 1.0),
+    )
+    turn = 2.0 * np.arctan2(0.1, 5.0)
+    assert scored.sideslip_error[:2] == pytest.approx([turn, -turn])
+    assert scored.is_sideslip_scored.tolist() == [True, True, False]
+    assert scored.is_sideslip_drawn.tolist() == [True, False, False]

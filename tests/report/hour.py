@@ -51,6 +51,7 @@ def hour_of_driving():
         columns[f"health{i}"] = np.where(np.sin(0.02 * time + i) > 0.97, 1.0, 0.0) + np.where(
             np.sin(0.02 * time + i) > 0.995, 1.0, 0.0
         )
+    columns["scored"] = np.ones(len(time))
     columns["x"], columns["y"] = reckoned_course(vx, vy, yaw_rate, 1.0 / RATE)
     looks = [
         {"label": title, "colour": colour, "dark": on_dark(colour), "dash": "solid"}

@@ -67,7 +67,7 @@ def test_reference_lies_below_the_estimates_and_is_wider():
     reference = traces("measured", REFERENCE, 1.0)
     estimate = traces("GRU", GRU, 0.9)
     for axes in (
-        *traces_figure(TIME, reference, [estimate], "time [s]").axes,
+        *traces_figure(TIME, reference, [estimate], [0.1], "time [s]").axes,
         zoom_figure(TIME, None, reference, [estimate], "time [s]").axes[0],
     ):
         (below,) = [line for line in axes.lines if line.get_color() == REFERENCE_GREY]

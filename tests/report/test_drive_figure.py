@@ -137,3 +137,28 @@ def test_a_notebook_shows_it_and_the_same_drive_gives_the_same_bytes(drive):
     picture = drive_figure(drive, [estimate_of(drive)])._repr_png_()
     assert picture.startswith(b"\x89PNG")
     assert drive_figure(drive, [estimate_of(drive)])._repr_png_() == picture
+
+
+def standing_and_reversing():
+    """A car that drives, stands with a speed that wanders around zero, and reverses; 10 s each."""
+    n = round(10.0 * RATE)
+    rng = np.random.default_rng(4)
+    vx = np.concatenate([np.full(n, 10.0), rng.normal(0.0, 0.15, n), np.full(n, -3.0)])
+    vy = np.concatenate([np.full(n, 0.5), rng.normal(0.0, 0.02, n), rng.normal(0.0, 0.02, n)])
+    channels = {"vx": vx, "yaw_rate": np.zeros(3 * n), "vy_ref": vy}
+    return Recording("yard", "car", RATE, 0.0, channels), n
+
+
+@pytest.mark.parametrize("has_reference", [True, False])
+def test_standstill_and_reverse_neither_draw_sideslip_nor_set_its_axis(has_reference):
+    recording, n = standing_and_reversing()
+    estimate = estimate_of(recording)
+    assert np.degrees(np.abs(estimate["sideslip"])).max() > 170.0
+    drawn = recording if has_reference else recording.without_references()
+    for figure in (drive_figure(drawn, [estimate]), drive_figure(None, [estimate])):
+        axes = axes_of(figure, "sideslip β [deg]")
+        (line,) = [line for line in axes.get_lines() if line.get_label() == "mine"]
+        is_drawn = np.isfinite(line.get_ydata())
+        assert is_drawn.tolist() == [True] * n + [False] * (2 * n)
+        assert line.get_ydata()[0] == pytest.approx(np.degrees(np.arctan2(0.6, 10.0)))
+        assert np.abs(axes.get_ylim()).max() < 10.0

@@ -16,7 +16,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
-from vehest.run.compare_files import compare_estimates, compare_files
+from vehest.run.compare_files import _named_by_estimator, compare_estimates, compare_files
 from vehest.run.estimate_tables import parse_columns, parse_shift, read_estimate_table
 from vehest.run.inspect_data import check
 
@@ -65,6 +65,22 @@ def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_pat
     assert "nameless.csv': column 'beta', read as sideslip_ref: " in message
     assert message.count("warning: ") == 1
     assert "outside the possible range" in message
+
+
+def test_an_angle_at_standstill_is_no_velocity_and_other_tools_have_an_angle_to_draw(
+    drive, tmp_path
+):
+    """At 0.05 m/s an angle of 89.9 degrees would be 29 m/s."""
+    is_standing = drive.time > 110.0
+    stopped = {"vx": 0.05, "vy_ref": 0.0, "yaw_rate": 0.0}
+    channels = {name: np.where(is_standing, value, drive[name]) for name, value in stopped.items()}
+    stopped_drive = replace(drive, channels={**drive.channels, **channels})
+    beta = np.where(is_standing, np.radians(89.9), np.arctan2(drive["vy_ref"], drive["vx"]))
+    file = tmp_path / "angle.csv"
+    pd.DataFrame({"time": drive.time, "beta": beta}).to_csv(file, index=False)
+    estimate = read_estimate_table(file, stopped_drive)
+    assert estimate["vy"] == pytest.approx(channels["vy_ref"], abs=1e-6)
+    assert estimate["sideslip"][~is_standing] == pytest.approx(beta[~is_standing], abs=1e-6)
 
 
 def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, tmp_path):
@@ -433,3 +449,16 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
         place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1]
         == "error: name at least one estimate to compare"
     )
+
+
+def test_a_row_is_named_by_the_estimator_that_its_table_records(drive):
+    def by(estimator):
+        zeros = np.zeros(len(drive))
+        return Estimate(drive.id, estimator, drive.rate_hz, 0.0, {"vy": zeros, "sideslip": zeros})
+
+    alone = _named_by_estimator({"out": by("ksnn"), "mine": by("mine")}, ["gru-seed0"])
+    assert list(alone) == ["ksnn", "mine"]
+    twice = _named_by_estimator({"out": by("ksnn"), "before": by("ksnn")}, [])
+    assert list(twice) == ["out", "before"]
+    taken = {"out": by("ksnn"), "still": by("zero"), "ksnn": by("other")}
+    assert list(_named_by_estimator(taken, [])) == ["out", "still", "other"]

@@ -53,6 +53,25 @@ def lap(changes=None):
     )
 
 
+def test_the_stated_range_of_sideslip_leaves_out_standstill_and_reverse(saved):
+    drive = drive_of(4)
+    time = drive.time
+    wandering = np.random.default_rng(2).normal(0.0, 0.3, len(time))
+    lap({"vx": np.where(time < 15.0, drive["vx"], np.where(time < 22.0, wandering, -2.0))})
+    out, _ = saved.done("estimate", "own", "lap.csv", "dataset.accept=[sign]", "--json")
+    outcome = json.loads(out)
+    angles = pd.read_parquet("estimate.parquet")["sideslip_deg"]
+    assert angles.abs().max() > 170.0
+    assert outcome["min_sideslip_speed"] == 1.0
+    assert outcome["sideslip_deg"]["max"] < 45.0
+    assert outcome["sideslip_deg"]["min"] == pytest.approx(
+        angles[(angles.index < 1500)].min(), abs=0.01
+    )
+    lap({"vx": np.zeros(len(time))})
+    out, _ = saved.done("estimate", "own", "lap.csv", "dataset.accept=[sign]")
+    assert "sideslip  never forward at 1 m/s or more" in out
+
+
 def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved):
     for changes in ({}, {"vx_ref": np.zeros(3000)}):  # which the model does not read
         lap(changes)

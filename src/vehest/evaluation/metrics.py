@@ -241,6 +241,19 @@ class Scored:
         pairs = {**self.other_states, "vy": (self.vy, self.vy_ref)}
         return {name: pairs[name][0] - pairs[name][1] for name in REFERENCES if name in pairs}
 
+    @property
+    def sideslip_error(self) -> FloatArray:
+        """Estimate - reference of β within a half turn, (K,) [rad]; at all samples."""
+        return _turned(self.sideslip - self.sideslip_ref)
+
+    @property
+    def is_sideslip_drawn(self) -> BoolArray:
+        """Whether β is drawn, (K,): where it is scored and the car moves forward.
+
+        In reverse β jumps between -180° and 180°, which would set the axis; it is scored there.
+        """
+        return self.is_sideslip_scored & (np.abs(self.sideslip_ref) <= 0.5 * np.pi)
+
     def at(self, chosen: BoolArray | slice) -> Scored:
         """Lateral velocity and sideslip at some of the samples; without other states, covariances,
         innovations and bands.
@@ -477,6 +490,29 @@ def is_fast_enough(vx: FloatArray, vy_ref: FloatArray, min_speed: float) -> Bool
     return np.asarray(np.hypot(vx, vy_ref) >= min_speed)
 
 
+def moves_forward(vy: FloatArray, sideslip: FloatArray, min_speed: float) -> BoolArray:
+    """Whether an estimated sideslip is stated and drawn: u is ``min_speed`` or more.
+
+    Since β = atan2(v, u), the measured u is v/tan β: an estimate needs no further channel. A β of
+    0 with v other than 0 is standstill (`STANDSTILL_SPEED`); both are 0 at any speed, and pass.
+
+    Parameters
+    ----------
+    vy, sideslip : FloatArray
+        Estimates of v [m/s] and β [rad], (K,).
+    min_speed : float
+        Speed from which on sideslip is scored [m/s] (`min_sideslip_speed`).
+
+    Returns
+    -------
+    BoolArray
+        Shape (K,); False in reverse, where β jumps between -180° and 180°, and where v is NaN.
+    """
+    is_standing = (sideslip == 0.0) & (vy != 0.0)
+    is_fast = np.abs(vy) * np.cos(sideslip) >= min_speed * np.abs(np.sin(sideslip))
+    return np.asarray(is_fast & ~is_standing)
+
+
 def _require_all(values: FloatArray, problem: str, span: Span) -> None:
     """Raise `DataError` where a value is NaN; ``problem`` begins the message."""
     missing = int(np.isnan(values).sum())
@@ -506,9 +542,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """
     vy = np.concatenate([part.vy for part in parts])
     vy_ref = np.concatenate([part.vy_ref for part in parts])
-    error = np.degrees(
-        np.concatenate([_turned(part.sideslip - part.sideslip_ref) for part in parts])
-    )
+    error = np.degrees(np.concatenate([part.sideslip_error for part in parts]))
     nonlinear = np.abs(np.concatenate([part.ay for part in parts])) >= NONLINEAR_AY
     is_scored = np.concatenate([part.is_sideslip_scored for part in parts])
     scored = error[is_scored] if is_scored.any() else np.full(1, np.nan)

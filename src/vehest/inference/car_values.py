@@ -79,6 +79,22 @@ class CarRecord:
             )
 
 
+def stated_wheelbase(car: CarValues, settings: Mapping[str, Any]) -> float | None:
+    """Wheelbase [m] by the settings of the command line, or else by the data set; None: neither.
+
+    Raises
+    ------
+    ConfigurationError
+        The setting is no wheelbase.
+    """
+    if "wheelbase" not in settings:
+        return car.wheelbase
+    of_command = {"wheelbase": settings["wheelbase"]}
+    return validated(
+        CarValues, of_command, "", error=ConfigurationError, group="estimator"
+    ).wheelbase
+
+
 def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     """The filter with some settings changed.
 

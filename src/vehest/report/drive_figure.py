@@ -27,6 +27,7 @@ from vehest.evaluation.metrics import (
     accuracy,
     is_fast_enough,
     min_sideslip_speed,
+    moves_forward,
     score_whole,
     with_vy_ref,
 )
@@ -108,7 +109,8 @@ def drive_figure(
 
     Sideslip with the 90 % band and the health of the first estimate; lateral velocity; the measured
     channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over
-    reference. What is not there is left out.
+    reference. What is not there is left out. β is drawn where the car moves forward at the speed
+    from which on it is scored (`min_sideslip_speed`).
 
     Parameters
     ----------
@@ -170,6 +172,8 @@ def _drive_of(
     names = [estimate.estimator for estimate in estimates]
     lines = lines_of(dict.fromkeys((name, "") for name in names))
     traces = []
+    reference = _reference_of(recording)
+    min_speed = _min_speed(recording)
     for place, estimate in enumerate(estimates):
         name = names[place]
         count = names[:place].count(name)  # earlier estimates of the same estimator
@@ -179,7 +183,7 @@ def _drive_of(
                 f"{_title_of(name)} ({count + 1})" if count else _title_of(name),
                 replace(line, dash=DASHES[count % len(DASHES)]) if count else line,
                 _at(time, estimate, "vy"),
-                np.degrees(_at(time, estimate, "sideslip")),
+                _drawn_sideslip(time, estimate, min_speed, reference),
             )
         )
     band = health = None
@@ -196,7 +200,26 @@ def _drive_of(
     if time[0] >= MIN_UNIX_SECONDS:
         time = time - time[0]
         time_label = "time after the start [s]"
-    return Drive(title, time, time_label, recording, _reference_of(recording), traces, band, health)
+    return Drive(title, time, time_label, recording, reference, traces, band, health)
+
+
+def _min_speed(recording: Recording | None) -> float:
+    """Speed from which on sideslip is drawn [m/s]."""
+    return min_sideslip_speed(None if recording is None else recording.car.wheelbase)
+
+
+def _drawn_sideslip(
+    time: FloatArray, estimate: Estimate, min_speed: float, reference: Traces | None
+) -> FloatArray:
+    """Estimated β at some times, (K,) [deg]; NaN where it is not drawn.
+
+    Where the reference has v, that decides, as in scores, else the measured u.
+    """
+    is_forward = moves_forward(estimate["vy"], estimate["sideslip"], min_speed)
+    is_drawn = np.interp(time, estimate.time, is_forward.astype(np.float64)) == 1.0
+    if reference is not None:
+        is_drawn = np.where(np.isfinite(reference.vy), np.isfinite(reference.sideslip), is_drawn)
+    return np.where(is_drawn, np.degrees(_at(time, estimate, "sideslip")), np.nan)
 
 
 def _at(time: FloatArray, estimate: Estimate, name: str) -> FloatArray:
@@ -210,13 +233,13 @@ def _title_of(estimator: str) -> str:
 
 
 def _reference_of(recording: Recording | None) -> Traces | None:
-    """Reference v and β, which is NaN where the car is too slow for it to be scored."""
+    """Reference v and β, which is NaN where the car is too slow for a score, or reverses."""
     if recording is None or not {"vx", "vy_ref"} <= recording.channels.keys():
         return None
     vx = recording["vx"]
     vy = recording["vy_ref"]
-    is_fast = is_fast_enough(vx, vy, min_sideslip_speed(recording.car.wheelbase))
-    sideslip = np.where(is_fast, np.degrees(np.arctan2(vy, vx)), np.nan)
+    is_drawn = is_fast_enough(vx, vy, _min_speed(recording)) & (vx >= 0.0)
+    sideslip = np.where(is_drawn, np.degrees(np.arctan2(vy, vx)), np.nan)
     return Traces("reference", REFERENCE, vy, sideslip)
 
 
@@ -287,7 +310,8 @@ def _draw_course(recording: Recording, motion: Traces, axes: Axes) -> None:
     x, y = reckoned_course(recording["vx"], motion.vy, recording["yaw_rate"], step)
     stride = max(len(x) // MAX_POINTS, 1)
     points = np.stack([x, y], axis=1)[::stride]
-    colours = LinearSegmentedColormap.from_list("sideslip", COURSE_COLOURS)
+    scale = LinearSegmentedColormap.from_list("sideslip", COURSE_COLOURS)
+    colours = scale.with_extremes(bad=COURSE_COLOURS[1])
     limit = float(np.nanquantile(np.abs(motion.sideslip), 0.995)) or 1.0
     course = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
@@ -313,7 +337,7 @@ def _draw_course(recording: Recording, motion: Traces, axes: Axes) -> None:
 
 def _draw_errors(estimates: Sequence[Traces], scored: Sequence[Scored], axes: Axes) -> None:
     for traces, part in zip(reversed(estimates), reversed(scored), strict=True):
-        chosen = part.is_sideslip_scored
+        chosen = part.is_sideslip_drawn
         draw_cloud(
             axes,
             Cloud(

@@ -4,6 +4,7 @@ rows that pass a filter.
 Values are kept in 16 bits over their range, as differences between neighbours, compressed: an hour
 at 20 Hz of eight estimates with their bands and ten channels takes some 4 MB of the page. The page
 unpacks them by itself; sideslip is computed there as everywhere, atan2(v, u) with the measured u.
+It is drawn where it is scored and the car moves forward.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray |
     """What the page reads of ``columns``, (K,) each or None, and of how they are called and drawn;
     it cannot end a script element.
 
-    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; of each
+    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; ``scored``: 1
+    where sideslip is scored, else 0; of each
     candidate ``vy0`` [m/s], half widths of its 90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg],
     ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
     """

@@ -50,14 +50,18 @@ class Traces:
 
 
 def traces_figure(
-    time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str
+    time: FloatArray,
+    reference: Traces,
+    estimates: Sequence[Traces],
+    rmse_sideslip: Sequence[float],
+    time_label: str,
 ) -> MatplotlibFigure:
     """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator:
-    lateral velocity left, sideslip right.
+    lateral velocity left, sideslip right, with its RMSE [deg].
     """
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
-        for (left, right), estimate in zip(grid, estimates, strict=True):
+        for (left, right), estimate, rmse in zip(grid, estimates, rmse_sideslip, strict=True):
             for axes, measured, estimated in (
                 (left, reference.vy, estimate.vy),
                 (right, reference.sideslip, estimate.sideslip),
@@ -76,12 +80,7 @@ def traces_figure(
                 fontsize=7.5,
                 fontweight="bold",
             )
-            right.set_title(
-                f"RMSE(β) {significant(_rms(estimate.sideslip - reference.sideslip))}°",
-                loc="right",
-                pad=2.0,
-                fontsize=7.0,
-            )
+            right.set_title(f"RMSE(β) {significant(rmse)}°", loc="right", pad=2.0, fontsize=7.0)
         for column, label in enumerate(("lateral velocity [m/s]", "sideslip angle [deg]")):
             grid[-1][column].set_xlabel(time_label)
             grid[(len(estimates) - 1) // 2][column].set_ylabel(label)
@@ -179,7 +178,7 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
         for name, line, error in reversed(estimates):
             counts, _ = np.histogram(np.clip(error, -limit, limit), edges)
             density = counts / len(error) / np.diff(edges)
-            label = f"{name}: {significant(_rms(error))}°"
+            label = f"{name}: {significant(root_mean_square(error))}°"
             axes.stairs(
                 density, edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=label
             )
@@ -407,5 +406,6 @@ def _legend_width(labels: Sequence[str], columns: int) -> float:
     return sum(0.54 + 0.052 * width for width in widths)
 
 
-def _rms(values: FloatArray) -> float:
+def root_mean_square(values: FloatArray) -> float:
+    """Root mean square, gaps left out."""
     return float(np.sqrt(np.nanmean(np.square(values))))

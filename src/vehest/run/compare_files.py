@@ -20,19 +20,17 @@ from vehest.alignment.checks import refuse_errors
 from vehest.configuration.estimate_options import estimate_options
 from vehest.configuration.files import is_file_name
 from vehest.constants import FloatArray
-from vehest.data.car import CarValues
 from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
 from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
 from vehest.data.resampling import resampled
-from vehest.data.schema import validated
 from vehest.data.splits import Span
 from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, min_sideslip_speed, score
 from vehest.evaluation.ranking import rank
-from vehest.inference.car_values import adapted
+from vehest.inference.car_values import adapted, stated_wheelbase
 from vehest.inference.estimation import estimate_recording
 from vehest.inference.models import is_training_recording, open_model
 from vehest.report.style import MISSING
@@ -56,6 +54,7 @@ from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 MIN_COMMON_SECONDS = 5.0
 MIN_RATE_HZ = 1.0  # Hz
+BASELINES = ("zero", "static_map")  # rows of every comparison
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -104,9 +103,10 @@ def compare_files(
             complain(f"warning: '{recording}': {finding}")
         _check_rows([*(file.stem for file in files), *models])
         _check_columns(named_columns, files)
-        estimates = {
+        tables = {
             file.stem: read_estimate_table(file, drive, named_columns, seconds) for file in files
         }
+        estimates = _named_by_estimator(tables, models)
         for name in models:
             folder, model, trust = open_model(name, options.output, note)
             model, trust, remarks = adapted(model, trust, drive.car, settings)
@@ -117,12 +117,7 @@ def compare_files(
             estimates[name] = estimate_recording(
                 model, drive.without_references(), trust, options.same_vehicle
             )
-        wheelbase = drive.car.wheelbase
-        if "wheelbase" in settings:
-            of_command = {"wheelbase": settings["wheelbase"]}
-            wheelbase = validated(
-                CarValues, of_command, "", error=ConfigurationError, group="estimator"
-            ).wheelbase
+        wheelbase = stated_wheelbase(drive.car, settings)
         comparison = compare_estimates(drive, estimates, wheelbase, trained_here)
     for text in notes:
         note(text)
@@ -155,6 +150,20 @@ def _check_rows(names: Sequence[str]) -> None:
                 f"{count} estimates are called '{name}'; rename a file or leave one out, since the "
                 "name stands for the row"
             )
+
+
+def _named_by_estimator(
+    tables: Mapping[str, Estimate], models: Sequence[str]
+) -> dict[str, Estimate]:
+    """Estimates by the estimator that their tables record; by the file's name where a table records
+    none, or where the estimator names another row, too.
+    """
+    names = Counter([*(estimate.estimator for estimate in tables.values()), *models, *BASELINES])
+    names.update(stem for stem, estimate in tables.items() if stem != estimate.estimator)
+    return {
+        estimate.estimator if names[estimate.estimator] == 1 else stem: estimate
+        for stem, estimate in tables.items()
+    }
 
 
 def _check_columns(columns: Sequence[NamedColumn], files: Sequence[Path]) -> None:
@@ -197,7 +206,7 @@ def compare_estimates(
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
-    if reserved := {"zero", "static_map"} & set(estimates):
+    if reserved := set(BASELINES) & set(estimates):
         raise ConfigurationError(
             f"an estimate cannot be called '{min(reserved)}', which is a baseline; rename its file"
         )

@@ -27,7 +27,8 @@ from vehest.data.recording import Recording, joined
 from vehest.data.resampling import resampled_parts
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
-from vehest.inference.car_values import adapted, read_car
+from vehest.evaluation.metrics import min_sideslip_speed, moves_forward
+from vehest.inference.car_values import adapted, read_car, stated_wheelbase
 from vehest.inference.estimation import estimate_parts, too_short_error
 from vehest.inference.models import (
     SELF_CALIBRATING,
@@ -122,7 +123,8 @@ def estimate_file(
                 "estimate"
             )
         run = GuardedRun(model, trust, elsewhere=elsewhere)
-        report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
+        min_speed = min_sideslip_speed(stated_wheelbase(first.car, settings))
+        report = _Report(model, trust, accepted, min_speed, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, first_findings)], parts))
         if writes_log or not run.takes_parts:
             first = joined(list(drive))
@@ -273,15 +275,23 @@ class _Report:
         That estimate it.
     accepted : Sequence[str]
         Checks whose contradictions do not count.
+    min_sideslip_speed : float
+        Speed from which on the range of β is stated [m/s].
     strict : str or None
         Name of the file if findings are an error.
     """
 
     def __init__(
-        self, model: Estimator, trust: Trust | None, accepted: Sequence[str], strict: str | None
+        self,
+        model: Estimator,
+        trust: Trust | None,
+        accepted: Sequence[str],
+        min_sideslip_speed: float,
+        strict: str | None,
     ) -> None:
         self.model = model
         self.accepted = accepted
+        self.min_sideslip_speed = min_sideslip_speed
         self.strict = strict
         self.health = trust.health if trust is not None else None
         self.findings: list[list[Finding]] = []
@@ -314,8 +324,10 @@ class _Report:
         for part in parts:
             self.last = part
             is_estimated = ~np.isnan(part["vy"])
-            degrees = np.degrees(part["sideslip"])
-            self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
+            is_stated = moves_forward(part["vy"], part["sideslip"], self.min_sideslip_speed)
+            if is_stated.any():
+                degrees = np.degrees(part["sideslip"][is_stated])
+                self.extremes += [float(degrees.min()), float(degrees.max())]
             self.samples, self.estimated = (
                 self.samples + len(part),
                 self.estimated + int(is_estimated.sum()),
@@ -350,9 +362,10 @@ class _Report:
             "outside_training": self.outside_training,
             "has_calibration": self.health is not None,
             "quantities": {name: QUANTITIES[name] for name in last.channels},
+            "min_sideslip_speed": self.min_sideslip_speed,
             "sideslip_deg": {
-                end: round(float(take.reduce(self.extremes)), 3)
-                for end, take in (("min", np.fmin), ("max", np.fmax))
+                end: round(take(self.extremes), 3) if self.extremes else None
+                for end, take in (("min", min), ("max", max))
             },
         }
         if "band_sideslip" in last.channels:

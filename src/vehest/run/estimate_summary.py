@@ -79,11 +79,10 @@ def has_unknown_reference_point(dataset: str) -> bool:
 
 def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
     """Lines for a terminal from the outcome of `vehest.run.estimate.estimate_file`."""
-    sideslip = outcome["sideslip_deg"]
     rows = {
         "estimate": f"{outcome['recording']} by {outcome['model']}: {outcome['seconds']:.4g} s, "
         f"{outcome['estimated']} of {outcome['samples']} samples at {outcome['rate_hz']:g} Hz",
-        "sideslip": f"{sideslip['min']:.2f}° to {sideslip['max']:.2f}°{_band(outcome)}",
+        "sideslip": f"{_sideslip(outcome)}{_band(outcome)}",
         "bands": outcome.get("band", ""),
         "valid": _valid(outcome),
         "range": _range(outcome),
@@ -160,6 +159,14 @@ def _columns(out: Path) -> str:
     if out.suffix.lower() in LOG_SUFFIXES:
         return ""
     return " (vy [m/s], sideslip [rad], sideslip_deg [deg], half widths of the band, health)"
+
+
+def _sideslip(outcome: Mapping[str, Any]) -> str:
+    """Range of the sideslip angle where the car moves forward and fast enough."""
+    low, high = (outcome["sideslip_deg"][end] for end in ("min", "max"))
+    if low is None:
+        return f"never forward at {outcome['min_sideslip_speed']:.3g} m/s or more"
+    return f"{low:.2f}° to {high:.2f}°"
 
 
 def _band(outcome: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording, merged_findings
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -108,7 +109,7 @@ def read_estimate_table(
 
     Columns are found by name, whatever their case; a unit in brackets or at the end of a name
     counts, else v is in m/s and β in rad. Where only β is there, v = u tan β with the recording's
-    u. Prints a warning where unit or sign contradict the recording.
+    u, and 0 at standstill. Prints a warning where unit or sign contradict the recording.
 
     Parameters
     ----------
@@ -155,15 +156,17 @@ def read_estimate_table(
     table = read_single(options, file)
     table = replace(table, start_time=table.start_time + _seconds(file, table, drive, shift))
     _warn_of_estimate(file, str(declared[channel]["column"]), table, drive)
-    values = table[channel]
+    vx = np.interp(table.time, drive.time, drive["vx"])
+    vy = table[channel]
     if channel == "sideslip_ref":
-        values = np.tan(values) * np.interp(table.time, drive.time, drive["vx"])
+        # at standstill the angle is noise, of which a tangent can make any velocity
+        vy = vx * np.tan(np.where(np.abs(vx) < STANDSTILL_SPEED, 0.0, vy))
     return Estimate(
         drive.id,
         file.stem,
         table.rate_hz,
         table.start_time,
-        {"vy": values, "sideslip": np.zeros_like(values)},
+        {"vy": vy, "sideslip": np.arctan2(vy, vx)},
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
 from vehest.data.limits import use_limits
 from vehest.data.recording import Recording
+from vehest.inference.car_values import stated_wheelbase
 from vehest.inference.reading import read_checked, without_references
 from vehest.report.document import Document, Figure, as_text, page_of, pdf_of, png_of, svg_of
 from vehest.report.drive_figure import drive_figure
@@ -90,6 +92,8 @@ def plot_files(
     recording_file, *estimate_files = files
     options = estimate_options([word for word in words if not is_file_name(word)])
     recording = _with_references_if_any(recording_file, options)
+    wheelbase = stated_wheelbase(recording.car, options.settings)
+    recording = replace(recording, car=replace(recording.car, wheelbase=wheelbase))
     with use_limits(options.limits):
         estimates = [read_estimate_table(file, recording) for file in estimate_files]
     figure = drive_figure(recording, estimates, start, stop)

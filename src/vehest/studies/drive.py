@@ -63,7 +63,7 @@ from vehest.studies.kit.standing import (
     ranking_of,
     standing_columns,
 )
-from vehest.studies.kit.warnings import warnings_of
+from vehest.studies.kit.warnings import sizes_of_sideslip, warnings_of
 
 TAKES = "split"
 MAX_DRAWN = 8
@@ -587,13 +587,11 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
         recordings = artefacts.reference_ranges(spans)
         if not recordings:
             continue
-        sideslip = np.concatenate(
-            [np.arctan2(recording["vy_ref"], recording["vx"]) for recording in recordings]
-        )
+        sideslip = sizes_of_sideslip(artefacts, spans)
         row = {
             "role": role,
             "minutes": sum(len(recording) / recording.rate_hz for recording in recordings) / 60.0,
-            "sideslip_99": float(np.nanquantile(np.degrees(np.abs(sideslip)), 0.99)),
+            "sideslip_99": float(np.quantile(sideslip, 0.99)),
         }
         if all("ay" in recording for recording in recordings):
             ay = np.concatenate([recording["ay"] for recording in recordings])

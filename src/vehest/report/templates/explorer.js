@@ -1,7 +1,8 @@
 "use strict";
 
 // Traces, course and filter of a test set. The data are unpacked from 16 bits (report/explorer.py); sideslip is atan2(v, u) with the
-// measured u, as everywhere.
+// measured u, as everywhere. It is drawn where it is scored and the car moves forward: at standstill it is noise, in reverse it jumps
+// between -180 and 180 degrees.
 
 const DEGREES = 180 / Math.PI;
 const DRAWN_AT_FIRST = 4;
@@ -26,6 +27,11 @@ async function unpack(content) {
     columns[name] = values;
   });
   return columns;
+}
+
+// The same angle within a half turn [deg].
+function halfTurn(angle) {
+  return Math.abs(angle) > 180 ? angle - 360 * Math.round(angle / 360) : angle;
 }
 
 function element(tag, properties = {}, ...children) {
@@ -57,13 +63,17 @@ class Explorer {
     this.whole = [this.time[0], this.time[this.n - 1]];
     this.view = [...content.zoom];
     const { vx, vy } = columns;
-    this.sideslip = vy.map((value, k) => Math.atan2(value, vx[k]) * DEGREES);
+    this.scored = columns.scored.map((value) => value > 0.5);
+    const angles = (v) => v.map((value, k) => (this.scored[k] ? Math.atan2(value, vx[k]) * DEGREES : NaN));
+    const forward = (angle) => angle.map((value, k) => (vx[k] >= 0 ? value : NaN));
+    const reference = angles(vy);
+    this.sideslip = forward(reference);
     this.candidates = content.candidates.map((own, i) => {
       const v = columns[`vy${i}`];
-      const sideslip = v.map((value, k) => Math.atan2(value, vx[k]) * DEGREES);
-      const error = sideslip.map((value, k) => value - this.sideslip[k]);
+      const angle = angles(v);
+      const error = angle.map((value, k) => halfTurn(value - reference[k]));
       const bands = { v: columns[`bandv${i}`], sideslip: columns[`bandb${i}`] };
-      return { ...own, i, v, sideslip, error, bands, health: columns[`health${i}`], drawn: i < DRAWN_AT_FIRST };
+      return { ...own, i, v, sideslip: forward(angle), error, bands, health: columns[`health${i}`], drawn: i < DRAWN_AT_FIRST };
     });
     this.detail = this.candidates[0];
     this.inputs = content.inputs.map((own, i) => ({ ...own, values: columns[`input${i}`] }));
@@ -198,24 +208,25 @@ class Explorer {
     const [low, high] = [bound("ay from", -Infinity), bound("ay to", Infinity)];
     const { vx, ay } = this.columns;
     const filtered = this.inView.checked || Object.values(this.bounds).some((input) => input.value !== "");
-    let [count, known] = [0, 0];
+    let [count, known, scored] = [0, 0, 0];
     for (let k = 0; k < this.n; k++) {
-      const there = !Number.isNaN(this.sideslip[k]);
+      const there = !Number.isNaN(this.columns.vy[k]);
       const size = ay ? Math.abs(ay[k]) : 0;
       const seen = !this.inView.checked || (this.time[k] >= this.view[0] && this.time[k] <= this.view[1]);
       this.passes[k] = there && vx[k] >= slow && vx[k] <= fast && (low === -Infinity && high === Infinity ? true : size >= low && size <= high) && seen;
       known += there;
       count += this.passes[k];
+      scored += this.passes[k] && this.scored[k];
     }
     this.filtered = filtered;
     for (const row of this.rows) {
       let [sideslip, v] = [0, 0];
       for (let k = 0; k < this.n; k++) {
         if (!this.passes[k]) continue;
-        sideslip += row.own.error[k] ** 2;
+        if (this.scored[k]) sideslip += row.own.error[k] ** 2;
         v += (row.own.v[k] - this.columns.vy[k]) ** 2;
       }
-      row.rmse = Math.sqrt(sideslip / count);
+      row.rmse = Math.sqrt(sideslip / scored);
       row.sideslip.textContent = rounded(row.rmse);
       row.v.textContent = rounded(Math.sqrt(v / count));
     }
@@ -225,7 +236,7 @@ class Explorer {
     if (sorted) this.table.append(...[...this.rows].sort((a, b) => a.rmse - b.rmse).map((row) => row.line));
     const seconds = (count * this.content.step).toFixed(1);
     this.said.textContent = count
-      ? `${count} of ${known} samples, ${seconds} s${filtered ? "; the intervals of the forest plot are those of all samples" : ""}.`
+      ? `${count} of ${known} samples, ${seconds} s${scored < count ? `, sideslip scored at ${scored}` : ""}${filtered ? "; the intervals of the forest plot are those of all samples" : ""}.`
       : "No sample is chosen.";
     this.plots.forEach((plot) => plot.redraw(false));
     this.drawMap();
@@ -485,9 +496,9 @@ class Explorer {
       box[1] = Math.max(box[1], x[k]);
       box[2] = Math.min(box[2], y[k]);
       box[3] = Math.max(box[3], y[k]);
-      sizes.push(Math.abs(this.detail.error[k]));
+      if (this.scored[k]) sizes.push(Math.abs(this.detail.error[k]));
     }
-    if (!sizes.length) return;
+    if (!Number.isFinite(box[0])) return;
     const limit = sizes.sort((a, b) => a - b)[Math.floor(0.95 * (sizes.length - 1))] || 1;
     const margin = 12;
     const scale = Math.min((width - 2 * margin) / Math.max(box[1] - box[0], 1), (height - 2 * margin - 16) / Math.max(box[3] - box[2], 1));
@@ -497,7 +508,7 @@ class Explorer {
     ctx.lineCap = "round";
     for (let k = from; k + step <= to; k += step) {
       if (Number.isNaN(x[k]) || Number.isNaN(x[k + step])) continue;
-      const passes = this.passes[k];
+      const passes = this.passes[k] && this.scored[k];
       ctx.strokeStyle = passes ? courseColour(Math.abs(this.detail.error[k]) / limit) : colourOf("rule");
       ctx.lineWidth = passes ? 3 : 1.5;
       ctx.beginPath();

@@ -91,8 +91,8 @@ def signals_of(
 
 
 def is_scored_somewhere(signals: DriveSignals) -> bool:
-    """Whether sideslip is scored at any sample of the test set."""
-    return bool(signals.reference.is_sideslip_scored.any())
+    """Whether sideslip is scored, and drawn, at any sample of the test set."""
+    return bool(signals.reference.is_sideslip_drawn.any())
 
 
 def traces_block(signals: DriveSignals, file: str) -> Figure:
@@ -104,7 +104,11 @@ def traces_block(signals: DriveSignals, file: str) -> Figure:
         "(coloured), of each "
         "estimator the seed chosen on validation.",
         figures.traces_figure(
-            drive.time, _reference_trace(signals), _estimate_traces(signals), signals.time_label
+            drive.time,
+            _reference_trace(signals),
+            _estimate_traces(signals),
+            [figures.root_mean_square(error) for _, _, error in _errors(signals)],
+            signals.time_label,
         ),
     )
 
@@ -158,10 +162,10 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     reference, β over ay, g-g.
     """
     drive = signals.reference
-    scored = drive.is_sideslip_scored
-    reference = np.degrees(drive.sideslip_ref)[scored]
+    is_drawn = drive.is_sideslip_drawn
+    reference = np.degrees(drive.sideslip_ref)[is_drawn]
     clouds = [
-        Cloud(title, line.colour, reference, np.degrees(estimate.sideslip)[scored])
+        Cloud(title, line.colour, reference, np.degrees(estimate.sideslip)[is_drawn])
         for (_, title, line), estimate in zip(
             signals.candidates.values(), signals.joined.values(), strict=True
         )
@@ -174,7 +178,7 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     )
     if not signals.has_ay:
         return [agreement]
-    ay = drive.ay[scored]
+    ay = drive.ay[is_drawn]
     first = clouds[0]
     panels: list[tuple[list[Cloud], str, str, bool]] = [
         (
@@ -259,13 +263,13 @@ def _explorer(signals: DriveSignals) -> str:
 def _reference_trace(signals: DriveSignals) -> figures.Traces:
     drive = signals.reference
     return figures.Traces(
-        "measured", REFERENCE, drive.vy_ref, _where_scored(drive, drive.sideslip_ref)
+        "measured", REFERENCE, drive.vy_ref, _where_drawn(drive, drive.sideslip_ref)
     )
 
 
 def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
     return [
-        figures.Traces(title, line, drive.vy, _where_scored(drive, drive.sideslip))
+        figures.Traces(title, line, drive.vy, _where_drawn(drive, drive.sideslip))
         for (_, title, line), drive in zip(
             signals.candidates.values(), signals.joined.values(), strict=True
         )
@@ -274,7 +278,7 @@ def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
 
 def _errors(signals: DriveSignals) -> list[figures.Errors]:
     return [
-        (title, line, np.degrees(drive.sideslip - drive.sideslip_ref)[drive.is_sideslip_scored])
+        (title, line, np.degrees(drive.sideslip_error)[drive.is_sideslip_scored])
         for (_, title, line), drive in zip(
             signals.candidates.values(), signals.joined.values(), strict=True
         )
@@ -298,9 +302,9 @@ def _joined(parts: Sequence[Scored], step: float) -> Scored:
     )
 
 
-def _where_scored(part: Scored, sideslip: FloatArray) -> FloatArray:
-    """Sideslip where it is scored, else NaN, (K,) [deg]."""
-    return np.where(part.is_sideslip_scored, np.degrees(sideslip), np.nan)
+def _where_drawn(part: Scored, sideslip: FloatArray) -> FloatArray:
+    """Sideslip where it is drawn, else NaN, (K,) [deg]."""
+    return np.where(part.is_sideslip_drawn, np.degrees(sideslip), np.nan)
 
 
 def _gap_of(parts: Sequence[Scored]) -> int:
@@ -318,7 +322,7 @@ def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[fl
     offset = 0
     for part in parts:
         n = min(round(ZOOM_SECONDS / step), len(part.time))
-        sideslip = np.where(part.is_sideslip_scored, part.sideslip_ref, 0.0)
+        sideslip = np.where(part.is_sideslip_drawn, part.sideslip_ref, 0.0)
         power = np.convolve(np.square(sideslip), np.full(n, 1.0 / n), mode="valid")
         if power.max() > best:
             best = float(power.max())

@@ -72,6 +72,10 @@ def explorer_of(
     columns: dict[str, FloatArray | None] = {
         "vx": vx,
         "vy": vy_ref,
+        "scored": chained(
+            [part.is_sideslip_scored.astype(np.float64) for part in next(iter(scored.values()))],
+            gap,
+        ),
         "ay": measured("ay") if "ay" in names else None,
     }
     inputs = []

@@ -95,24 +95,28 @@ def _lowest(runs: Runs, test_set: str, metric: str) -> float:
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
-    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its
-    tail [deg].
+    """Root mean square of the reference sideslip [deg]."""
+    return float(np.sqrt(np.mean(np.square(sizes_of_sideslip(artefacts, spans)))))
+
+
+def sizes_of_sideslip(artefacts: PartArtefacts, spans: Sequence[Span]) -> FloatArray:
+    """Magnitude of the reference sideslip where it is scored, that of a car rolling backwards
+    counted from its tail, (K,) [deg].
     """
     size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
-    return float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))
+    return np.minimum(size, 180.0 - size)
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
     sentences = []
     for test_set, spans in artefacts.split.tests.items():
-        sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
-        level = float(np.sqrt(np.mean(np.square(sideslip))))
+        level = _level(artefacts, spans)
         if level < MIN_SIDESLIP_DEG:
+            largest = np.quantile(sizes_of_sideslip(artefacts, spans), 0.99)
             sentences.append(
                 f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the "
                 "time below "
-                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide "
-                "the order."
+                f"{largest:.2g}°; offsets of the reference may decide the order."
             )
     return sentences
 
