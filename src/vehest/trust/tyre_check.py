@@ -26,7 +26,7 @@ from vehest.trust.checks import check_number, check_numbers
 FRICTION_SLIP = 0.05
 """c [rad], error of the slip angle where the friction is e times as large.
 
-Chosen by the interval score on development tyres (docs/learned_ukf.md, "Bands on other tyres").
+Chosen on simulated tyres (docs/learned_ukf.md, "Bands on other tyres").
 """
 GAUSSIAN_90 = 1.6448536269514722  # half width of 90 % of a Gaussian, in standard deviations
 MAX_WEIGHT = 1e12
