@@ -335,6 +335,9 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         jump = max(excess, SPIKE_STEP * float(np.quantile(steps, USUAL_STEP_QUANTILE)))
         is_jump = np.pad(steps > jump, 1)
         is_open = np.pad(np.diff(rows) > 1, 1, constant_values=True)  # an end, or missing samples
+        # before its first step, or after its last one, a command rests near zero
+        reach = max(high, 0.0) - min(low, 0.0)
+        is_far = (measured > high + reach) | (measured < low - reach)
         max_samples = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
         spikes = [
             (int(rows[begin]), int(rows[end - 1]) + 1)
@@ -342,6 +345,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             if end - begin <= max_samples
             and (is_jump | is_open)[[begin, end]].all()
             and is_jump[[begin, end]].any()
+            and (is_jump[[begin, end]].all() or is_far[begin:end].all())
             and counts[rows[begin:end]].all()
         ]
         if spikes:

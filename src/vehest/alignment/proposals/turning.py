@@ -140,16 +140,16 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
         for i, j in zip(*np.nonzero(np.abs(correlations) >= MIN_CORRELATION), strict=True):
             if len({id(column) for column in (speed, rates[i], accelerations[j])}) == 3:
                 named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
-                turnings.append(
-                    _scored(
-                        columns, named, float(correlations[i, j]), float(ay_scales[j] / scales[i])
-                    )
-                )
-    return [
-        turning
-        for turning in sorted(turnings, key=lambda turning: -turning.score)[:MAX_TURNINGS]
-        if turning.score >= MIN_SCORE
-    ]
+                turnings.append((named, float(correlations[i, j]), float(ay_scales[j] / scales[i])))
+    scored = sorted(
+        ((_scored(columns, *turning), turning) for turning in turnings),
+        key=lambda entry: -entry[0].score,
+    )
+    best = [_scored(columns, *turning, try_rare_units=True) for _, turning in scored[:MAX_TURNINGS]]
+    return sorted(
+        (turning for turning in best if turning.score >= MIN_SCORE),
+        key=lambda turning: -turning.score,
+    )
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
@@ -276,12 +276,14 @@ def _scored(
     named: Mapping[str, Candidate],
     correlation_with_ay: float,
     file_gain: float,
+    *,
+    try_rare_units: bool = False,
 ) -> Turning:
     """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
     evidence.
     """
     ranked = _ranked(named, file_gain, {name: column.units(name) for name, column in named.items()})
-    if ranked[0][0] >= FAR_MISMATCH:
+    if try_rare_units and ranked[0][0] >= FAR_MISMATCH:
         units_of = {
             name: column.units(name) if column.unit else (*UNITS[name], *RARE_UNITS[name])
             for name, column in named.items()
