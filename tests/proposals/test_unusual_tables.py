@@ -112,11 +112,11 @@ def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
     assert_yaw_rate_is(recording, table)
 
 
-def test_a_row_of_numbers_that_is_cut_off_is_an_error(tmp_path):
+def test_a_row_of_numbers_that_is_cut_off_within_the_table_is_an_error(tmp_path):
     lines = lines_of(usual(drive()))
     file = tmp_path / "lap.csv"
-    for text in ("\n".join(lines)[:-30], "\n".join([*lines[:500], "bad,1.0,2.0", *lines[500:]])):
-        file.write_text(text, encoding="utf-8")
+    for row in ("bad,1.0,2.0", lines[500][:-30]):
+        file.write_text("\n".join([*lines[:500], row, *lines[500:]]), encoding="utf-8")
         with pytest.raises(DataError, match="Expected 7 columns"):
             inspect("my_car", [file])
 
