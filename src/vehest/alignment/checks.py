@@ -337,7 +337,7 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         is_open = np.pad(np.diff(rows) > 1, 1, constant_values=True)  # an end, or missing samples
         # before its first step, or after its last one, a command rests near zero
         reach = max(high, 0.0) - min(low, 0.0)
-        is_far = (measured > high + reach) | (measured < low - reach)
+        is_far = (measured > max(high, 0.0) + reach) | (measured < min(low, 0.0) - reach)
         max_samples = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
         spikes = [
             (int(rows[begin]), int(rows[end - 1]) + 1)
