@@ -328,6 +328,41 @@ def test_a_speed_that_jumps_to_one_value_and_back_is_found_within_its_usual_rang
     )
 
 
+@pytest.mark.parametrize(
+    "rows", [slice(0, 1), slice(0, 2), slice(1, 2), slice(-2, -1), slice(-1, None)]
+)
+@pytest.mark.parametrize(("value", "words"), [(7.3, "1 spike of"), (0.0, "jumps away and back 1")])
+def test_a_spike_in_the_first_or_last_samples_is_found(rows, value, words):
+    drive = clean_drive()
+    angle = 2.0 + 15.0 * drive["steer"] if value == 0.0 else 15.0 * drive["steer"]
+    channels = {**drive.channels, "handwheel": angle.copy()}
+    assert "spike" not in [
+        one.check for one in checks_of_recording(replace(drive, channels=channels))
+    ]
+    channels["handwheel"][rows] = value
+    found = checks_of_recording(replace(drive, channels=channels))
+    spikes = [one for one in found if one.check == "spike"]
+    assert [one.channel for one in spikes] == ["handwheel"]
+    assert words in spikes[0].message
+
+
+def test_a_spike_beside_missing_samples_is_found_and_a_manoeuvre_at_the_start_is_none():
+    drive = clean_drive()
+    gappy = 15.0 * drive["steer"]
+    gappy[2990:3000] = np.nan
+    gappy[3000] = 7.3
+    swerve = 15.0 * drive["steer"]
+    swerve[:20] += 4.0 * np.cos(np.linspace(0.0, 0.5 * np.pi, 20))
+    for angle, expected in ((gappy, ["handwheel"]), (swerve, [])):
+        recording = replace(
+            drive,
+            channels={**drive.channels, "handwheel": angle},
+            gappy=frozenset({"handwheel"}),
+        )
+        found = checks_of_recording(recording)
+        assert [one.channel for one in found if one.check == "spike"] == expected
+
+
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
     drive = clean_drive()
     shaking = 5.0 * (-1.0) ** np.arange(len(drive))

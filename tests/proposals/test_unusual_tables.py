@@ -112,11 +112,11 @@ def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
     assert_yaw_rate_is(recording, table)
 
 
-def test_a_row_of_numbers_that_is_cut_off_is_an_error(tmp_path):
+def test_a_row_of_numbers_that_is_cut_off_within_the_table_is_an_error(tmp_path):
     lines = lines_of(usual(drive()))
     file = tmp_path / "lap.csv"
-    for text in ("\n".join(lines)[:-30], "\n".join([*lines[:500], "bad,1.0,2.0", *lines[500:]])):
-        file.write_text(text, encoding="utf-8")
+    for row in ("bad,1.0,2.0", lines[500][:-30]):
+        file.write_text("\n".join([*lines[:500], row, *lines[500:]]), encoding="utf-8")
         with pytest.raises(DataError, match="Expected 7 columns"):
             inspect("my_car", [file])
 
@@ -418,3 +418,33 @@ def test_minutes_and_seconds_are_times():
     texts = pa.chunked_array([["59:59.98", "60:00.00", "60:00,02"]])
     np.testing.assert_allclose(seconds_of_text(texts), [3599.98, 3600.0, 3600.02], atol=1e-9)
     assert seconds_of_text(pa.chunked_array([["59:59", "60:00"]])) is None
+
+
+@pytest.mark.parametrize(
+    ("units", "factors"),
+    [
+        (("m/s", "mdeg/s", "m/s²"), (1.0, np.radians(1e-3), 1.0)),
+        (("cm/s", "mrad/s", "milli-g"), (0.01, 1e-3, G * 1e-3)),
+        (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
+        (("kn", "Grad/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),
+    ],
+)
+def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
+    d = drive()
+    table = {"time [s]": d["t"]}
+    for name, key, unit, factor in zip("vra", ("vx", "r", "ay"), units, factors, strict=True):
+        label = {"v": "Speed", "r": "Yaw Rate", "a": "Lat Acc"}[name]
+        table[f"{label} [{unit}]"] = d[key] / factor
+    _, recording = read_back(write(tmp_path / "lap.csv", pd.DataFrame(table)))
+    for channel, key in (("vx", "vx"), ("yaw_rate", "r"), ("ay", "ay")):
+        np.testing.assert_allclose(recording[channel], d[key], atol=1e-3)
+
+
+def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {"t": d["t"], "speed": d["vx"], "yaw_rate": np.degrees(d["r"]) * 1e3, "ay": d["ay"]}
+    )
+    channels = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel
+    assert channels["yaw_rate"].unit == "mdeg/s"
+    assert channels["vx"].unit == "m/s"

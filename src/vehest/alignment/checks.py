@@ -330,19 +330,23 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             continue
         low, high = np.quantile(measured, USUAL_QUANTILES)
         excess = SPIKE_EXCESS * (high - low)
-        runs = true_runs((samples > high + excess) | (samples < low - excess))
-        steps = np.abs(np.diff(samples))
-        jump = max(excess, SPIKE_STEP * float(np.nanquantile(steps, USUAL_STEP_QUANTILE)))
+        rows = np.flatnonzero(np.isfinite(samples))
+        steps = np.abs(np.diff(measured))
+        jump = max(excess, SPIKE_STEP * float(np.quantile(steps, USUAL_STEP_QUANTILE)))
+        is_jump = np.pad(steps > jump, 1)
+        is_open = np.pad(np.diff(rows) > 1, 1, constant_values=True)  # an end, or missing samples
+        # before its first step, or after its last one, a command rests near zero
+        reach = max(high, 0.0) - min(low, 0.0)
+        is_far = (measured > max(high, 0.0) + reach) | (measured < min(low, 0.0) - reach)
         max_samples = max(SPIKE_SECONDS * recording.rate_hz, 1.0)
         spikes = [
-            (begin, end)
-            for begin, end in runs.tolist()
-            if begin > 0
-            and end < len(samples)
-            and end - begin <= max_samples
-            and steps[begin - 1] > jump
-            and steps[end - 1] > jump
-            and counts[begin:end].all()
+            (int(rows[begin]), int(rows[end - 1]) + 1)
+            for begin, end in true_runs((measured > high + excess) | (measured < low - excess))
+            if end - begin <= max_samples
+            and (is_jump | is_open)[[begin, end]].all()
+            and is_jump[[begin, end]].any()
+            and (is_jump[[begin, end]].all() or is_far[begin:end].all())
+            and counts[rows[begin:end]].all()
         ]
         if spikes:
             worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
@@ -375,16 +379,21 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _between_jumps(samples: FloatArray, rate_hz: float) -> Iterator[tuple[int, int]]:
-    """Runs of equal samples, or a single zero, between two jumps that lead away and back."""
-    steps = np.diff(samples)
-    usual = float(np.nanquantile(np.abs(steps), USUAL_STEP_QUANTILE))
-    is_jump = (np.abs(steps) > JUMP_STEP * usual) & (usual > 0.0)
-    edges = np.flatnonzero(is_jump) + 1
-    for begin, end in pairwise(edges.tolist()):
-        away = steps[begin - 1]
-        back = steps[end - 1]
+    """Runs of equal samples, or a single zero, between two jumps that lead away and back, or
+    between a jump and an end of the recording.
+    """
+    rows = np.flatnonzero(np.isfinite(samples))
+    steps = np.diff(samples[rows])
+    usual = float(np.quantile(np.abs(steps), USUAL_STEP_QUANTILE))
+    jumps = np.flatnonzero((np.abs(steps) > JUMP_STEP * usual) & (usual > 0.0)) + 1
+    for first, after in pairwise([0, *jumps.tolist(), len(rows)] if len(jumps) else ()):
+        away = steps[first - 1] if first else -steps[after - 1]
+        back = steps[after - 1] if after < len(rows) else -away
         is_return = abs(away + back) < 0.5 * min(abs(away), abs(back))
-        is_code = np.ptp(samples[begin:end]) == 0.0 and (end - begin > 1 or samples[begin] == 0.0)
+        run = samples[rows[first:after]]
+        is_code = np.ptp(run) == 0.0 and (after - first > 1 or run[0] == 0.0)
+        begin = int(rows[first])
+        end = int(rows[after - 1]) + 1
         if is_return and is_code and end - begin <= JUMP_SECONDS * rate_hz:
             yield begin, end
 

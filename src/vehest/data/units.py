@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 
 from vehest.data.errors import DataError
 
+STEP = re.compile(r"(0?\.0*1|1e-\d)?", re.IGNORECASE)  # before a unit, of raw counts
 _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "m/s": {
         "m/s": 1.0,
@@ -26,8 +28,15 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
         "cm/s²": 0.01,
         "mm/s²": 0.001,
     },
-    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 0.001},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "mrad/s": 0.001},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 0.001, "mdeg": math.pi / 180e3},
+    "rad/s": {
+        "rad/s": 1.0,
+        "deg/s": math.pi / 180.0,
+        "rpm": math.pi / 30.0,
+        "rev/s": 2.0 * math.pi,
+        "mrad/s": 0.001,
+        "mdeg/s": math.pi / 180e3,
+    },
     "N": {"N": 1.0, "kN": 1e3},
     "N·m": {"N·m": 1.0, "Nm": 1.0},
     "Pa": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": 6894.757293168361},
@@ -51,16 +60,17 @@ _UNITS = {
 
 
 def factor_to_si(unit: str, si_unit: str) -> float:
-    """Factor that brings a value in ``unit`` to ``si_unit``.
+    """Factor that brings a value in ``unit``, such as ``deg/s`` or ``0.01*deg/s``, to ``si_unit``.
 
     Raises
     ------
     DataError
         The unit is not known, or measures something else.
     """
-    if unit not in _UNITS:
+    step, _, plain = unit.rpartition("*")
+    if plain not in _UNITS or not STEP.fullmatch(step):
         raise DataError(f"unit '{unit}' is not known; known units: {', '.join(sorted(_UNITS))}")
-    target, factor = _UNITS[unit]
+    target, factor = _UNITS[plain]
     if target != si_unit:
         raise DataError(f"unit '{unit}' cannot be converted to '{si_unit}'")
-    return factor
+    return factor * float(step) if step else factor

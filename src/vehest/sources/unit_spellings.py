@@ -12,25 +12,31 @@ from vehest.sources.columns import Column
 # brackets and case, sec as s; ambiguous ones are left out
 _SPELLINGS_OF = {
     "m/s": "m/s mps meter/s meters/s ms-1 ms^-1",
-    "km/h": "km/h kmh kph km/hr kmph kmh-1 kmh^-1",
-    "mph": "mph mi/h mile/h miles/h",
-    "knots": "kt kts knot knots knoten noeuds nœuds",
-    "ft/s": "ft/s fps",
+    "km/h": "km/h kmh kph km/hr km/hour km/std kmph kmh-1 kmh^-1",
+    "mph": "mph mi/h mi/hr mile/h miles/h miles/hour",
+    "knots": "kt kts knt knot knots knoten noeuds nœuds nodi",
+    "ft/s": "ft/s fps feet/s foot/s fts-1 fts^-1",
     "m/s²": "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2",
-    "ft/s²": "ft/s² ft/s^2 ft/s2",
+    "ft/s²": "ft/s² ft/s^2 ft/s2 ft/s/s fps2 fps² feet/s² feet/s^2 feet/s2 fts-2 fts^-2",
     "g": "g gs g's gn g0",
     "rad": "rad radian radians",
-    "deg": "deg ° degree degrees",
+    "deg": "deg ° º degree degrees grad gradi grados degré degrés 度",
     "rad/s": "rad/s radian/s radians/s rads-1 rads^-1",
-    "deg/s": "deg/s °/s degree/s degrees/s degs-1 degs^-1 °s-1 dps",
-    "rpm": "rpm 1/min u/min r/min rev/min upm min-1 min^-1",
-    "cm/s": "cm/s",
-    "mm/s": "mm/s",
-    "mrad": "mrad",
-    "mrad/s": "mrad/s",
-    "mg": "mg",
-    "cm/s²": "cm/s² cm/s^2 cm/s2",
-    "mm/s²": "mm/s² mm/s^2 mm/s2",
+    "deg/s": (
+        "deg/s °/s º/s degree/s degrees/s degs-1 degs^-1 °s-1 dps grad/s gradi/s grados/s "
+        "degré/s degrés/s 度/s"
+    ),
+    "rpm": "rpm 1/min u/min r/min rev/min tr/min giri/min upm min-1 min^-1",
+    "rev/s": "rev/s revs/s tr/s giri/s",
+    "cm/s": "cm/s cms-1 cms^-1",
+    "mm/s": "mm/s mms-1 mms^-1",
+    "mrad": "mrad milliradian milliradians",
+    "mdeg": "mdeg m° millideg millidegree millidegrees",
+    "mrad/s": "mrad/s mrads-1 mrads^-1 milliradian/s milliradians/s",
+    "mdeg/s": "mdeg/s m°/s mdps mdegs-1 mdegs^-1 millideg/s millidegree/s millidegrees/s",
+    "mg": "mg millig milli-g milligs",
+    "cm/s²": "cm/s² cm/s^2 cm/s2 cm/s/s cms-2 cms^-2 gal",
+    "mm/s²": "mm/s² mm/s^2 mm/s2 mm/s/s mms-2 mms^-2",
     "N": "n newton",
     "Nm": "nm",
     "Pa": "pa pascal",
@@ -55,15 +61,21 @@ _CASES = {
     "Mpa": "MPa",
     "mPa": "another unit",
 }
+_STEPPED = re.compile(r"(?:(0?[.,]0*1|1e-\d)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL)
+_SECOND = re.compile(r"sec(ond[saeoi]?)?|sek(unden?)?|秒")
 
 
 def plain_unit(text: str) -> str | None:
     """A unit as vehest spells it, ``another unit`` for one that no channel has.
 
-    None for an unknown spelling or none.
+    A step of raw counts stays before it: ``0.01*deg/s``. None for an unknown spelling or none.
     """
-    bare = re.sub(r"[\s·*.Â()\[\]]", "", text)  # Â: UTF-8 that was read as Latin-1
-    return _CASES.get(bare) or _SPELLINGS.get(bare.lower().replace("sec", "s"))
+    step, rest = _STEPPED.fullmatch(text.strip("()[] ")).groups()  # type: ignore[union-attr]
+    bare = re.sub(r"[\s·*×.Â()\[\]]", "", rest)  # Â: UTF-8 that was read as Latin-1
+    plain = _CASES.get(bare) or _SPELLINGS.get(_SECOND.sub("s", bare.lower()))
+    if not step or plain in (None, "another unit"):
+        return None if step else plain
+    return f"{step.lower().replace(',', '.')}*{plain}"
 
 
 def require_unit(written: str, column: Column, si_unit: str, location: str, fix: str) -> None:

@@ -37,6 +37,12 @@ UNITS = {  # where the header is silent, the likeliest first
     "vy_ref": ("m/s", "km/h"),
     "sideslip_ref": ("rad", "deg"),
 }
+RARE_UNITS = {  # of loggers that write whole numbers; tried where the others explain nothing
+    "vx": ("cm/s", "mm/s", "ft/s", "0.01*km/h"),
+    "yaw_rate": ("mrad/s", "mdeg/s", "0.1*deg/s", "0.01*deg/s"),
+    "ay": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),
+    "ax": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
+from vehest.alignment.proposals.columns import (
+    RARE_UNITS,
+    Candidate,
+    correlation,
+    largest,
+    si_factor,
+    slow_of,
+)
 from vehest.alignment.proposals.names import STRONG, is_pair
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import FAR_MISMATCH, Search
@@ -402,10 +409,12 @@ def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
 
 def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -> Agreement:
     """Agreement of a column with d(vx)/dt, in the unit with a gain near 1."""
-    agreements = (
-        agreement(motion, column, "ax", unit, "ax") for unit in units or column.units("ax")
-    )
-    return min(agreements, key=lambda fit: fit.mismatch)
+    tried = list(units or column.units("ax"))
+    rare = [] if units or column.unit else list(RARE_UNITS["ax"])
+    fits = [agreement(motion, column, "ax", unit, "ax") for unit in tried]
+    if min(fit.mismatch for fit in fits) >= FAR_MISMATCH:
+        fits += [agreement(motion, column, "ax", unit, "ax") for unit in rare]
+    return min(fits, key=lambda fit: fit.mismatch)
 
 
 def agreement(

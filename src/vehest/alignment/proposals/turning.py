@@ -13,13 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import UNITS, Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.columns import (
+    RARE_UNITS,
+    UNITS,
+    Candidate,
+    correlation,
+    largest,
+    si_factor,
+)
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
 
 MIN_CORRELATION = 0.75
 UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
+RARITY = 0.25  # penalty of a rare unit
 # logarithms of a gain that should be 1
 CLOSE_MISMATCH = 0.3  # within, units explain it
 FAR_MISMATCH = 0.6  # beyond, they do not
@@ -132,16 +140,16 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
         for i, j in zip(*np.nonzero(np.abs(correlations) >= MIN_CORRELATION), strict=True):
             if len({id(column) for column in (speed, rates[i], accelerations[j])}) == 3:
                 named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
-                turnings.append(
-                    _scored(
-                        columns, named, float(correlations[i, j]), float(ay_scales[j] / scales[i])
-                    )
-                )
-    return [
-        turning
-        for turning in sorted(turnings, key=lambda turning: -turning.score)[:MAX_TURNINGS]
-        if turning.score >= MIN_SCORE
-    ]
+                turnings.append((named, float(correlations[i, j]), float(ay_scales[j] / scales[i])))
+    scored = sorted(
+        ((_scored(columns, *turning), turning) for turning in turnings),
+        key=lambda entry: -entry[0].score,
+    )
+    best = [_scored(columns, *turning, try_rare_units=True) for _, turning in scored[:MAX_TURNINGS]]
+    return sorted(
+        (turning for turning in best if turning.score >= MIN_SCORE),
+        key=lambda turning: -turning.score,
+    )
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
@@ -237,17 +245,14 @@ def is_plausible(size: float, channel: str, unit: str) -> bool:
     return low <= size * si_factor(unit, channel) <= high
 
 
-def _scored(
-    columns: Sequence[Candidate],
-    named: Mapping[str, Candidate],
-    correlation_with_ay: float,
-    file_gain: float,
-) -> Turning:
-    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
-    evidence.
+def _ranked(
+    named: Mapping[str, Candidate], file_gain: float, units_of: Mapping[str, Sequence[str]]
+) -> list[tuple[float, float, tuple[str, ...], float, int]]:
+    """Units of the three with their cost, the logarithm of the gain, the gain and the number of
+    implausible sizes, the best first.
     """
     ranked = []
-    for units in product(*(column.units(channel) for channel, column in named.items())):
+    for units in product(*units_of.values()):
         speed, rate, acceleration = (
             si_factor(unit, channel) for unit, channel in zip(units, named, strict=True)
         )
@@ -256,17 +261,34 @@ def _scored(
             not is_plausible(column.size, channel, unit)
             for (channel, column), unit in zip(named.items(), units, strict=True)
         )
-        rarity = 0.0 if named["vx"].unit == units[0] else UNIT_PENALTIES.get(units[0], 0.0)
-        ranked.append(
-            (
-                abs(math.log(gain)) + rarity + n_implausible,
-                abs(math.log(gain)),
-                units,
-                gain,
-                n_implausible,
-            )
+        rarity = sum(
+            UNIT_PENALTIES.get(unit, RARITY * (unit in RARE_UNITS[channel]))
+            for unit, (channel, column) in zip(units, named.items(), strict=True)
+            if column.unit != unit
         )
-    ranked.sort()
+        mismatch = abs(math.log(gain))
+        ranked.append((mismatch + rarity + n_implausible, mismatch, units, gain, n_implausible))
+    return sorted(ranked)
+
+
+def _scored(
+    columns: Sequence[Candidate],
+    named: Mapping[str, Candidate],
+    correlation_with_ay: float,
+    file_gain: float,
+    *,
+    try_rare_units: bool = False,
+) -> Turning:
+    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
+    evidence.
+    """
+    ranked = _ranked(named, file_gain, {name: column.units(name) for name, column in named.items()})
+    if try_rare_units and ranked[0][0] >= FAR_MISMATCH:
+        units_of = {
+            name: column.units(name) if column.unit else (*UNITS[name], *RARE_UNITS[name])
+            for name, column in named.items()
+        }
+        ranked = _ranked(named, file_gain, units_of)
     cost, mismatch, units, gain, n_implausible = ranked[0]
     decided = mismatch < FAR_MISMATCH and (
         len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
