@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import cache
 
 from vehest.data.errors import DataError
 
@@ -59,6 +60,7 @@ _UNITS = {
 }
 
 
+@cache  # thousands of combinations of columns ask for the same few
 def factor_to_si(unit: str, si_unit: str) -> float:
     """Factor that brings a value in ``unit``, such as ``deg/s`` or ``0.01*deg/s``, to ``si_unit``.
 

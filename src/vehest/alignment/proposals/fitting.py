@@ -410,7 +410,7 @@ def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
 def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -> Agreement:
     """Agreement of a column with d(vx)/dt, in the unit with a gain near 1."""
     tried = list(units or column.units("ax"))
-    rare = [] if units or column.unit else list(RARE_UNITS["ax"])
+    rare = RARE_UNITS["ax"] if "ax" in column.hints and not (units or column.unit) else ()
     fits = [agreement(motion, column, "ax", unit, "ax") for unit in tried]
     if min(fit.mismatch for fit in fits) >= FAR_MISMATCH:
         fits += [agreement(motion, column, "ax", unit, "ax") for unit in rare]

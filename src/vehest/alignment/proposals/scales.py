@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from vehest.alignment.motion import rms
-from vehest.alignment.proposals.columns import RARE_UNITS, UNITS, Candidate, si_factor
+from vehest.alignment.proposals.columns import UNITS, Candidate, si_factor
 from vehest.alignment.proposals.fitting import (
     CLEAR_CORRELATION,
     REFERENCES,
@@ -114,7 +114,7 @@ def unit_of_factor(channel: str, unit: str, factor: float) -> str:
     return next(
         (
             other
-            for other in (*UNITS[channel], *RARE_UNITS[channel])
+            for other in UNITS[channel]
             if other != unit
             and abs(math.log(si_factor(other, channel) / right)) < MAX_UNIT_MISMATCH
         ),
