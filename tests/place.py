@@ -224,9 +224,8 @@ class Place:
         before = self.files()
         exit_code, _, err = self(*arguments)
         assert exit_code != 0
-        lines = [
-            line for line in err.splitlines() if not line.startswith(("done", "reused", "once"))
-        ]
+        progress = ("done", "reused", "once", "running")
+        lines = [line for line in err.splitlines() if not line.startswith(progress)]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
         assert {

@@ -215,10 +215,13 @@ def new_car(
     have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
     Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
-    from vehest.run.own_car.inspect import inspect
+    from vehest.run.console import Messages
 
     vehicle = {"wheelbase": wheelbase, "mass": mass, "steering_ratio": steering_ratio}
-    examined = inspect(name, files, vehicle, force=force or dry_run)
+    with Messages().running("inspect", ", ".join(file.name for file in files)):
+        from vehest.run.own_car.inspect import inspect
+
+        examined = inspect(name, files, vehicle, force=force or dry_run)
     emit(False, None, [] if as_json else examined.in_words())
     from vehest.run.own_car.questions import ask
     from vehest.run.own_car.write import (
@@ -903,15 +906,19 @@ def report(
     those that results/stale.yaml lists may be stale.
     """
     if check:
-        from vehest.run.published import check_listed, check_published, in_words
+        from vehest.run.console import Messages
+
+        messages = Messages(quiet=quiet)
+        with messages.running("import", "vehest"):
+            from vehest.run.published import check_listed, check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         names = [word for word in words if is_file_name(word)]
         overrides_of_check = [word for word in words if not is_file_name(word)]
         verdicts = (
-            check_published(names, overrides_of_check)
+            check_published(names, overrides_of_check, messages)
             if names
-            else check_listed(overrides_of_check)
+            else check_listed(overrides_of_check, messages)
         )
         emit(as_json, verdicts, map(in_words, verdicts))
         failed = any(
@@ -1317,14 +1324,19 @@ def _run_study(
     """Run a study or sweep, or repeat its record; prints tables and the report's path; raises
     `JobsFailedError` where some jobs failed.
     """
+    from vehest.run.console import PLAN, Messages
     from vehest.run.run_cache import RunCache
 
     cache = RunCache("sweep" if sweep else "run", name or "", overrides)
     ran = cache.repeat(options)
     if ran is None:
-        from vehest.run.study_run import run_study
+        messages = Messages(quiet=options.quiet)
+        with messages.running(PLAN, name or "sweep"):
+            from vehest.run.study_run import run_study
 
-        ran = run_study(name, overrides, options, cache, sweep=sweep, only_report=only_report)
+            ran = run_study(
+                name, overrides, options, cache, messages, sweep=sweep, only_report=only_report
+            )
     page = ran.folder / ran.summary.page
     summary = ran.summary
     outcome: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}

@@ -29,6 +29,7 @@ from vehest.run import console
 from vehest.run.console import Messages
 from vehest.run.failures import failure_of
 from vehest.run.printing import TerminalTable, emit
+from vehest.run.runner import Runner
 
 HOSTILE = "a\x1b]0;owned\x07\x9b31m\u202e[bold]b[/] :car:"
 
@@ -188,6 +189,25 @@ def test_a_stage_gets_a_line_once_it_has_been_silent_for_long(monkeypatch):
         assert not timer.is_alive()
     assert stream.getvalue() == "running ingest     long\n"
     assert messages.printed == []
+
+
+def test_planning_of_a_study_is_announced_and_ends_before_its_trainings(place, monkeypatch):
+    events = []
+    monkeypatch.setattr(Messages, "begin", lambda self, *stage: events.append(("begin", *stage)))
+    monkeypatch.setattr(Messages, "end", lambda self, *stage: events.append(("end", *stage)))
+    monkeypatch.setattr(Runner, "run", lambda *_: events.append(("trainings",)) or ({}, {}))
+    place("run", "small", "tracking=none")
+    assert events[0] == ("begin", "plan", "small")
+    assert events.index(("end", "plan", "small")) < events.index(("trainings",))
+
+
+def test_reading_of_logs_is_announced(place, monkeypatch):
+    events = []
+    monkeypatch.setattr(Messages, "begin", lambda self, *stage: events.append(("begin", *stage)))
+    monkeypatch.setattr(Messages, "end", lambda self, *stage: events.append(("end", *stage)))
+    place("new", "other", "raw/one.csv", "raw/two.csv", "--yes")
+    stage = ("inspect", "one.csv, two.csv")
+    assert events == [("begin", *stage), ("end", *stage)]
 
 
 def test_every_stage_of_a_training_is_announced_and_ended(place, monkeypatch):

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
 from rich.console import Console
@@ -28,6 +29,7 @@ from vehest.data.errors import printable
 WARNING = "warn"
 REUSED = "skip"  # status of an existing artefact, also in records of finished studies
 RUNNING = "run"
+PLAN = "plan"  # stage before those of a study: libraries and configurations are loaded
 MARKS = {
     WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
@@ -44,8 +46,8 @@ MARKS = {
 """Status -> its word and colour."""
 
 MAX_BARS = 16
-MAX_SILENT_SECONDS = 10.0
-"""After this time a stage that is still running gets a line, so that a log shows no hang."""
+MAX_SILENT_SECONDS = 5.0
+"""After this time a stage that is still running gets a line, so that nobody takes it for a hang."""
 
 
 class _Console(Console):
@@ -101,6 +103,15 @@ class Messages:
         timer = self._timers.pop((stage, label), None)
         if timer is not None:
             timer.cancel()
+
+    @contextmanager
+    def running(self, stage: str, label: str) -> Iterator[None]:
+        """Begin a stage, and end it with the block."""
+        self.begin(stage, label)
+        try:
+            yield
+        finally:
+            self.end(stage, label)
 
     def close(self) -> None:
         """Note the end of all stages and print the reused artefacts."""

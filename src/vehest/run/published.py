@@ -151,9 +151,11 @@ def in_words(verdict: Mapping[str, Any]) -> str:
     return ": ".join(part for part in (verdict["study"], verdict["state"], why) if part)
 
 
-def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
+def check_published(
+    names: Sequence[str], overrides: Sequence[str] = (), messages: Messages | None = None
+) -> list[dict[str, Any]]:
     """Compare the recorded keys of published studies with those of today's code, configuration and
-    raw files.
+    raw files; ``messages`` name a study that takes long.
 
     Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
     with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
@@ -183,10 +185,17 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    return [_verdict(study, pipeline, overrides) for study, pipeline in pipelines.items()]
+    messages = messages or Messages(quiet=True)
+    verdicts = []
+    for study, declared_pipeline in pipelines.items():
+        with messages.running("check", study):
+            verdicts.append(_verdict(study, declared_pipeline, overrides))
+    return verdicts
 
 
-def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
+def check_listed(
+    overrides: Sequence[str] = (), messages: Messages | None = None
+) -> list[dict[str, Any]]:
     """Compare all published studies as `check_published`, and those that are not up to date with
     the list of those that may be stale.
 
@@ -216,7 +225,9 @@ def check_listed(overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
             continue
         settled.add(study)
     names = {file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")} - settled
-    for verdict in check_published(sorted(names), overrides) if names or not settled else ():
+    for verdict in (
+        check_published(sorted(names), overrides, messages) if names or not settled else ()
+    ):
         is_incomplete = verdict["n_not_trained"] > 0
         if is_incomplete and verdict["study"] not in reasons:
             verdict["failure"] = f"it is incomplete, and not in '{RESULTS / STALE_LIST}'"

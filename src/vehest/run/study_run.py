@@ -37,7 +37,7 @@ from vehest.run.comparison import (
     print_notes,
     slowest,
 )
-from vehest.run.console import Messages
+from vehest.run.console import PLAN, Messages
 from vehest.run.evaluate import Evaluation, fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.ingest import STAGE as INGEST
@@ -83,12 +83,16 @@ MAX_NAMED = 6  # trainings in one message
 
 @contextmanager
 def open_runner(
-    config: Config, options: RunOptions, stages: Collection[str], study: str = ""
+    config: Config,
+    options: RunOptions,
+    stages: Collection[str],
+    study: str = "",
+    messages: Messages | None = None,
 ) -> Iterator[Runner]:
     """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs
     under a study, if there is one.
     """
-    messages = Messages(quiet=options.quiet)
+    messages = messages or Messages(quiet=options.quiet)
     stop = StopSignals()
     output = Path(config["output"])
     tracker = Tracker(
@@ -122,6 +126,7 @@ def run_study(
     overrides: Sequence[str],
     options: RunOptions,
     cache: RunCache,
+    messages: Messages,
     *,
     sweep: bool = False,
     only_report: bool = False,
@@ -138,6 +143,8 @@ def run_study(
         For all jobs that have their key; of a sweep, with several values.
     cache : RunCache
         Keeps the finished study.
+    messages : Messages
+        Of the run, in which the stage `PLAN` may have begun; it ends before the first training.
     sweep : bool
         Whether the overrides make a sweep.
     only_report : bool
@@ -169,7 +176,11 @@ def run_study(
         *((SWEEP,) if sweep else ("ingest", "downsample", REPORT)),
     }
     with open_runner(
-        first, options, {REPORT} if only_report else stages, study.study if study.parts else ""
+        first,
+        options,
+        {REPORT} if only_report else stages,
+        study.study if study.parts else "",
+        messages,
     ) as runner:
         runner.until = _until(options.minutes, begun)
         if study.publish and not options.retrain:
@@ -194,6 +205,7 @@ def run_study(
             with suppress(DryRunStop):
                 datasets.append(_dataset(config, study, runner))
         planned = _planned(study, jobs, runner)
+        messages.end(PLAN, name or SWEEP)
         values = {}
         if study.publish and not (options.retrain or TRAIN in runner.force):
             values = published_values(study, planned, RESULTS / study.study / SEARCHES)
