@@ -20,10 +20,10 @@ _SPELLINGS_OF = {
     "ft/s²": "ft/s² ft/s^2 ft/s2 ft/s/s fps2 fps² feet/s² feet/s^2 feet/s2 fts-2 fts^-2",
     "g": "g gs g's gn g0",
     "rad": "rad radian radians",
-    "deg": "deg ° º degree degrees grad gradi grados degré degrés 度",
+    "deg": "deg ° º degree degrees gradi grados degré degrés 度",
     "rad/s": "rad/s radian/s radians/s rads-1 rads^-1",
     "deg/s": (
-        "deg/s °/s º/s degree/s degrees/s degs-1 degs^-1 °s-1 dps grad/s gradi/s grados/s "
+        "deg/s °/s º/s degree/s degrees/s degs-1 degs^-1 °s-1 dps gradi/s grados/s "
         "degré/s degrés/s 度/s"
     ),
     "rpm": "rpm 1/min u/min r/min rev/min tr/min giri/min upm min-1 min^-1",

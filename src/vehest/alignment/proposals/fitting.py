@@ -24,7 +24,7 @@ from vehest.alignment.proposals.columns import (
 )
 from vehest.alignment.proposals.names import STRONG, is_pair
 from vehest.alignment.proposals.proposal import Proposal
-from vehest.alignment.proposals.turning import FAR_MISMATCH, Search
+from vehest.alignment.proposals.turning import CLOSE_MISMATCH, FAR_MISMATCH, Search
 from vehest.alignment.signs import MIN_SCALE_CORRELATION, relations_of
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
@@ -413,7 +413,8 @@ def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -
     rare = RARE_UNITS["ax"] if "ax" in column.hints and not (units or column.unit) else ()
     fits = [agreement(motion, column, "ax", unit, "ax") for unit in tried]
     if min(fit.mismatch for fit in fits) >= FAR_MISMATCH:
-        fits += [agreement(motion, column, "ax", unit, "ax") for unit in rare]
+        rare_fits = [agreement(motion, column, "ax", unit, "ax") for unit in rare]
+        fits += [fit for fit in rare_fits if fit.mismatch < CLOSE_MISMATCH]
     return min(fits, key=lambda fit: fit.mismatch)
 
 
