@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import io
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,9 +30,6 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
-TAIL = 1 << 16  # bytes at the end of a table, in which its last rows are
-ROWS_ABOVE = 50  # of numbers, with which the last one is compared
-MIN_ROWS_ABOVE = 10
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
 # a row with a cell that is a number, or whose first one is missing
 ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
@@ -171,10 +167,8 @@ def read_columns(
     if is_parquet(file):
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, selected)
+    opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     layout = with_names(file, layout)
-    opened = (
-        partial(finished_rows, file, layout) if text is None else partial(pa.BufferReader, text)
-    )
     convert = _conversion(selected, layout)
     if text is None:
         require_memory(file, layout)
@@ -213,7 +207,7 @@ def column_parts(
             else:
                 layout = with_names(file, layout)
                 options = _options(layout, _conversion(selected, layout), [])
-                stream = opened.enter_context(finished_rows(file, layout))
+                stream = opened.enter_context(table_stream(file))
                 opened.enter_context(decoding_failures_ignored())
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
@@ -326,84 +320,6 @@ def table_stream(file: Path) -> pa.NativeFile:
     packed = PACKED.get(regular_file(file).suffix.lower())
     # pyarrow opens no name that is not UTF-8
     return pa.input_stream(open(file, "rb"), compression=packed)
-
-
-def unfinished_line(file: Path, layout: TextLayout) -> tuple[int, str] | None:
-    """The last line of a table that ends in the middle of a row: bytes before it, and its text.
-
-    Such a line has no end, and fewer cells than the rows above it or a last cell with fewer
-    decimals than all of theirs. None where the table is complete. Raises as `table_stream` does.
-    """
-    encoding = layout.encoding
-    size = 0
-    tail = b""
-    with table_stream(file) as stream:
-        if file.suffix.lower() not in PACKED and (length := stream.size()) > TAIL:
-            size = length - TAIL
-            stream.seek(size)
-        elif encoding == "utf-16":
-            encoding = "utf-16-le" if stream.read(2) == codecs.BOM_UTF16_LE else "utf-16-be"
-            size = 2
-        while block := stream.read(BLOCK):
-            joined = tail + block
-            tail = joined[-TAIL:]
-            size += len(block)
-    text = tail.decode(encoding, errors="replace")
-    lines = re.split(r"\r\n|\n|\r", text)
-    last = lines[-1]
-    rows = list(csv.reader(lines[-1 - ROWS_ABOVE : -1], delimiter=layout.delimiter))
-    rows = [row for row in rows[1:] if row]
-    is_row = last.strip() and re.search(ROW_OF_NUMBERS, last, re.IGNORECASE)
-    if not is_row or len(rows) < MIN_ROWS_ABOVE:
-        return None
-    cells = next(csv.reader([last], delimiter=layout.delimiter))
-    is_short = len(cells) < min(map(len, rows))
-    decimals = [_n_decimals(row[-1], layout.decimal) for row in rows]
-    if not is_short and _n_decimals(cells[-1], layout.decimal) >= min(decimals):
-        return None
-    return size - len(last.encode(encoding)), last
-
-
-def _n_decimals(cell: str, decimal: str) -> int:
-    """Characters behind the decimal mark of a number, -1 for another text."""
-    number = cell.strip().strip('"').replace(decimal, ".")
-    try:
-        float(number)
-    except ValueError:
-        return -1
-    return len(number.partition(".")[2])
-
-
-class _FirstBytes(io.RawIOBase):
-    """The first bytes of a stream."""
-
-    def __init__(self, stream: pa.NativeFile, n_bytes: int) -> None:
-        self._stream = stream
-        self._remaining = n_bytes
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        block = self._stream.read(self._remaining if size < 0 else min(size, self._remaining))
-        self._remaining -= len(block)
-        return bytes(block)
-
-
-def finished_rows(
-    file: Path, layout: TextLayout, lines_of_text: list[str] | None = None
-) -> pa.NativeFile:
-    """Text of a table as `table_stream` opens it, without a last line that is cut short, which is
-    appended to ``lines_of_text``.
-    """
-    unfinished = unfinished_line(file, layout)
-    stream = table_stream(file)
-    if unfinished is None:
-        return stream
-    n_bytes, line = unfinished
-    if lines_of_text is not None:
-        lines_of_text.append(line)
-    return pa.PythonFile(_FirstBytes(stream, n_bytes), mode="r")
 
 
 def require_memory(file: Path, layout: TextLayout) -> None:

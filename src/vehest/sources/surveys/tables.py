@@ -43,12 +43,12 @@ from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_
 from vehest.sources.tables import (
     ROW_OF_NUMBERS,
     TextLayout,
-    finished_rows,
     is_parquet,
     names_of,
     parse_table,
     read_head,
     require_memory,
+    table_stream,
     with_names,
 )
 from vehest.sources.text_log import CLOCK
@@ -456,11 +456,11 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
     )
     require_memory(file, shape.layout)
+    opened = partial(table_stream, file)
     problem = None
     for convert in (inferred, text):
         lines: list[str] = []
         try:
-            opened = partial(finished_rows, file, shape.layout, lines)
             layout = with_names(file, shape.layout)
             table = parse_table(opened, layout, convert, lines_of_text=lines)
             return table, [f"line '{printable(line.strip()[:60])}'" for line in lines]
