@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
@@ -51,6 +52,7 @@ app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 MAX_ERROR_CHARACTERS = 4_000
+NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"  # of Typer
 STAGES = "Single stages, all of which `run` includes"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
@@ -1287,6 +1289,8 @@ def _fail_usage(error: Any) -> None:
     if type(error).__name__ == "NoArgsIsHelpError":  # the help is on the screen
         sys.exit(error.exit_code)
     words = error.format_message().strip().rstrip(".").replace(". Did you mean", "; did you mean")
+    words = re.sub(r" \(Possible options: (.*)\)$", r"; did you mean \1?", words)
+    words = words.replace(NOT_A_NUMBER, "a number is required, with a decimal point (2.4)")
     key = str(getattr(error, "option_name", "")).lstrip("-").partition("=")[0]
     if key in GROUPS or key in ROOT_KEYS or "." in key:
         hint = f"keys of the configuration are written without dashes: {key}=…"

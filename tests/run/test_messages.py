@@ -78,6 +78,9 @@ def _shows_only_text(text):
             ),
             "limits.jobs=NUMBER",
         ),
+        (("new", "car", "raw/one.csv", "--weelbase", "2"), "--weelbase; did you mean --wheelbase?"),
+        (("run", "small", "--minute", "5"), "no such option: --minute; did you mean --minutes?"),
+        (("new", "car", "raw/one.csv", "--wheelbase", "2,4"), "with a decimal point (2.4)"),
         *(
             (("sweep", "split=mine", f"seed={value}", "--dry-run"), words)
             for value, words in (
@@ -96,6 +99,11 @@ def _shows_only_text(text):
 )
 def test_wrong_usage_is_a_single_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
+
+
+@pytest.mark.parametrize("command", [("new", "car"), ("estimate",)])
+def test_mistyped_name_of_a_file_is_answered_with_the_close_one(place, command):
+    place.refused(*command, "raw/one.cvs", code=4, says="did you mean 'raw/one.csv'?")
 
 
 def test_hostile_names_reach_the_terminal_as_text(place):

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from vehest.data.errors import DataError, MissingError, printable
+from vehest.data.files import missing_file
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
@@ -52,7 +53,7 @@ def survey(path: Path) -> Log:
     Raises `MissingError` without file or package, `DataError` where it cannot be read.
     """
     if not path.exists():
-        raise MissingError(f"there is no file '{path}'")
+        raise missing_file(path)
     require_no_spreadsheet(path)
     log = _without_codes(_survey(path))
     for run in log.runs:
