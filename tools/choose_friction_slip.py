@@ -5,13 +5,15 @@
 MODEL are folders of learned UKFs that were trained and calibrated on the split ``sim_tyre_sets``. Each estimates drives whose tyres are
 drawn anew: of another friction and stiffness, and of another friction alone. For several values of `vehest.trust.tyre_check.FRICTION_SLIP`
 the coverage and the interval score of the 90 % band of v are written to results/tyre_check/friction_slip.csv, and the smallest value that
-covers 80 % of the samples on tyres of another friction and stiffness is printed. SIMULATED data; no drive of a test set is used.
+covers 80 % of the samples on tyres of another friction and stiffness is printed. The drives of the split's tests have rows of their own and
+choose nothing. SIMULATED data.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +45,15 @@ TYRES = {  # kind of tyres -> what each drive's car draws
     "friction": f"[{FRICTION}]",
 }
 N_DRIVES = 14  # of each kind of tyres
-SEED = 1000  # of the drives; those of the test sets follow from 0
+SEED = 1000  # of the drives; those of the tests follow from 0
+TESTS = {"test, tyre A": "test_a_*", "test, tyre D": "test_d_*"}  # name -> recordings
 
 
 def drives_on(tyres: str) -> list[Recording]:
-    """Drives of the small car on tyres of a kind, each drawn anew."""
+    """Drives of the small car on tyres of a kind, each drawn anew, or those of a test."""
+    if tyres in TESTS:
+        source = open_source(compose_config("ingest", ["dataset=sim_tyre_sets"])["dataset"])
+        return [source.read(name) for name in source.ids() if fnmatchcase(name, TESTS[tyres])]
     drives = (
         f"[{{id: develop, count: {N_DRIVES}, vehicle: tyre_a, "
         "manoeuvre: {name: freestyle, duration: [25, 30], speed: [1.2, 3.4], current: [8, 34]}}]"
@@ -91,7 +97,7 @@ def errors_and_bands(
 def table_of(folders: Sequence[str]) -> pd.DataFrame:
     """Coverage and interval score by tyres, constant and model."""
     rows = []
-    for tyres in TYRES:
+    for tyres in (*TYRES, *TESTS):
         drives = drives_on(tyres)
         for folder in folders:
             results = list(errors_and_bands(folder, drives))

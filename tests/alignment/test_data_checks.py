@@ -346,6 +346,17 @@ def test_a_spike_in_the_first_or_last_samples_is_found(rows, value, words):
     assert words in spikes[0].message
 
 
+def test_a_spike_with_a_missing_sample_inside_is_stated_by_its_largest_sample():
+    drive = clean_drive()
+    angle = 15.0 * drive["steer"]
+    angle[3000:3003] = [7.1, np.nan, 7.3]
+    channels = {**drive.channels, "handwheel": angle}
+    recording = replace(drive, channels=channels, gappy=frozenset({"handwheel"}))
+    found = checks_of_recording(recording)
+    (message,) = [one.message for one in found if one.check == "spike"]
+    assert f"the largest 7.3 rad at t = {drive.time[3002]:.12g} s" in message
+
+
 def test_a_spike_beside_missing_samples_is_found_and_a_manoeuvre_at_the_start_is_none():
     drive = clean_drive()
     gappy = 15.0 * drive["steer"]

@@ -258,7 +258,7 @@ def test_candidate_that_was_trained_once_gets_no_verdict():
     }
     verdict = judged(claim_of(), studied(a=ratio(0.5), b=LEVELS), trained)
     assert verdict.verdict == "no significant difference"
-    assert "a with one seed" in verdict.reason
+    assert "a has one seed" in verdict.reason
     twice = studied(a=[ratio(0.5), ratio(0.5)], b=LEVELS)
     assert judged(claim_of(), twice, trained).verdict == "reproduced"
     limit = claim_of("limit", direction="lower", limit=1.0)

@@ -349,8 +349,9 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             and counts[rows[begin:end]].all()
         ]
         if spikes:
-            worst = max(spikes, key=lambda run: float(np.abs(samples[run[0] : run[1]]).max()))
-            at = worst[0] + int(np.argmax(np.abs(samples[worst[0] : worst[1]])))
+            sizes = np.abs(samples)
+            begin, end = max(spikes, key=lambda run: float(np.nanmax(sizes[slice(*run)])))
+            at = begin + int(np.nanargmax(sizes[begin:end]))
             unit = CHANNELS[name].unit
             message = (
                 f"{number_of(len(spikes), 'spike')} of at most "
@@ -504,8 +505,8 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     runs = _lasting_runs(backwards & (recording["vx"] > REVERSE_SPEED), recording)
     if len(runs):
         message = (
-            f"unsigned: positive while the car reverses in "
-            f"{number_of(len(runs), 'segment')}, the longest {_longest(runs, recording)}"
+            f"unsigned: positive while the car reverses in {number_of(len(runs), 'segment')}, "
+            f"the longest {_longest(runs, recording)}"
         )
         yield Finding(
             "warning",

@@ -13,15 +13,12 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from difflib import get_close_matches
 from functools import cache
-from itertools import islice
 from pathlib import Path
 
-from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.errors import DataError, MissingError, VehestError, closest
 
 ASIDE_PREFIX = ".writing-"
-MAX_COMPARED_NAMES = 1_000  # of a folder, with a mistyped one
 _ASIDE = re.compile(
     rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?"
 )  # process and host before the name
@@ -76,10 +73,10 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
 def missing_file(path: Path) -> MissingError:
     """The error for a file that does not exist, with a name of its folder that is close to it."""
     names: list[str] = []
-    with suppress(OSError), os.scandir(path.parent) as entries:
-        names = [entry.name for entry in islice(entries, MAX_COMPARED_NAMES)]
-    close = get_close_matches(path.name, sorted(names), n=1, cutoff=0.75)
-    hint = f"; did you mean '{path.parent / close[0]}'?" if close else ""
+    with suppress(OSError):
+        names = sorted(os.listdir(path.parent))
+    close = closest(path.name, names)
+    hint = f"; did you mean '{path.parent / close}'?" if close else ""
     return MissingError(f"there is no file '{path}'{hint}")
 
 

@@ -155,8 +155,8 @@ def _check_rows(names: Sequence[str]) -> None:
 def _named_by_estimator(
     tables: Mapping[str, Estimate], models: Sequence[str]
 ) -> dict[str, Estimate]:
-    """Estimates by the estimator that their tables record; by the file's name where a table records
-    none, or where the estimator names another row, too.
+    """Estimates by the estimator that their tables record; by the file's name where that is the
+    name of another row.
     """
     names = Counter([*(estimate.estimator for estimate in tables.values()), *models, *BASELINES])
     names.update(stem for stem, estimate in tables.items() if stem != estimate.estimator)

@@ -160,7 +160,7 @@ def read_estimate_table(
     vy = table[channel]
     if channel == "sideslip_ref":
         # at standstill the angle is noise, of which a tangent can make any velocity
-        vy = vx * np.tan(np.where(np.abs(vx) < STANDSTILL_SPEED, 0.0, vy))
+        vy = vx * np.tan(np.where(np.abs(vx) < STANDSTILL_SPEED, 0.0, table[channel]))
     return Estimate(
         drive.id,
         file.stem,

@@ -374,7 +374,8 @@ def _without_single_trainings(
     verdict = judgement.verdict
     if verdict in ("reproduced", "direction only", "contradicted", "met by a trivial baseline"):
         verdict = "no significant difference" if claim.kind == "order" else "inconclusive"
-    words = f"{' and '.join(names)} with one seed: two at least are needed"
+    verb = "has" if len(names) == 1 else "have"
+    words = f"{' and '.join(names)} {verb} one seed; at least two are needed"
     return replace(judgement, verdict=verdict, reason=f"{judgement.reason}; {words}")
 
 
