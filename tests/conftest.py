@@ -25,6 +25,14 @@ def _single_core():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _no_lines_by_the_clock():
+    """No stage of this process is named because the machine is slow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vehest.run.console.MAX_SILENT_SECONDS", 3600.0)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _composed_once():
     """Hydra composes the same overrides over the same files of ./conf once, which takes it 0.1 s.
 

@@ -224,8 +224,9 @@ class Place:
         before = self.files()
         exit_code, _, err = self(*arguments)
         assert exit_code != 0
-        progress = ("done", "reused", "once", "running")
-        lines = [line for line in err.splitlines() if not line.startswith(progress)]
+        lines = [
+            line for line in err.splitlines() if not line.startswith(("done", "reused", "once"))
+        ]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
         assert {

@@ -74,7 +74,11 @@ def outcome(exit_code, stderr, changed=()):
         (True, outcome(3, "error: no\n"), "refused"),
         (False, outcome(3, "error: no\n"), "ok"),
         (True, outcome(0, "warning something\n"), "ok"),
-        (False, outcome(3, "done    ingest     mine\nwarning something\nerror: no\n"), "ok"),
+        (
+            False,
+            outcome(3, "done    ingest     a\nrunning ingest     b\nwarning c\nerror: no\n"),
+            "ok",
+        ),
         (False, outcome(3, "/a/b.py:3: RuntimeWarning: overflow\nerror: no\n"), "several lines"),
         (False, outcome(7, "error: no\n"), "exit1"),
         (False, outcome(0, "", ("up/up/up/place/outputs/a",)), "ok"),

@@ -26,7 +26,7 @@ VERDICTS = {
     "leftovers": "half-written or temporary files stayed",
 }
 EXIT_CODES = frozenset({0, 2, 3, 4, 5, 130, 141, 143})
-PROGRESS = ("done ", "reused ", "would ", "once ", "failed ", "stopped ", "warning")
+PROGRESS = ("done ", "reused ", "running ", "would ", "once ", "failed ", "stopped ", "warning")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f\x80-\x9f]")
 
 
