@@ -413,7 +413,13 @@ def _figure(curve: Curve) -> MatplotlibFigure:
             (ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan
         )
         if math.isfinite(nothing):
-            axes.axhline(nothing, color="black", linewidth=0.7, linestyle=(0, (4, 3)))
+            axes.axhline(
+                nothing,
+                color="black",
+                linewidth=0.7,
+                linestyle=(0, (4, 3)),
+                label="zero-sideslip baseline",
+            )
         axes.set_xscale("log")
         axes.set_yscale("log")
         for axis in (axes.xaxis, axes.yaxis):

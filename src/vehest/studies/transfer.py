@@ -339,10 +339,16 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                         solid_capstyle="butt",
                     )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
-            axes.axvline(1.0, color="black", linewidth=0.7)
+            axes.axvline(1.0, color="black", linewidth=0.7, label="zero-sideslip baseline")
             static = _first(rows_of_test, "static_map") / zero
             if math.isfinite(static):
-                axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
+                axes.axvline(
+                    static,
+                    color="#999999",
+                    linewidth=0.7,
+                    linestyle=(0, (3, 2)),
+                    label="static map",
+                )
             title = str(rows_of_test["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
             lines_of_title = [
@@ -358,6 +364,12 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
             axes.set_yticks(range(len(names)), [name[2] for name in names])
             axes.set_ylim(len(names) - 0.5, -0.5)
         figure.supxlabel("RMSE(β) over that of the zero-sideslip baseline", fontsize=7.5)
+        figure.legend(
+            *grid[0, 0].get_legend_handles_labels(),
+            loc="outside upper right",
+            ncols=2,
+            fontsize=6.5,
+        )
     return figure
 
 
