@@ -208,7 +208,11 @@ class Stages:
 
     def cars(self, config: Config, datasets: Iterable[str]) -> dict[str, CarValues]:
         """Values of the cars of data sets."""
-        return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+
+        def car(name: str) -> CarValues:
+            return car_of(self.dataset_config(name, config)["dataset"])
+
+        return {name: self._once("car", name, partial(car, name)) for name in datasets}
 
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
         """How estimates are scored, with the lowest speed of sideslip on each data set, by its
