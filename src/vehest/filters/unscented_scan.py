@@ -132,6 +132,9 @@ class TorchModel(PointModel):
     def _value(
         function: Function, points: Array, inputs: Array, car: Any, out: Array, first: int, end: int
     ) -> None:
+        """Write f or h of the points of some sequences; ``function`` is bound by the
+        constructor.
+        """
         with torch.no_grad():
             value = function(*_of_torch(points, inputs, first, end))
         out[..., first:end] = value.movedim(0, -1).numpy()
@@ -147,6 +150,11 @@ class TorchModel(PointModel):
         gradients: Sequence[Array],
         *ends: int,
     ) -> None:
+        """Write the gradient of the points, and add to those of the parameters.
+
+        ``up`` is the gradient of what ``function`` returned, (S, ..., B). The function is evaluated
+        again, since nothing of the forward pass was stored.
+        """
         with torch.enable_grad():
             state, input_tensor = _of_torch(points, inputs, *ends)
             upstream = torch.from_numpy(_sequences_first(up, *ends))
@@ -163,6 +171,9 @@ class TorchModel(PointModel):
 
 
 def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tensor, Tensor]:
+    """Points (B, S, n) and inputs (B, 1, p) of some sequences as tensors, which share no memory
+    with the arrays.
+    """
     return torch.from_numpy(_sequences_first(points, first, end)), torch.from_numpy(
         _sequences_first(inputs, first, end)
     ).unsqueeze(-2)
@@ -185,6 +196,9 @@ StepNoise = Array | CompiledNoise
 def _setting(
     model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None
 ) -> Setting:
+    """Rules of `unscented_steps` for a model and a precision; without a gate its limit is 0 and
+    not used.
+    """
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
     return Setting(
@@ -245,6 +259,12 @@ def unscented_scan(
     ------
     ValueError
         Shapes do not fit each other.
+
+    Returns
+    -------
+    NonlinearFiltered
+        Predicted and filtered states (B, T, n), innovations (B, T, m), which measurements were
+        used, and where a covariance was repaired, in the precision of the measurements.
 
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky
     factor: Murray 2016, arXiv 1602.07527.
@@ -337,6 +357,8 @@ class UnscentedStepper:
         The same after it; both are valid until the next step and may be changed.
     innovation, innovation_covariance, gain
         Of the last update, (m,), (m, m) and (n, m).
+
+    Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
     """
 
     def __init__(
@@ -394,14 +416,37 @@ class UnscentedStepper:
         return self.state.mean
 
     def predict(self, inputs: Array, process_noise: StepNoise) -> None:
-        """Move the state to the next sample by inputs of this one."""
+        """Move the state to the next sample by inputs of this one.
+
+        Parameters
+        ----------
+        inputs : Array
+            (p,), held from this sample to the next.
+        process_noise : StepNoise
+            Q, (1, n, n), or at the state.
+        """
         self._run(0, self.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: StepNoise) -> None:
-        """Take in the measurement."""
+        """Take in the measurement.
+
+        Parameters
+        ----------
+        measurement : Array
+            (m,); NaN where nothing was measured.
+        inputs : Array
+            (p,), of this sample.
+        observation_noise : StepNoise
+            R, (1, m, m), or at the predicted state.
+        """
         self._run(1, measurement, inputs, observation_noise)
 
     def _run(self, half: int, measurement: Array, inputs: Array, noise: StepNoise) -> None:
+        """Run half-step 0 (prediction) or 1 (update) on the tape of one sample.
+
+        The prediction writes the prior from the state after the last measurement: with one sample
+        on the tape, sample k - 1 is sample k itself.
+        """
         noise_covariance, at = (
             (noise[0], None)
             if isinstance(noise, np.ndarray)
@@ -428,8 +473,19 @@ class UnscentedStepper:
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
-    """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's
-    parameters alone.
+    """States one step later, without noise.
+
+    Parameters
+    ----------
+    model : PointModel
+        Whose transition is used.
+    states, inputs : Tensor
+        (B, n) and (B, p).
+
+    Returns
+    -------
+    Tensor
+        (B, n), differentiable in the model's parameters alone.
     """
     apply: Any = _Moved.apply
     moved_states: Tensor = apply(model, states, inputs, *model.parameters)
@@ -437,6 +493,8 @@ def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
 
 
 class _Moved(torch.autograd.Function):
+    """Autograd function of `moved`: the model's transition, and its adjoint for the parameters."""
+
     @staticmethod
     def forward(
         ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
@@ -465,6 +523,14 @@ class _Moved(torch.autograd.Function):
 
 
 class _Scan(torch.autograd.Function):
+    """Autograd function of `unscented_scan`.
+
+    Forward copies tensors to arrays by time, runs `forward` of `unscented_loops` for each share of
+    the sequences, and returns filtered means and covariances. Backward runs `backward` over the
+    same tape. Gradients of parameters are added up over the shares in the order of their first
+    sequence.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -646,4 +712,5 @@ def _by_sequence(values: Array) -> Tensor:
 
 
 def _alone(work: Callable[[int, int], None], sequences: int) -> None:
+    """Do all work in the calling thread."""
     work(0, sequences)
