@@ -81,6 +81,14 @@ def sample_phase(
         Of a batch, one a member, (M,).
     judge : Callable[[], Tensor]
         On validation samples, (M,).
+
+    An epoch draws one permutation of the samples for each member; the last batch may be smaller.
+    The losses of members are added, so that each member's gradient is that of its own loss.
+
+    Returns
+    -------
+    Phase
+        For `vehest.training.sequences.train_phases`.
     """
 
     def batches(generator: torch.Generator) -> Iterator[Draw]:

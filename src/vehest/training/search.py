@@ -1,5 +1,8 @@
 """Search inside a box for the parameters with the smallest cost: Nelder-Mead from a grid of starts,
 Optuna at once or in stages.
+
+Flow: ranges of the parameters -> starts or Optuna's proposals -> cost of each -> `SearchRecord`.
+Costs that are not finite become `UNUSABLE_COST`, so that a search goes on elsewhere.
 """
 
 from __future__ import annotations
@@ -78,6 +81,15 @@ def nelder_mead_over_grid(
     DataError
         The cost is finite nowhere.
 
+    Parameters are divided by the width of their range, so that tolerances are relative to it. Each
+    search begins with a simplex of 5 % of the box (`_simplex`). A stop counts between two starts,
+    but not before the first one is over.
+
+    Returns
+    -------
+    SearchRecord
+        With one row for each start.
+
     Source: Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
     """
     scale = np.array([high - low for low, high in box])
@@ -114,6 +126,9 @@ def finite_cost(cost: float) -> float:
 
 
 def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> SearchRecord:
+    """Record of a search from rows of start, result (K each) and cost; raises `DataError` where no
+    cost is usable.
+    """
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
     if best[-1] >= UNUSABLE_COST:
@@ -172,6 +187,15 @@ def optuna_search(
         Optuna is not installed.
     DataError
         The cost is finite nowhere.
+
+    Each stage is a study of its own with the seed ``seed`` plus its number. The box of a later
+    stage is ``shrink`` times as wide as the one before, centred at the best so far and moved inside
+    the bounds.
+
+    Returns
+    -------
+    SearchRecord
+        With one row for each evaluation, in which the start is the point itself.
 
     Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et
     al., KDD 2019; stages as in Bertipaglia et al., IEEE Intelligent Vehicles Symposium 2022.

@@ -139,6 +139,23 @@ def one_step_phase(
     """Phase that trains the model as a predictor of the next sample, without the filter.
 
     Loss: mean over pairs of samples of Σ_i w_i (f(x, u)_i - x⁺_i)², with w = ``weights.one_step``.
+
+    Each pair is mirrored with the probability ``settings.mirrored``: signs of states and inputs
+    that change under a reflection at the car's longitudinal plane are those of
+    ``filtering.mirror``.
+
+    Parameters
+    ----------
+    filtering : Any
+        Module with ``moved(states (N, n), inputs (N, p)) -> (N, n)`` and ``mirror``.
+    train, validation : Sequence[Drive]
+        True states (T, n) and inputs (T, p); pairs are of consecutive samples within a drive.
+    weights : Weights
+        Of which those of the one-step prediction count.
+    settings : ThroughFilterSettings
+        Batch size, share of mirrored pairs, and settings of the phase.
+    trainable : Callable[[str], bool]
+        Which parameters of ``filtering`` learn, by name.
     """
     before, inputs, after = _pairs(train)
     judged = _pairs(validation)
@@ -184,6 +201,32 @@ def filter_phases(
     ------
     DataError
         No training or validation drive is long enough.
+
+    A sequence starts at its true state with the initial covariance of ``filtering``; the last state
+    may be off by up to ``settings.start_spread``. Validation uses fixed sequences of
+    ``settings.validation_steps`` from true states, of which the first ones do not count.
+
+    Parameters
+    ----------
+    filtering : Any
+        See the module.
+    train, validation : Sequence[Drive]
+        Drives of any length.
+    weights : Weights
+        Of the squared errors of states.
+    settings : ThroughFilterSettings
+        Sequences, curriculum, mirroring, likelihood.
+    phase_settings : PhaseSettings
+        Of each phase; epochs of the curriculum's phases are ``settings.curriculum_epochs``.
+    trainable : Callable[[str], bool]
+        Which parameters learn, by name.
+    name : str
+        Of the last phase; those of the curriculum append their length.
+
+    Returns
+    -------
+    list[Phase]
+        The first may start noise from the residuals of the model before its first validation.
     """
     judged = sequences_of(validation, settings.validation_steps)
     judged_by = torch.nonzero(weights.validation).flatten()
@@ -261,6 +304,11 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
     ------
     DataError
         No drive is long enough.
+
+    Returns
+    -------
+    Drive
+        Of sequences (B, steps, ...), in the order of the drives.
     """
     starts = [
         (drive, first)
@@ -271,7 +319,10 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
 
 
 def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> Drive:
-    """As many sequences of each drive as fit into it, each at a random place."""
+    """As many sequences of each drive as fit into it, each at a random place.
+
+    They may overlap. Raises `DataError` where no drive is long enough.
+    """
     starts = []
     for drive in drives:
         count = len(drive.states) // steps
@@ -281,6 +332,7 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
 
 
 def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
+    """Cut sequences from (drive, first row) pairs and stack them: (B, steps, ...)."""
     if not starts:
         raise DataError(
             f"no drive is {steps} samples long, as a sequence for training through a filter is; "
@@ -306,10 +358,22 @@ def _pairs(drives: Sequence[Drive]) -> list[Tensor]:
 
 
 def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
-    """Mean negative log-likelihood of errors, (..., k), under normal distributions of these
-    covariances, (..., k, k) [nat], scalar.
+    """Mean negative log-likelihood of errors under normal distributions.
 
     ½ (eᵀ P⁻¹ e + ln det P + k ln 2π), by the Cholesky factor of P.
+
+    Parameters
+    ----------
+    error : Tensor
+        e, (..., k).
+    covariance : Tensor
+        P, (..., k, k); where it is not positive definite the result is not finite or meaningless,
+        and nothing is raised.
+
+    Returns
+    -------
+    Tensor
+        Scalar [nat].
     """
     factor = torch.linalg.cholesky_ex(covariance).L
     whitened = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
@@ -322,4 +386,5 @@ def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _weighted(error: Tensor, weights: Tensor) -> Tensor:
+    """Mean of the weighted squared error, Σ_i w_i e_i², of errors (..., n) and weights (n,)."""
     return (error.square() @ weights).mean()
