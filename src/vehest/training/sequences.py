@@ -271,7 +271,6 @@ class _Run:
         self.adam = self._new_adam()
 
     def _new_adam(self) -> Adam:
-        """Adam without moments, for the parameters that learn in this phase."""
         return Adam(self.learning.values(), self._step_size(), self.phase.settings.weight_decay)
 
     def _step_size(self) -> float:
