@@ -255,7 +255,12 @@ class DugoffUkf(DugoffFilter):
     def identify(
         self, data: FitData, training: IdentificationSettings, context: FitContext
     ) -> FitRecord:
-        """Fit tyres and levels."""
+        """Fit tyres and levels.
+
+        In this order: tyres by a genetic algorithm, sensor levels from quiet segments, process
+        noise and ``force_factor`` by a search for the smallest error of sideslip, each where it is
+        not given.
+        """
         started = time.monotonic()
         metrics: dict[str, float] = {"epochs": 0}
         history: dict[str, list[float]] = {}

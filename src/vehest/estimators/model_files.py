@@ -1,6 +1,11 @@
 """Fitted estimators on disk.
 
 Weights as safetensors, settings as YAML; loading executes no code from the files.
+
+A model is a folder of two files. ``model.yaml`` (`Description`) names the family by its registry
+name, never by an import path, with settings and origin; ``model.safetensors`` has the weights.
+`load_model` checks both before anything is built: format, version, known settings, finite numbers,
+and that the settings do not ask for more memory than the file has weights.
 """
 
 from __future__ import annotations
@@ -121,6 +126,11 @@ def load_model(folder: Path) -> Estimator:
     DataError
         A file is damaged or of another format, the estimator is unknown, a weight is not
         finite, or the weights do not fit the settings.
+
+    Returns
+    -------
+    Estimator
+        Fitted; its ``preparation`` and ``trust`` are left as they are by default.
     """
     description = read_description(folder)
     path = folder / DESCRIPTION
@@ -200,6 +210,9 @@ def _built(
     ------
     DataError
         They ask for more, or make no sense.
+
+    A whole number among the settings that exceeds the number of weights and `MIN_CHECKED_SIZE` is
+    refused before anything of that size is allocated.
     """
     for name, number in _integers(settings, "settings"):
         if number > max(MIN_CHECKED_SIZE, n_weights):

@@ -88,6 +88,14 @@ def training_phases(
         Settings of both phases.
     learns_dynamics : bool
         Whether the dynamics learn through the filter too.
+
+    Errors of states are weighted by `WEIGHTS`. The friction counts through the filter only, with
+    the weight 1; validation judges vx, vy and yaw rate alone.
+
+    Returns
+    -------
+    list of Phase
+        One-step, then through the filter.
     """
     weights = torch.tensor(WEIGHTS, dtype=train[0].states.dtype)
     last = torch.zeros(1, dtype=weights.dtype)

@@ -1,4 +1,11 @@
-"""Identifies Dugoff's tyres on drives, skidpads above all, by a genetic algorithm."""
+"""Identifies Dugoff's tyres on drives, skidpads above all, by a genetic algorithm.
+
+    recordings --axle_motion--> slip angles, forces --thinning--> at most 1,500 samples
+    --differential evolution for each axle, several restarts--> `DugoffFit`
+
+The cost of an axle is the root mean square of C tan α f(λ) - F over that of F. The load follows
+from the measured longitudinal acceleration.
+"""
 
 from __future__ import annotations
 
@@ -60,6 +67,11 @@ def fit_dugoff(
     ------
     DataError
         A channel is missing, ``ax`` has gaps, or hardly any samples are left.
+
+    Returns
+    -------
+    DugoffFit
+        Of both axles; the spread over restarts shows which parameters the drives determine.
 
     Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal
     of Global Optimization 11, 1997.

@@ -58,6 +58,11 @@ def identify_tyres(
     ------
     DataError
         No recording matches.
+
+    Returns
+    -------
+    DugoffFit
+        Parameters (2, 3) of `DugoffAxle`, of the front, then of the rear axle.
     """
     matching = [
         recording for recording in recordings if fnmatch.fnmatch(recording.id, training.tyres_from)
@@ -130,6 +135,21 @@ def search_levels(
     ------
     DataError
         A recording has no ``vy_ref``.
+
+    Parameters
+    ----------
+    estimator : DugoffFilter
+        With tyres and sensor levels; it is not changed.
+    names : sequence of str
+        Levels that are searched, of `BOXES` and ``process_yaw_rate``.
+    recordings : sequence of Recording
+        Training recordings with ``vy_ref``.
+    training : IdentificationSettings
+        Method, limits, and how errors are combined.
+    seed : int
+        Of Optuna's sampler.
+    context : FitContext
+        Progress and the wish to stop.
     """
     for recording in recordings:
         if "vy_ref" not in recording:

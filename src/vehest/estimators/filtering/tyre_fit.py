@@ -236,6 +236,13 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
     may differ in size (a sandwich of blocks): residuals of neighbouring samples are hardly
     independent, and to count them so would make intervals far too narrow.
 
+    Parameters
+    ----------
+    motion : AxleMotion
+        Slip angles and forces.
+    kind : str
+        ``linear`` or ``rational``.
+
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang
     & Zeger, Biometrika 73 (1), 1986.
     """
@@ -255,6 +262,26 @@ def _fitted(
     """Parameters of one axle, their covariance and the rms of what is left.
 
     Logarithms are fitted, so that all stay positive.
+
+    Parameters
+    ----------
+    kind : str
+        ``linear`` or ``rational``.
+    slip, force : array
+        (N,) [rad] and [N].
+    block : array
+        Number of the block of time of each sample, (N,).
+
+    Returns
+    -------
+    tuple
+        Parameters (P,), their covariance (P, P) in the parameters' units, and the root mean square
+        of residual forces [N].
+
+    Raises
+    ------
+    DataError
+        The axle never slips, or forces run against slip angles.
     """
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))

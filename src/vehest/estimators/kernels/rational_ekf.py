@@ -134,6 +134,11 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
 def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):
     """f: mean one step later, in place; writes the rows of A for β' and r', returns the front
     axle's force and slopes.
+
+    With c = 1/(M u) and slopes F' = ∂F/∂α:
+
+        ∂β'/∂β = -(F_F' + F_R') c,   ∂β'/∂r = (a_R F_R' - a_F F_F') c/u - 1
+        ∂r'/∂β = (a_R F_R' - a_F F_F')/J,   ∂r'/∂r = -(a_F² F_F' + a_R² F_R')/(J u)
     """
     mass, inertia, front_arm, rear_arm = car
     turn = mean[1] / speed

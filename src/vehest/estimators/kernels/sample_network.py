@@ -100,6 +100,10 @@ def losses_of(
 
 
 class _Outputs(torch.autograd.Function):
+    """Autograd function of `outputs_of`: hidden layers of all members are stored for the
+    adjoint.
+    """
+
     @staticmethod
     def forward(
         ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], dropped_parts: int, *parameters: Tensor
@@ -153,6 +157,10 @@ class _Outputs(torch.autograd.Function):
 
 
 class _Losses(torch.autograd.Function):
+    """Autograd function of `losses_of`: gradients are computed in the forward pass, since each
+    member's loss has one number, and scaled in the backward pass.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -239,6 +247,11 @@ def gaussian_likelihood(outputs, targets, gradient):
 
 @compiled
 def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out):
+    """Write both hidden layers (B, H₁), (B, H₂) and the outputs (B, O) of one member; see the
+    module.
+
+    Masks follow from ``seed`` and the number of the layer; ``dropped_parts`` 0: none.
+    """
     np.dot(x, w1, first)
     _activate(first, b1, seed, 0, dropped_parts)
     np.dot(first, w2, second)
@@ -253,6 +266,12 @@ def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out)
 def _backward(
     x, w2, w3, dropped_parts, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar
 ):
+    """Write gradients of weights and biases of one member, given those of the outputs, ``up`` (B,
+    O).
+
+    W̄₃ = h₂ᵀ ō,  ā₂ = gate(ō W₃ᵀ),  W̄₂ = h₁ᵀ ā₂,  ā₁ = gate(ā₂ W₂ᵀ),  W̄₁ = xᵀ ā₁; biases are sums
+    of these over samples. Hidden layers are those that `_forward` wrote.
+    """
     np.dot(second.T, up, w3_bar)
     _summed(up, b3_bar)
     second_bar = np.empty_like(second)

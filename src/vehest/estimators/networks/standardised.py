@@ -37,7 +37,16 @@ class StandardisedNetwork(nn.Module):
         channels: Sequence[str],
         references: Sequence[str] = ("vy_ref",),
     ) -> None:
-        """Take means and standard deviations from recordings."""
+        """Take means and standard deviations from recordings.
+
+        Parameters
+        ----------
+        train : sequence of Recording
+            Taken together, sample by sample.
+        channels, references : sequence of str
+            Inputs (C of them), and what is predicted. A deviation is at least 1e-6, in the
+            channel's unit.
+        """
         parts = (
             (self.input_mean, self.input_scale, channels),
             (self.output_mean, self.output_scale, references),

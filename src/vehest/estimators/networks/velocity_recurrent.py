@@ -1,6 +1,13 @@
 """Base of recurrent networks that estimate a car's velocities from all samples so far.
 
 It trains them on sequences, estimates, and runs them online.
+
+    recordings --`_Drives`--> tensors (N, C) --cut, padded--> `_Batch` --`VelocityNetwork`--> loss
+    recording --run, SAMPLES_TOGETHER at a time, the state carried on--> velocities
+
+Without ``truncate_steps`` an epoch has sequences of one length at random places. With it, drives
+are cut whole, and a step of the optimiser follows each stretch of a batch, whose hidden state the
+next one continues.
 """
 
 from __future__ import annotations
@@ -174,7 +181,22 @@ class VelocityNetwork(StandardisedNetwork):
 
     @abstractmethod
     def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
-        """`forward` on standardised quantities."""
+        """`forward` on standardised quantities.
+
+        Parameters
+        ----------
+        inputs : Tensor
+            (B, T, C).
+        state : State
+            Before the first sample.
+        mask : Tensor or None
+            (B, T, H).
+
+        Returns
+        -------
+        tuple
+            Standardised velocities (B, T, O), and the state after the last sample.
+        """
 
 
 class RecurrentVelocityEstimator(HiddenStateEstimator):
@@ -295,7 +317,15 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
-        """Velocities [m/s, rad/s]."""
+        """Velocities [m/s, rad/s].
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, C).
+        state : tuple of Tensor
+            As `first_state` or an earlier call returned it.
+        """
         inputs = torch.from_numpy(samples.take(self._columns, 1)).to(self.network.input_mean.dtype)[
             None
         ]
@@ -389,6 +419,8 @@ class _Drives:
         """All drives, cut whole at random places into pieces of ``steps`` samples and less.
 
         First row and length of each, (N, 2).
+
+        The first piece of a drive may be shorter than ``steps``, and so may the last.
         """
         spans = []
         offset = 0
@@ -439,7 +471,17 @@ def _phase(
     train: _Drives,
     validation: _Drives,
 ) -> Phase:
-    """Weighted squared errors over sequences at random places of the drives."""
+    """Weighted squared errors over sequences at random places of the drives.
+
+    The loss of a batch is the mean, over its counted samples, of Σ_o w_o ρ(v̂_o - v_o), with the
+    weights of the settings and `robust_squares` ρ. Dropout masks, mirroring and places are drawn
+    with the batches.
+
+    Raises
+    ------
+    DataError
+        No training recording is as long as a sequence, or one for validation is too short.
+    """
     steps = training.sequence_steps
     truncated = training.truncate_steps
     dtype = train.inputs.dtype
