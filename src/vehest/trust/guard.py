@@ -126,6 +126,15 @@ def learn_limits(
 
     A range is that of any car or, if more, `MAX_OVER_TRAINING` times the largest value; a jump
     likewise; a channel may stand still for twice its longest run while the car moved.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Training drives.
+    channels : sequence of str
+        Channels that the estimator reads; one that no recording has gets the limits of any car.
+    rate_hz : float
+        Sampling rate of all recordings [Hz].
     """
     channel_limits = {}
     for name in channels:
@@ -165,6 +174,10 @@ def _largest(parts: Sequence[FloatArray]) -> float:
 
 
 def _usual(name: str, rate_hz: float) -> ChannelLimits:
+    """Limits of a channel that hold for any car, at a rate [Hz].
+
+    Channels in `FREE` have the range and the span of their table.
+    """
     table = CHANNELS[name]
     size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
     if name.startswith(FREE):
@@ -183,6 +196,7 @@ def _fastest(name: str, rate_hz: float) -> float:
 
 
 def _tan_sideslip(recording: Recording) -> FloatArray:
+    """|v|/max(|u|, 1 m/s) of a recording's references; empty where it has none."""
     name = "vx_ref" if "vx_ref" in recording else "vx"
     if not ("vy_ref" in recording and name in recording):
         return np.zeros(0)
@@ -305,7 +319,18 @@ class Guard:
         self.state[-1, 0] = WAIT
 
     def __call__(self, rows: FloatArray) -> Cleaned:
-        """Go on with further rows, (T, C)."""
+        """Go on with further rows, (T, C).
+
+        Parameters
+        ----------
+        rows : array
+            As received, in the order of the channels; any value, NaN and infinity included.
+
+        Returns
+        -------
+        Cleaned
+            Of these rows. Parts of a recording give the same as the whole.
+        """
         clean = np.empty_like(rows)
         measured = np.empty(rows.shape, np.bool_)
         flow = np.empty(len(rows), np.int8)
@@ -338,6 +363,11 @@ def guard_rows(  # type: ignore[no-untyped-def]
         level has to stand, whether an accepted jump makes the estimator start anew.
     clean, measured, flow
         Output, as in `Cleaned`.
+
+    A value within the range is accepted unless it has stood still for too long between its stops
+    while the car moves, or jumps from a value that is at most ``bridged`` samples old. A jump is
+    accepted once ``persists`` samples have confirmed its new level. The estimator waits where a
+    channel that it needs, or every skippable one, has been missing for longer than ``bridged``.
     """
     n_channels = rows.shape[1]
     vx_at, yaw_at, bridged, persists, remembers = settings

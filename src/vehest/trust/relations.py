@@ -158,6 +158,18 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
     """Feature -> (T,), of channels as they are measured.
 
     Those that need a channel that is not there are of zeros.
+
+    Parameters
+    ----------
+    samples : mapping
+        Channel -> (T,) [SI], at least one.
+    least_speed : float
+        Smallest |u| that divides [unit of the speed channel].
+
+    Returns
+    -------
+    dict
+        Of all `FEATURES` but ``v r``, which needs a relation (`slide_of`).
     """
     any_samples = next(iter(samples.values()))
     speed = speed_channel(list(samples))
@@ -185,6 +197,15 @@ def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: flo
     """v r, (T,), with v from the residual of the relation of ay, at most the speed.
 
     It is integrated with the leakage of `SLIDE_SECONDS`.
+
+    Parameters
+    ----------
+    features : mapping
+        As of `features_of`, (T,).
+    lateral : Relation
+        Of ay against the yaw rate.
+    rate_hz : float
+        Sampling rate [Hz].
     """
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
     drift = scipy.signal.lfilter(
@@ -265,6 +286,21 @@ def learn_relations(
     """Coefficients of every relation, from drives at one rate [Hz].
 
     NaN and samples below ``least_speed`` are left out.
+
+    Both sides are low-passed by the same filter of `LOW_PASS_SECONDS` before the fit. The
+    coefficient of v r is -1 by kinematics and not fitted. A relation with fewer than `MIN_ROWS`
+    samples is left out.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Healthy drives with all ``channels``.
+    channels : sequence of str
+        Among which relations are looked for.
+    rate_hz : float
+        Sampling rate of all recordings [Hz].
+    least_speed : float
+        See `least_speed_of`.
     """
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
@@ -339,7 +375,22 @@ def _fill_gaps(samples: FloatArray) -> FloatArray:
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:
-    """Least squares, reweighted ten times by Huber's function of residual over median size."""
+    """Least squares, reweighted ten times by Huber's function of residual over median size.
+
+    Columns are scaled to a root mean square of 1, and a ridge of 1e-9 keeps the equations regular.
+
+    Parameters
+    ----------
+    design : array
+        (N, K).
+    target : array
+        (N,).
+
+    Returns
+    -------
+    array
+        Coefficients, (K,).
+    """
     size = np.maximum(np.sqrt(np.mean(np.square(design), axis=0)), 1e-300)
     scaled = design / size
     weight = np.ones(len(target))
