@@ -207,6 +207,7 @@ def _between(function: Any, write: Any, truth: bool = False) -> None:
             return kind and signature(Lanes(types.boolean, kind.count) if truth else kind, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Write the instruction for two operands, with a number copied to every lane."""
         kind = _pair(*sig.args)
         one, other = (
             _vector(context, builder, value, own, kind)
@@ -278,6 +279,7 @@ def _by_llvm(name: str) -> Any:
     """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Call the intrinsic for the vector's type."""
         own = args[0].type
         return builder.call(
             builder.module.declare_intrinsic(

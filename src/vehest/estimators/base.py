@@ -227,7 +227,7 @@ class Estimator(Fittable):
         sample : array
             Values of ``channels``, (C,).
         initial_state : mapping
-            What a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
+            Known values of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
             otherwise.
         """
         return None

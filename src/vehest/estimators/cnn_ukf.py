@@ -134,7 +134,7 @@ class Cuts(NamedTuple):
 class CnnUkf(NetworkUkf):
     """Filter with a sideslip angle, its variance and process noise by a network, at each sample.
 
-    Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy
+    Its 1x1 convolutions over time read one sample each, so it is a network of samples. σ_DD, σ_Vy
     and σ_ψ̇ come out of logistic functions; all three are standard deviations here, in pre-training
     too, where Eq. 6 has σ_DD as a variance: R = σ_DD² + ε, and ε is added rather than a bound, so
     that it has a gradient everywhere.
@@ -307,6 +307,7 @@ class CnnUkf(NetworkUkf):
         dropout = self.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
+            """Loss of outputs (1, N, 4) against scaled angles, one a member, (1,)."""
             output = self.output_of(outputs)
             error = output.sideslip - targets.double() * network.unit.double()
             likelihood = 0.5 * (output.variance.log() + error.square() / output.variance).mean(-1)

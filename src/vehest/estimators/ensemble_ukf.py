@@ -49,6 +49,7 @@ class EnsembleSettings(SampleSettings):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for fewer trials than stages, or a limit of squared errors."""
         super().__post_init__()
         if self.scaling_trials < self.identification.stages:
             raise ConfigurationError(
@@ -155,6 +156,9 @@ class EnsembleUkf(NetworkUkf):
         quiet = FitContext(should_stop=context.should_stop)
 
         def cost(scaling: FloatArray) -> float:
+            """Mean squared error of sideslip [rad²] with the networks' variances scaled by p₁
+            and p₂.
+            """
             pseudo = [
                 PseudoMeasurement(sideslip, scaled_variance(variance, scaling, self.least_variance))
                 for sideslip, variance in moments

@@ -140,9 +140,9 @@ class FactorGraph(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """Straight ahead and unknown, or what a protocol hands over.
+        """Straight ahead and unknown, or a known initial state.
 
-        Deviations of β [rad] and r [rad/s] are ``noise.first_state``; a state that is handed over
+        Deviations of β [rad] and r [rad/s] are ``noise.first_state``; a known state
         counts as exact.
         """
         return self.first_motion(sample, np.full(2, self.noise.first_state), initial_state)

@@ -101,6 +101,7 @@ class CarSettings(Group):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for a centre of gravity that is not within the wheelbase."""
         super().__post_init__()
         if self.cg_to_rear_axle >= self.wheelbase:
             raise ConfigurationError(

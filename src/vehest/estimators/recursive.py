@@ -67,6 +67,9 @@ class Recursive(Estimator):
     values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:
+        """Make each number that is declared by `fitted` an attribute that reads and writes
+        ``values``.
+        """
         super().__init_subclass__(**options)
         for name, declared in cls.settings_type.declarations().items():
             if declared.is_fitted:

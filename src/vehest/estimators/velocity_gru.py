@@ -60,7 +60,7 @@ class VelocityGruNetwork(VelocityNetwork):
 class VelocityGru(RecurrentVelocityEstimator):
     """GRU of Srinivasan et al. 2020.
 
-    An ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it.
+    A known ``initial_state`` is ignored, since no part of the network's state is a velocity.
     """
 
     name = "velocity_gru"

@@ -245,7 +245,7 @@ def guard_table(guard: Guard) -> dict[str, Any]:
 
 
 def _endless(values: FloatArray) -> FloatArray:
-    """The same with infinity for what stands for it."""
+    """The same with infinity instead of the numbers that represent it."""
     return np.where(np.abs(values) >= ENDLESS, np.copysign(np.inf, values), values)
 
 

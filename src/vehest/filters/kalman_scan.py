@@ -45,8 +45,8 @@ def kalman_scan(
     gate : Gate | None, default None
         Which measurements are refused; none: all are taken.
     refused : NDArray[np.int64] | None, default None
-        How often on end each measurement was before the first sample, (m,); after the last one on
-        return. None: never.
+        How often in a row each measurement was refused before the first sample, (m,); after the
+        last one on return. None: never.
 
     Raises
     ------

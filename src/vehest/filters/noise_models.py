@@ -222,7 +222,7 @@ def compiled_noise(noise: StateDependentNoise, min_entropy: float = -math.inf) -
     Parameters
     ----------
     noise : StateDependentNoise
-        As it is now; later changes of its parameters are not seen.
+        As it is now; later changes of its parameters have no effect.
     min_entropy : float, default -math.inf
         See `with_entropy` [nat]; none: entropy as it is.
     """

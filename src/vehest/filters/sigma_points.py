@@ -1,4 +1,4 @@
-"""Rules by which an unscented filter stands for a normal distribution with a few points."""
+"""Rules by which an unscented filter represents a normal distribution by a few points."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ Share = Callable[[Callable[[int, int], None], int], None]
 
 
 class NonlinearFiltered(NamedTuple):
-    """What a nonlinear filter knows after a sequence."""
+    """Result of a nonlinear filter over a sequence."""
 
     steps: Filtered[Tensor]
     # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in
@@ -108,7 +108,7 @@ class TorchModel(PointModel):
     observation : Function
         h of the same, (..., m).
     parameters : Sequence[Tensor], default ()
-        Leaves that both may use and gradients are wanted for.
+        Leaves that both may use; those that require a gradient receive one.
     lower : Sequence[float] | None, default None
         See `PointModel`.
     """
@@ -499,6 +499,7 @@ class _Moved(torch.autograd.Function):
     def forward(
         ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
     ) -> Tensor:
+        """Run the transition on states as the only sigma point of each sequence."""
         points, inputs_by_time = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
         ctx.forward_values = (model, points, inputs_by_time[0])
         out = room(points.shape, points.dtype)
@@ -508,6 +509,7 @@ class _Moved(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of the parameters; states and inputs have none."""
         model, points, inputs = ctx.forward_values
         gradients = [
             np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters
@@ -547,6 +549,11 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
+        """Fill the tape from half-step 1 on, and return filtered means (B, T, n) and covariances.
+
+        Inputs have further rows for what the model saves for its adjoints where gradients are
+        needed.
+        """
         ctx.set_materialize_grads(False)
         scratch_rows = model.scratch_rows * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
         y = _by_time(measurements)
@@ -577,6 +584,11 @@ class _Scan(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of measurements, initial state, noise and parameters, in this order of
+        arguments.
+
+        Raises `RuntimeError` where noise is a function of the estimate, which has no adjoint.
+        """
         model, setting, share, tape, functions, y, u = ctx.forward_values
         if any(function is not None for function in functions):
             raise RuntimeError(
@@ -603,6 +615,9 @@ class _Scan(torch.autograd.Function):
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
+            """Run the adjoint over sequences ``first`` to ``end`` with gradients of parameters
+            of their own.
+            """
             gradients[first] = [
                 np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters
             ]

@@ -73,6 +73,9 @@ class CarRecord:
     offsets: Mapping[str, Mapping[str, Number]]
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a number beyond `LIMITS`, or a centre of gravity beyond the
+        wheelbase.
+        """
         for name, (low, high) in LIMITS.items():
             if not low < getattr(self, name).value < high:
                 raise DataError(

@@ -72,7 +72,7 @@ def random_numbers(seed: int) -> Iterator[None]:
 
 
 def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
-    """Buffers and parameters that no gradient is wanted of, by name, (M, ...).
+    """Buffers and parameters that are not trained, by name, (M, ...).
 
     Parameters
     ----------
@@ -211,6 +211,7 @@ def _plain(
     """Predictions of M members by PyTorch alone, windows (M, B, N, C) -> (M, B)."""
 
     def predict(member_parameters: Mapping[str, Tensor], batch: Tensor) -> Tensor:
+        """Predictions (B,) of one member on its windows (B, N, C); raises `ConfigurationError`."""
         predicted = torch.func.functional_call(network, dict(member_parameters), (batch,))
         if predicted.shape not in (batch.shape[:1], (*batch.shape[:1], 1)):
             raise ConfigurationError(

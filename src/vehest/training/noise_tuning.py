@@ -135,6 +135,7 @@ class IdentificationSettings(NoiseTuningSettings):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for more stages than trials."""
         super().__post_init__()
         if self.stages > self.trials:
             raise ConfigurationError(

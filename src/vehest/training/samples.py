@@ -16,7 +16,7 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):
-    """What is learnt from, as a network sees it."""
+    """Training data, as a network receives it."""
 
     inputs: Tensor  # (N, C)
     targets: Tensor  # (N,)
@@ -72,7 +72,7 @@ def sample_phase(
     settings : PhaseSettings
         Step size, epochs, patience.
     batch_size : int
-        Samples that a member sees at a time.
+        Samples of a member's batch.
     n_samples : int
         How many there are.
     members : int
@@ -92,6 +92,9 @@ def sample_phase(
     """
 
     def batches(generator: torch.Generator) -> Iterator[Draw]:
+        """All samples once, in an order of its own for each member, with a seed of dropout a
+        batch.
+        """
         order = torch.stack(
             [torch.randperm(n_samples, generator=generator) for _ in range(members)]
         )

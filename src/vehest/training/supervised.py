@@ -348,6 +348,7 @@ class _Run:
     context: FitContext
 
     def __post_init__(self) -> None:
+        """Prepare both window sets, and activate all members with the networks' present weights."""
         self.network = self.networks[0]
         self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
         self.train = _Prepared(self.network, self.train_windows, self.settings)

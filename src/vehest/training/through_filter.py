@@ -105,6 +105,7 @@ class ThroughFilterSettings(Group):
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for sequences of which nothing would count."""
         super().__post_init__()
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
             raise ConfigurationError(
@@ -162,6 +163,7 @@ def one_step_phase(
     signs = [before.new_tensor(list(filtering.mirror[part])) for part in (0, 1)]
 
     def batches(generator: torch.Generator) -> Iterable[tuple[Tensor, Tensor]]:
+        """Rows of all pairs in random order, and which of them are mirrored."""
         for rows in torch.randperm(len(before), generator=generator).split(settings.one_step_batch):
             yield rows, _chosen(len(rows), settings.mirrored, generator)
 
@@ -232,6 +234,7 @@ def filter_phases(
     judged_by = torch.nonzero(weights.validation).flatten()
 
     def judge() -> float:
+        """Weighted mean squared error of estimates on validation sequences, as in use."""
         estimated = filtering.estimate_for_validation(judged)
         error = (estimated - judged.states)[:, settings.validation_drop_steps :]
         return float(_weighted(error, weights.validation))
@@ -241,9 +244,11 @@ def filter_phases(
             filtering.begin_noise(train, settings.start_spread)
 
     def phase(steps: int, epochs: int, label: str, first: bool) -> Phase:
+        """Phase of sequences of ``steps`` samples for ``epochs`` epochs."""
         fixed = sequences_of(train, steps)
 
         def batches(generator: torch.Generator) -> Iterable[tuple[Drive, Tensor]]:
+            """Mirrored sequences (B, T, ...) with the states that they start from, (B, n)."""
             drives = fixed if settings.placing == "fixed" else placed(train, steps, generator)
             order = torch.randperm(len(drives.states), generator=generator)
             for rows in order.split(settings.batch_size):
@@ -264,6 +269,9 @@ def filter_phases(
                 yield batch, start
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
+            """Weighted squared errors through the filter, plus the likelihood where it has a
+            weight.
+            """
             drives, start = batch
             truncated = settings.truncate_steps or None
             scored = slice(settings.drop_steps, None)

@@ -57,7 +57,7 @@ class Autoregression:
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows of unbroken stretches, (T, C) each.
+    """Fit orders 1 to ``max_order`` to the same rows of unbroken segments, (T, C) each.
 
     Keep that of least BIC; raises `DataError`.
 

@@ -85,6 +85,7 @@ class Quantity:
     effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for terms, factors or floors that no calibration leaves."""
         _check_terms("weights", self.weights, 0.0)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
             raise DataError(
@@ -128,6 +129,7 @@ class Bands:
     tyre_check: TyreCheck | None = None  # of the estimator's tyre model; None: it has none
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for unknown channels or numbers out of range."""
         check_channels("bands.channels", self.channels)
         _check_terms("largest", self.largest, MIN_TERM)
         check_number("bands.n_blocks", self.n_blocks, 0)

@@ -103,6 +103,9 @@ class Fault:
     size: float | None = None
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for an unknown kind, channel or severity, or a size out of
+        range.
+        """
         for name, choices in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
             value = getattr(self, name)
             if value not in choices:
@@ -141,7 +144,7 @@ class Fault:
     def condition(self) -> str:
         """``bias:ay:mild``.
 
-        A given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
+        A given size replaces the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
         """
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")

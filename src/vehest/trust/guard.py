@@ -1,11 +1,11 @@
-"""Rejects implausible samples before an estimator sees them.
+"""Rejects implausible samples before an estimator receives them.
 
     rows -> Guard -> rows, measured, flow (use, wait, restart)
 
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has
 stood still for longer than it ever did where the estimator learnt counts as not measured. Channels
 that a method can do without become NaN then; the others hold the last value that was accepted, for
-half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels
+half a second at most. After longer gaps the estimator starts anew when the channels
 are back.
 """
 
@@ -84,6 +84,7 @@ class ChannelLimits:
     )
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for limits in the wrong order or out of range."""
         if not self.low < self.high:
             raise DataError(f"low must be below high, not {self.low:.4g} and {self.high:.4g}")
         check_number("jump", self.jump, math.ulp(0.0))
@@ -102,6 +103,9 @@ class GuardLimits:
     largest_tan_sideslip: float = 1.0
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for limits that are wider than a channel's table or than any car
+        allows.
+        """
         check_channels("guard.channels", list(self.channels))
         for name, limits in self.channels.items():
             table = CHANNELS[name]
@@ -265,7 +269,7 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
 
 
 class Cleaned(NamedTuple):
-    """Rows as an estimator may see them."""
+    """Rows as an estimator receives them."""
 
     # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is
     # `WAIT`

@@ -201,6 +201,7 @@ class HealthModel:
     limits_behind_front_end: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        """Bring limits of earlier versions into the present order, then check shapes and ranges."""
         channels = len(self.channels)
         relations = len(self.relations)
         for name in ("healthy", "heaviest"):
@@ -246,7 +247,7 @@ class HealthModel:
                 )
 
     def _check_ranges(self) -> None:
-        """Raise `DataError` unless numbers can be what training leaves behind."""
+        """Raise `DataError` unless numbers are in ranges that training can produce."""
         check_number("health.rate_hz", self.rate_hz, math.ulp(0.0), HIGHEST_RATE)
         for name in ("deviation", "largest", "longest_gap", "spin", "speeds"):
             check_numbers(f"health.{name}", getattr(self, name), 0.0)

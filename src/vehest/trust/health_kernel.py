@@ -269,7 +269,7 @@ def _receive(k, rows, measured, model, state):
 
     Returns the channel that has been missing for longest beyond its limit, -1 if none has.
 
-    The last value stands for one that was not measured. A channel that is back has p rows to settle
+    The last value replaces one that was not measured. A channel that is back has p rows to settle
     in.
     """
     first = state.rows[0] == 0.0

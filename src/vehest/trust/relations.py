@@ -101,6 +101,7 @@ class Relation:
     instant: bool = False  # whether it holds for each sample and not only on average
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a term that is unknown, or not available at each instant."""
         usable = (*(FEATURES[:INSTANT_FEATURES] if self.instant else FEATURES), RATE)
         for name, coefficient in self.terms.items():
             if name not in usable:
@@ -110,7 +111,7 @@ class Relation:
     def involves(self, channel: str, speed: str | None) -> int:
         """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all.
 
-        ``speed`` is the channel that u stands for.
+        ``speed`` is the channel that is used as u.
         """
         if channel in (self.target, self.partner):
             return 1
@@ -320,6 +321,7 @@ def learn_relations(
         usable_rows.append(is_usable)
 
     def smoothed(name: str) -> FloatArray:
+        """A column of all recordings, low-passed within each, at the usable samples, (N,)."""
         pairs = [
             (part[name], is_usable) for part, is_usable in zip(parts, usable_rows, strict=True)
         ]

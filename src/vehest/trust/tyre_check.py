@@ -42,6 +42,7 @@ class TyreCheck:
     weights: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a friction or weights out of range."""
         check_number("tyre_check.friction", self.friction, 1e-3, 1e2)
         check_numbers("tyre_check.weights", self.weights, 0.0, MAX_WEIGHT)
 

@@ -63,6 +63,7 @@ class LoadedCar:
     cg_height: float = 0.52
 
     def __post_init__(self) -> None:
+        """Check all values against `RANGES`."""
         check_parameters(self)
 
     def loads(self, ax: Tensor) -> tuple[Tensor, Tensor]:

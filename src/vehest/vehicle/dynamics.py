@@ -261,8 +261,9 @@ class NeuralCar(Dynamics):
 class TyreNetworkCar(Dynamics):
     """NNTF and NNT: single track with a network for the tyres (Eqs. 6 and 5).
 
-    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network sees vx, vy, yaw rate, rim speed,
-    friction, steering angle and slips. NNT: forces are 0.4 o, and it sees the motor's current too.
+    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network receives vx, vy, yaw rate, rim
+    speed, friction, steering angle and slips. NNT: forces are 0.4 o, and it receives the motor's
+    current too.
 
     Parameters
     ----------

@@ -62,6 +62,7 @@ class SingleTrackParameters:
     cornering_stiffness_rear: float  # the same of the rear axle [N/rad]
 
     def __post_init__(self) -> None:
+        """Check all values against `RANGES`."""
         check_parameters(self)
 
 

@@ -159,6 +159,7 @@ def search_levels(
             )
 
     def cost(powers: FloatArray) -> float:
+        """Error of sideslip [rad²] with levels at these powers of ten, (K,)."""
         levels = estimator.levels | dict(zip(names, (10.0**powers).tolist(), strict=True))
         return estimator.mean_squared_error(
             recordings, training.skip_seconds, levels, training.error, limit=training.error_limit

@@ -101,7 +101,7 @@ class SideslipFilter(GatedFilter, Recursive):
     ) -> Gaussian[FloatArray]:
         """β and r before the first sample.
 
-        0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over.
+        0 with standard deviations (n ≥ 2), further states too, or a known initial state.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)

@@ -48,7 +48,7 @@ class SigmaPointEstimator(GatedFilter):
         """
 
     def online(self) -> Stepper:
-        """A stepper that starts from the first sample it sees."""
+        """A stepper that starts from the first sample that it receives."""
         self.require_fitted()
         return SigmaPointStepper(self)
 

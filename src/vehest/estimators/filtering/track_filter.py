@@ -112,7 +112,7 @@ class TrackFilter:
     ) -> Gaussian[Tensor]:
         """State before the first measurement.
 
-        Straight ahead and unknown, rolling where the car is slow, or what is handed over.
+        Straight ahead and unknown, rolling where the car is slow, or a known initial state.
 
         Parameters
         ----------

@@ -1,13 +1,13 @@
 """Fit of axle curves, force over slip angle, to drives whose sideslip angle was measured.
 
-A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small
-steering angles taken for granted (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
+A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, with
+small steering angles assumed (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
 
     F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,
     α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
 
-The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle
-carries what it carries at rest.
+The paper has its forces from another tool, TRICK, which also provides the vertical ones; here an
+axle carries what it carries at rest.
 """
 
 from __future__ import annotations
@@ -190,6 +190,7 @@ def _motion_of(
     )
 
     def smoothed(samples: FloatArray, derivative: int = 0) -> FloatArray:
+        """A signal or its derivative by a local polynomial; NaN at the ends and around gaps."""
         step = 1.0 / recording.rate_hz
         fitted = signal.savgol_filter(
             samples,
@@ -309,6 +310,7 @@ def _fitted(
     spread = math.sqrt(float(np.mean((force - stiffness * slip) ** 2)))
 
     def misfit(log_parameters: FloatArray, weight: float) -> FloatArray:
+        """Weighted residuals of forces, and that of the prior of ln c₁ where c₁ is fitted."""
         residuals = weight * (axle_force(kind, np.exp(log_parameters), slip) - force)
         return (
             np.append(

@@ -13,9 +13,9 @@ in order, stage by stage.
 
 Points lie side by side in columns, so that what is computed of each runs along rows; columns are as
 many as fill whole vectors, and those beyond the points repeat the last one and have no gradient. A
-network sees a point a row, its units side by side: its matrix products are as fast for a few points
-as for many. The adjoint computes stages again instead of storing them. Blocks of sequences are
-small enough for a core's own cache; matrix products stay on their thread.
+network receives a point a row, its units side by side: its matrix products are as fast for a few
+points as for many. The adjoint computes stages again instead of storing them. Blocks of sequences
+are small enough for a core's own cache; matrix products stay on their thread.
 
 In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three
 layers, then their weights transposed; learnt numbers in the order of `LEARNT` and `PACEJKA`; fixed
@@ -652,8 +652,8 @@ def _gather_points(points, inputs, first, end):
 
 @piece
 def _room(points, x, car):
-    """For what the network sees of so many points, slips, both hidden layers, its outputs, forces,
-    and rates without what it adds.
+    """Memory for the network's features of so many points, slips, both hidden layers, its outputs,
+    forces, and rates without what it adds.
     """
     (T1, _, T2) = car[0][:3]
     columns = x.shape[1]

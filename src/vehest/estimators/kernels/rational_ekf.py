@@ -59,7 +59,7 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
         measurements the model may be unstable; and variances of the first four states of a car that
         rolls, (4,).
     gate
-        Its deviations squared, inf: none; its patience in samples; and how often on end yaw rate
+        Its deviations squared, inf: none; its patience in samples; and how often in a row yaw rate
         and ay were refused before the first sample, (2,), after the last one on return.
     state
         Mean (n,) and covariance (n, n) at the first sample before its measurement; at the last

@@ -137,6 +137,7 @@ class Recursion(NamedTuple):
             adam = (flat, flat, flat, flat, *[0.0] * 6)
 
         def work(m: int, end: int) -> None:
+            """Run the loop over the members from ``m`` to ``end``."""
             adam_rows = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
             parts = (
                 starts[m:end],

@@ -87,7 +87,7 @@ def losses_of(
     targets : Tensor
         (N,).
     rows : Tensor
-        Which of them each member sees, int64 (M, B).
+        Which of them each member is trained on, int64 (M, B).
     parameters : Sequence[Tensor]
         See `outputs_of`; likewise ``seeds`` and ``dropout``.
     criterion : Criterion
@@ -108,6 +108,7 @@ class _Outputs(torch.autograd.Function):
     def forward(
         ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], dropped_parts: int, *parameters: Tensor
     ) -> Tensor:
+        """Outputs of all members, each from its own inputs or the common ones."""
         x = inputs.contiguous().numpy()
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
         members = len(weights[0])
@@ -134,6 +135,7 @@ class _Outputs(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of weights and biases; inputs and seeds have none."""
         x, weights, layers, dropped_parts = ctx.forward_values
         up = upstream[0].contiguous().numpy()
         gradients = [np.empty_like(weight) for weight in weights]
@@ -172,6 +174,10 @@ class _Losses(torch.autograd.Function):
         criterion: Criterion,
         *parameters: Tensor,
     ) -> Tensor:
+        """Losses (M,), and gradients of all parameters for an upstream gradient of 1.
+
+        Hidden layers are allocated once for each thread and reused by its members.
+        """
         x, y, chosen, drawn = (tensor.numpy() for tensor in (table, targets, rows, seeds))
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
         gradients = [np.empty_like(weight) for weight in weights]
@@ -206,6 +212,7 @@ class _Losses(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Multiply each member's gradients by the upstream gradient of its loss."""
         scaled = (
             torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1)))
             for gradient in ctx.forward_values

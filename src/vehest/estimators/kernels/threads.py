@@ -34,7 +34,7 @@ def threads_for_members() -> Iterator[None]:
 
 
 def over_members(work: Callable[[int, int], None], members: int, pieces: int = PIECES) -> None:
-    """Call ``work(first, end)`` on stretches of the members (or whatever else can be worked on one
+    """Call ``work(first, end)`` on ranges of the members (or whatever else can be worked on one
     by one), ``pieces`` for each thread.
 
     They run side by side on as many threads as torch is allowed; what is computed does not depend

@@ -101,12 +101,14 @@ class _Predict(torch.autograd.Function):
     def forward(
         ctx: Any, flat: Tensor, prepared: Tensor, starts: Tensor, recursion: Recursion
     ) -> Tensor:
+        """Predictions (M, B) of flat parameters (M, K)."""
         ctx.recursion = recursion
         ctx.arrays = [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)]
         return torch.from_numpy(recursion.values(*ctx.arrays))
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradient by the parameters, for which the recursion runs forward once more."""
         return (
             torch.from_numpy(ctx.recursion.gradient(*ctx.arrays, upstream[0].contiguous().numpy())),
             None,

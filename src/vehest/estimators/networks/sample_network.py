@@ -153,8 +153,8 @@ class SampleNetwork(nn.Module):
 
     Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0
     and a deviation of 1; a constant one becomes 0. Targets are divided by their root mean square in
-    training. Both are kept with the weights and are not parameters. A network says O numbers of a
-    sample.
+    training. Both are kept with the weights and are not parameters. A network returns O numbers
+    for a sample.
 
     Source: Bertipaglia et al. 2024, Section III-A.
     """

@@ -106,6 +106,9 @@ class SequenceSettings(Group):
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for sequences that are not longer than what is dropped of
+        them.
+        """
         super().__post_init__()
         for name, dropped in (
             ("sequence_steps", self.dropped_steps),
@@ -203,7 +206,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity
-    to start from; the network sees it only if it is among ``inputs``. The loss is that of
+    to start from; the network receives it only if it is among ``inputs``. The loss is that of
     Węgrzynowski et al. 2024: squared errors, each output with its weight, over sequences without
     their first samples.
     """
@@ -504,6 +507,9 @@ def _phase(
     carried: list[State] = []
 
     def errors(batch: _Batch, dropped: int) -> Tensor:
+        """Weighted squared errors (B, T - dropped); remembers the last state for the next
+        stretch.
+        """
         outputs, state = network(
             batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask
         )
@@ -514,6 +520,9 @@ def _phase(
         return weighted
 
     def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:
+        """Dropout's factors of the hidden state (B, T, H), with a mean of 1; None without
+        dropout.
+        """
         if not settings.dropout:
             return None
         is_active = (
@@ -523,6 +532,7 @@ def _phase(
         return is_active.to(dtype) / (1.0 - settings.dropout)
 
     def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
+        """A batch in which each sequence is mirrored with the probability of the settings."""
         if not training.mirrored:
             return batch
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
@@ -530,6 +540,7 @@ def _phase(
         return batch.scaled(inputs, outputs)
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
+        """Batches of sequences of one length, each starting from measured velocities."""
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):
             yield mirrored(
                 train.cut(chosen, torch.arange(steps), mask_of(len(chosen), steps, generator)),
@@ -537,6 +548,9 @@ def _phase(
             )
 
     def stretches(generator: torch.Generator) -> Iterator[_Batch]:
+        """Batches of pieces, each yielded in parts of ``truncated`` samples that continue each
+        other.
+        """
         pieces = train.pieces(steps, generator)
         for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(
             training.batch_size
@@ -552,11 +566,13 @@ def _phase(
                 yield batch.stretch(first, first + truncated)
 
     def loss(batch: _Batch) -> Tensor:
+        """Mean weighted squared error over the samples that count."""
         if batch.counted is None:
             return errors(batch, training.dropped_steps).mean()
         return (errors(batch, 0) * batch.counted).sum() / batch.counted.sum().clamp(min=1.0)
 
     def validate() -> float:
+        """Mean weighted squared error over all validation sequences."""
         samples = torch.cat(
             [errors(batch, training.settling_steps).reshape(-1) for batch in judged]
         )

@@ -56,7 +56,7 @@ class WindowedEstimator(Network):
     window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
-        """A network that knows the ranges of the training recordings.
+        """A network with the ranges of the training recordings.
 
         Means and deviations if it is a `StandardisedNetwork`.
         """
