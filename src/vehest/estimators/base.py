@@ -70,15 +70,15 @@ class Stepper(ABC):
 
         A method that has a covariance also returns ``vy_variance`` [m²/s²].
 
-        Raises
-        ------
-        DataError
-            A channel is missing.
-
         Parameters
         ----------
         sample : mapping
             Channel -> value; further channels are ignored.
+
+        Raises
+        ------
+        DataError
+            A channel is missing.
         """
 
 

@@ -35,6 +35,9 @@ def implicit_euler_observer(
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
+    The 2 × 2 system is solved in closed form; its determinant is at least 1 for α ≥ 0. Where |ω| is
+    below the threshold the state is not observable, and becomes v = 0, u = u_m.
+
     Parameters
     ----------
     measurements : FloatArray
@@ -45,9 +48,6 @@ def implicit_euler_observer(
         |yaw rate| below which the state is reset [rad/s].
     v, u : float
         Lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
-
-    The 2 × 2 system is solved in closed form; its determinant is at least 1 for α ≥ 0. Where |ω| is
-    below the threshold the state is not observable, and becomes v = 0, u = u_m.
 
     Source: Da Lio et al. 2023, Appendix A, with the gains in the order of Appendix B; Farrelly &
     Wellstead 1996.

@@ -119,6 +119,11 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
 def load_model(folder: Path) -> Estimator:
     """Read a fitted estimator back.
 
+    Returns
+    -------
+    Estimator
+        Fitted; its ``preparation`` and ``trust`` are left as they are by default.
+
     Raises
     ------
     MissingError
@@ -126,11 +131,6 @@ def load_model(folder: Path) -> Estimator:
     DataError
         A file is damaged or of another format, the estimator is unknown, a weight is not
         finite, or the weights do not fit the settings.
-
-    Returns
-    -------
-    Estimator
-        Fitted; its ``preparation`` and ``trust`` are left as they are by default.
     """
     description = read_description(folder)
     path = folder / DESCRIPTION
@@ -206,13 +206,13 @@ def _built(
 ) -> Estimator:
     """Build an estimator, unless its settings need more parameters than there are weights.
 
+    A whole number among the settings that exceeds the number of weights and `MIN_CHECKED_SIZE` is
+    refused before anything of that size is allocated.
+
     Raises
     ------
     DataError
         They ask for more, or make no sense.
-
-    A whole number among the settings that exceeds the number of weights and `MIN_CHECKED_SIZE` is
-    refused before anything of that size is allocated.
     """
     for name, number in _integers(settings, "settings"):
         if number > max(MIN_CHECKED_SIZE, n_weights):

@@ -138,11 +138,6 @@ class Recursive(Estimator):
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
 
-        Raises
-        ------
-        DataError
-            The recordings do not determine the values.
-
         Parameters
         ----------
         data : FitData
@@ -156,6 +151,11 @@ class Recursive(Estimator):
         -------
         tuple
             Numbers by name, and the record.
+
+        Raises
+        ------
+        DataError
+            The recordings do not determine the values.
         """
         values = self.closed_form(data.train)
         if values is not None:

@@ -160,15 +160,15 @@ def refuse_unresolved(trust: Trust | None) -> None:
 
     A channel that was computed from the others does.
 
-    Raises
-    ------
-    ConfigurationError
-        There is such a channel.
-
     Parameters
     ----------
     trust : Trust or None
         Calibration; without health nothing is refused.
+
+    Raises
+    ------
+    ConfigurationError
+        There is such a channel.
     """
     if trust is None or trust.health is None:
         return

@@ -48,9 +48,9 @@ class Gate(NamedTuple):
 def refuses(error, variance, limit, patience, refused, i):  # type: ignore[no-untyped-def]
     """Decide whether measurement i is refused, and update its counter.
 
-    A refusal counts up to twice the patience; an accepted measurement counts an open gate down by
-    one, and sets the counter of a closed one to 0. The gate is open while the counter is above the
-    patience.
+    A contradiction counts up to twice the patience; an accepted measurement counts an open gate
+    down by one, and sets the counter of a closed one to 0. The gate is open while the counter is
+    above the patience.
 
     Parameters
     ----------

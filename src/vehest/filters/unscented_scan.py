@@ -255,16 +255,16 @@ def unscented_scan(
     gate : Gate | None, default None
         Which measurements are refused; none: all are taken. The decision itself has no gradient.
 
-    Raises
-    ------
-    ValueError
-        Shapes do not fit each other.
-
     Returns
     -------
     NonlinearFiltered
         Predicted and filtered states (B, T, n), innovations (B, T, m), which measurements were
         used, and where a covariance was repaired, in the precision of the measurements.
+
+    Raises
+    ------
+    ValueError
+        Shapes do not fit each other.
 
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky
     factor: Murray 2016, arXiv 1602.07527.
@@ -335,6 +335,8 @@ def unscented_scan(
 class UnscentedStepper:
     """The same filter of one sequence, one sample at a time.
 
+    Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
+
     Parameters
     ----------
     model : PointModel
@@ -357,8 +359,6 @@ class UnscentedStepper:
         The same after it; both are valid until the next step and may be changed.
     innovation, innovation_covariance, gain
         Of the last update, (m,), (m, m) and (n, m).
-
-    Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
     """
 
     def __init__(

@@ -781,7 +781,7 @@ def _cholesky(A, L, n):
     Returns 1 in lanes in which the matrix is positive definite, else 0.
 
     Column by column, with sums over earlier columns in order. Where a matrix is not positive
-    definite, its factor is NaN; the upper triangle becomes 0, or NaN with it.
+    definite, its factor is incomplete and usually NaN; the upper triangle becomes 0, or NaN.
     """
     nothing = _scratch_row(A, 0) * 0
     definite = choose(nothing == 0, nothing + 1, 0.0)

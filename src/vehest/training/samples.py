@@ -63,6 +63,9 @@ def sample_phase(
 ) -> Phase:
     """Members learn from all samples, each in an order of its own; what is judged is their mean.
 
+    An epoch draws one permutation of the samples for each member; the last batch may be smaller.
+    The losses of members are added, so that each member's gradient is that of its own loss.
+
     Parameters
     ----------
     name : str
@@ -81,9 +84,6 @@ def sample_phase(
         Of a batch, one a member, (M,).
     judge : Callable[[], Tensor]
         On validation samples, (M,).
-
-    An epoch draws one permutation of the samples for each member; the last batch may be smaller.
-    The losses of members are added, so that each member's gradient is that of its own loss.
 
     Returns
     -------

@@ -62,6 +62,10 @@ def nelder_mead_over_grid(
     """Minimise a cost that need not be smooth nor finite, keeping the best of several local
     searches.
 
+    Parameters are divided by the width of their range, so that tolerances are relative to it. Each
+    search begins with a simplex of 5 % of the box (`_simplex`). A stop counts between two starts,
+    but not before the first one is over.
+
     Parameters
     ----------
     cost : Cost
@@ -76,19 +80,15 @@ def nelder_mead_over_grid(
     context : FitContext
         Progress and the wish to stop.
 
-    Raises
-    ------
-    DataError
-        The cost is finite nowhere.
-
-    Parameters are divided by the width of their range, so that tolerances are relative to it. Each
-    search begins with a simplex of 5 % of the box (`_simplex`). A stop counts between two starts,
-    but not before the first one is over.
-
     Returns
     -------
     SearchRecord
         With one row for each start.
+
+    Raises
+    ------
+    DataError
+        The cost is finite nowhere.
 
     Source: Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
     """
@@ -164,6 +164,10 @@ def optuna_search(
     """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps
     in smaller ones around the best so far.
 
+    Each stage is a study of its own with the seed ``seed`` plus its number. The box of a later
+    stage is ``shrink`` times as wide as the one before, centred at the best so far and moved inside
+    the bounds.
+
     Parameters
     ----------
     cost : Cost
@@ -181,21 +185,17 @@ def optuna_search(
     shrink : float, default 0.3
         Width of the box of a stage, relative to that of the stage before.
 
+    Returns
+    -------
+    SearchRecord
+        With one row for each evaluation, in which the start is the point itself.
+
     Raises
     ------
     MissingError
         Optuna is not installed.
     DataError
         The cost is finite nowhere.
-
-    Each stage is a study of its own with the seed ``seed`` plus its number. The box of a later
-    stage is ``shrink`` times as wide as the one before, centred at the best so far and moved inside
-    the bounds.
-
-    Returns
-    -------
-    SearchRecord
-        With one row for each evaluation, in which the start is the point itself.
 
     Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et
     al., KDD 2019; stages as in Bertipaglia et al., IEEE Intelligent Vehicles Symposium 2022.

@@ -199,11 +199,6 @@ def filter_phases(
     Loss of a batch: mean over its samples of Σ_i w_i (x̂_i - x_i)², with w = ``weights.training``,
     plus ``settings.likelihood`` times `gaussian_surprise`.
 
-    Raises
-    ------
-    DataError
-        No training or validation drive is long enough.
-
     A sequence starts at its true state with the initial covariance of ``filtering``; the last state
     may be off by up to ``settings.start_spread``. Validation uses fixed sequences of
     ``settings.validation_steps`` from true states, of which the first ones do not count.
@@ -229,6 +224,11 @@ def filter_phases(
     -------
     list[Phase]
         The first may start noise from the residuals of the model before its first validation.
+
+    Raises
+    ------
+    DataError
+        No training or validation drive is long enough.
     """
     judged = sequences_of(validation, settings.validation_steps)
     judged_by = torch.nonzero(weights.validation).flatten()
@@ -308,15 +308,15 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
     """Drives cut from their start into sequences of so many steps, without overlap; a remainder is
     left out.
 
-    Raises
-    ------
-    DataError
-        No drive is long enough.
-
     Returns
     -------
     Drive
         Of sequences (B, steps, ...), in the order of the drives.
+
+    Raises
+    ------
+    DataError
+        No drive is long enough.
     """
     starts = [
         (drive, first)

@@ -162,13 +162,6 @@ def learn_noise_levels(
 ) -> tuple[FloatArray, FloatArray]:
     """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
 
-    Returns
-    -------
-    tuple
-        Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
-        samples; and root mean squares there, (L, C), outliers cut off, between which straight
-        lines hold.
-
     Parameters
     ----------
     innovations : array
@@ -179,6 +172,13 @@ def learn_noise_levels(
         (T,), of which the size counts.
     n_levels : int
         L.
+
+    Returns
+    -------
+    tuple
+        Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
+        samples; and root mean squares there, (L, C), outliers cut off, between which straight
+        lines hold.
     """
     is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
     scaled = innovations[is_finite] / np.sqrt(np.diag(covariance))

@@ -584,14 +584,14 @@ def pooled_quantile(
     N, as in split conformal prediction. In between the level is met on average, nearly: the rest of
     the guarantee would make bands of few blocks far too wide.
 
-    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
-    (design effect).
-
     Returns
     -------
     tuple
         The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small
         for the level, where by rule it is the largest score times 1 + 1/n.
+
+    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
+    (design effect).
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
     n_blocks = len(counts)

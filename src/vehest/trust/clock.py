@@ -81,12 +81,6 @@ class SampleClock:
     def missing_before(self, time: float) -> int:
         """Take the stamp of a sample [s].
 
-        Returns
-        -------
-        int
-            Number of samples that are missing before this one, at most ``max_missing``; `REPEATED`
-            or `STOPPED` where it is not new.
-
         A stamp that is not finite counts as the next one at the input rate, and as uneven. A stamp
         that lies `RESET_SECONDS` or more before the last one sets the clock back: it is new, and
         the clock is not trusted for `RECOVERY_SECONDS`.
@@ -95,6 +89,12 @@ class SampleClock:
         ----------
         time : float
             Stamp of the sample [s].
+
+        Returns
+        -------
+        int
+            Number of samples that are missing before this one, at most ``max_missing``; `REPEATED`
+            or `STOPPED` where it is not new.
         """
         if math.isnan(self._last) and math.isfinite(time):
             self._last = self._previous = time

@@ -20,7 +20,7 @@ is passed on.
 
 `GuardedRun` runs each step over all rows of a piece up to the next wait, restart or loss;
 `GuardedStepper` runs all steps for one row. Rows pass the same compiled functions with the same
-state, so that both return the same bits, whatever the parts of a recording.
+state, so that both return the same bits.
 """
 
 from __future__ import annotations
@@ -78,9 +78,10 @@ class GuardedRun:
     neither band nor health of channels. The state of a protocol, ``initial_state``, is that at the
     first sample; ``elsewhere``: the car or its tyres are others than those that were calibrated on.
 
-    Attributes:
-        takes_parts: whether the estimator can go on where it stopped; else the recording must come
-        whole.
+    Attributes
+    ----------
+    takes_parts : bool
+        Whether the estimator continues where it stopped; else the recording must come whole.
     """
 
     def __init__(
@@ -357,11 +358,17 @@ class GuardedStepper(Stepper):
     anti-aliasing filter first. ``clock`` judges other stamps than those of `step`, such as the
     frames' that samples are formed from, and whoever passes it takes them.
 
-    Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
+    Attributes
+    ----------
+    last : dict
+        Result of the last step.
+    marks : int
+        Marks of `vehest.trust.watch` for it.
 
-    Attributes:
-        last: what the last step returned.
-        marks: of `vehest.trust.watch` for it.
+    Raises
+    ------
+    ConfigurationError
+        The estimator is not causal, or the bus is slower than it.
     """
 
     def __init__(

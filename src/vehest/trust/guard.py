@@ -350,6 +350,11 @@ def guard_rows(  # type: ignore[no-untyped-def]
 ):
     """Accept or reject values, row by row.
 
+    A value within the range is accepted unless it has stood still for too long between its stops
+    while the car moves, or jumps from a value that is at most ``bridged`` samples old. A jump is
+    accepted once ``persists`` samples have confirmed its new level. The estimator waits where a
+    channel that it needs, or every skippable one, has been missing for longer than ``bridged``.
+
     Parameters
     ----------
     rows
@@ -367,11 +372,6 @@ def guard_rows(  # type: ignore[no-untyped-def]
         level has to stand, whether an accepted jump makes the estimator start anew.
     clean, measured, flow
         Output, as in `Cleaned`.
-
-    A value within the range is accepted unless it has stood still for too long between its stops
-    while the car moves, or jumps from a value that is at most ``bridged`` samples old. A jump is
-    accepted once ``persists`` samples have confirmed its new level. The estimator waits where a
-    channel that it needs, or every skippable one, has been missing for longer than ``bridged``.
     """
     n_channels = rows.shape[1]
     vx_at, yaw_at, bridged, persists, remembers = settings

@@ -476,16 +476,16 @@ def learn_health(
     rate_hz : float
         Sampling rate of all recordings [Hz].
 
+    Returns
+    -------
+    HealthModel
+        With limits for rows as measured and for rows behind the filter from a faster bus.
+
     Raises
     ------
     DataError
         A recording has another rate or lacks a channel, there are too few samples, or no channel
         can be modelled.
-
-    Returns
-    -------
-    HealthModel
-        With limits for rows as measured and for rows behind the filter from a faster bus.
     """
     names = tuple(channels)
     for recording in (*train, *validation):
@@ -675,6 +675,11 @@ def limits_from(
     are not counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the
     blocks, and one where there are thirty blocks or more.
 
+    Rules: ``share`` is at most half way from the largest value to 1; ``domain`` is
+    `DAY_TO_DAY_FACTOR` alone; ``run`` has two samples more, and `MIN_RUN_SAMPLES` at least; the
+    others have a smallest limit (`MIN_LIMITS`). A limit that would be 0, and that of the share of a
+    channel that always repeats, is 1e300, which is never exceeded.
+
     Parameters
     ----------
     maxima : ndarray of shape (B, K)
@@ -683,11 +688,6 @@ def limits_from(
         The K statistics.
     step : float
         Sampling interval [s].
-
-    Rules: ``share`` is at most half way from the largest value to 1; ``domain`` is
-    `DAY_TO_DAY_FACTOR` alone; ``run`` has two samples more, and `MIN_RUN_SAMPLES` at least; the
-    others have a smallest limit (`MIN_LIMITS`). A limit that would be 0, and that of the share of a
-    channel that always repeats, is 1e300, which is never exceeded.
     """
     ordered = np.sort(maxima, axis=0)[::-1]
     set_aside = max(1, int(MAX_OUTLIER_SHARE * len(maxima))) if len(maxima) >= 30 else 0

@@ -100,6 +100,11 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
 
     Returns the rows done, and whether it is lost.
 
+    The bound is tan β_max · max(u, 1 m/s), with u the accepted speed, or the remembered one while
+    the car spins or no speed is known; the memory fades with `REMEMBERED_SECONDS`. The estimator is
+    lost once its estimate has been beyond the bound for `LOST_SECONDS`, or is not finite after the
+    warm-up. Without an estimate v fades with `FADE_SECONDS`.
+
     Parameters
     ----------
     vy, motion, flow
@@ -111,11 +116,6 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         Top speed, largest tan β, warm-up in samples, sampling interval [s].
     out, marks
         Output, (T,).
-
-    The bound is tan β_max · max(u, 1 m/s), with u the accepted speed, or the remembered one while
-    the car spins or no speed is known; the memory fades with `REMEMBERED_SECONDS`. The estimator is
-    lost once its estimate has been beyond the bound for `LOST_SECONDS`, or is not finite after the
-    warm-up. Without an estimate v fades with `FADE_SECONDS`.
     """
     top_speed, largest_tan, warm_up, step = settings
     for k in range(vy.shape[0]):

@@ -205,11 +205,6 @@ class CarFilter(nn.Module):
         variances that they have, but for a friction that may start anywhere within a spread: it has
         the variance of that.
 
-        Raises
-        ------
-        DataError
-            The residuals have no positive definite covariance.
-
         Parameters
         ----------
         drives : sequence of Drive
@@ -217,6 +212,11 @@ class CarFilter(nn.Module):
         start_spread : float
             Half width of the uniform distribution of the friction that a training sequence starts
             from.
+
+        Raises
+        ------
+        DataError
+            The residuals have no positive definite covariance.
         """
         with torch.no_grad():
             steps = torch.cat(

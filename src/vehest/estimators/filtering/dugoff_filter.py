@@ -317,6 +317,8 @@ def with_angles(
 ) -> tuple[Tensor, Tensor]:
     """Measurements (B, T, 5) and covariances (B, T, 5, 5) with a network's angles as the last.
 
+    The fifth measurement is NaN beyond the end of a shorter recording.
+
     Parameters
     ----------
     measurements : Tensor
@@ -325,8 +327,6 @@ def with_angles(
         Their covariances, diagonal, (B, T, 4, 4).
     angles : sequence of PseudoMeasurement
         One a recording, of at most T samples.
-
-    The fifth measurement is NaN beyond the end of a shorter recording.
     """
     sideslip = torch.as_tensor(padded([angle.sideslip[:, None] for angle in angles], np.nan))
     variance = torch.as_tensor(padded([angle.variance[:, None] for angle in angles], None))

@@ -63,15 +63,15 @@ def fit_dugoff(
     restarts : int, default 3
         Searches, of which the best counts, of so many ``generations`` each at most.
 
-    Raises
-    ------
-    DataError
-        A channel is missing, ``ax`` has gaps, or hardly any samples are left.
-
     Returns
     -------
     DugoffFit
         Of both axles; the spread over restarts shows which parameters the drives determine.
+
+    Raises
+    ------
+    DataError
+        A channel is missing, ``ax`` has gaps, or hardly any samples are left.
 
     Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal
     of Global Optimization 11, 1997.

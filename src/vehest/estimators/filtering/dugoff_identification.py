@@ -54,15 +54,15 @@ def identify_tyres(
     has_forces : bool
         Whether tyre forces are measured; otherwise they follow from accelerations.
 
-    Raises
-    ------
-    DataError
-        No recording matches.
-
     Returns
     -------
     DugoffFit
         Parameters (2, 3) of `DugoffAxle`, of the front, then of the rear axle.
+
+    Raises
+    ------
+    DataError
+        No recording matches.
     """
     matching = [
         recording for recording in recordings if fnmatch.fnmatch(recording.id, training.tyres_from)
@@ -131,11 +131,6 @@ def search_levels(
 ) -> SearchRecord:
     """Levels with the smallest error of sideslip, as powers of ten, (K,).
 
-    Raises
-    ------
-    DataError
-        A recording has no ``vy_ref``.
-
     Parameters
     ----------
     estimator : DugoffFilter
@@ -150,6 +145,11 @@ def search_levels(
         Of Optuna's sampler.
     context : FitContext
         Progress and the wish to stop.
+
+    Raises
+    ------
+    DataError
+        A recording has no ``vy_ref``.
     """
     for recording in recordings:
         if "vy_ref" not in recording:

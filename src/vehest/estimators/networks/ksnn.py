@@ -33,10 +33,6 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         Structure.
     yaw_rate_max : float, default 1.0
         Centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
-
-    Shapes:
-        measurements: (..., N, 4), channels yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
-        returns: (...) lateral velocity [m/s] one step after the window.
     """
 
     yaw_rate_max: Tensor
