@@ -1,4 +1,9 @@
-"""What a family of estimators declares: settings, channels, texts, version."""
+"""What a family of estimators declares: settings, channels, texts, version.
+
+`Description.__init_subclass__` turns the `setting` and `fitted` entries of a class body into a
+frozen dataclass, ``settings_type``, and into properties of the class. A configuration becomes an
+estimator by `Description.from_config`.
+"""
 
 from __future__ import annotations
 
