@@ -66,10 +66,15 @@ class StagePlan:
         }
 
     @property
-    def key(self) -> str:
-        """Hash of what determines the content, without options that have their defaults."""
+    def keyed_content(self) -> dict[str, Any]:
+        """What determines the content, without options that have their defaults."""
         config = self.config if self.key_config is None else self.key_config
-        return hash_of({**self.content, "config": config})
+        return {**self.content, "config": config}
+
+    @property
+    def key(self) -> str:
+        """Hash of what determines the content."""
+        return hash_of(self.keyed_content)
 
     @property
     def folder(self) -> Path:

@@ -170,7 +170,7 @@ def draw_report(
             if not is_complete and runner.weights is not None and runner.weights.path.is_file():
                 shutil.copyfile(runner.weights.path, folder / PUBLISHED_WEIGHTS)
             try:
-                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models)
+                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models, runner.origins)
             except WeightsTooLargeError as error:
                 runner.messages.warn(f"the report is published without weights: {error}")
 

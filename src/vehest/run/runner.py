@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
+from vehest.artefacts.keys import hash_of
 from vehest.artefacts.locks import Waiting
 from vehest.configuration.composition import Config, compose_config, missing_keys, quoted
 from vehest.data.car import CarValues
@@ -32,13 +33,14 @@ from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
+from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.printing import finding_in_words
 from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
-from vehest.run.train import DIVERGED, read_fit_metrics
+from vehest.run.train import DIVERGED, TrainJob, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.weights import PublishedWeights, publish_weights
 from vehest.sources.base import SIMULATED, car_of, kind_of, open_source
@@ -292,6 +294,7 @@ class Runner(Stages):
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
     weights: PublishedWeights | None = None  # published ones, used instead of training
     publishes_to: PublishedWeights | None = None  # to which finished trainings are added
+    origins: dict[str, str] = field(default_factory=dict)  # key of a training -> its origin
     train_first: str = ""  # command to run first where a training is missing; empty to train here
     evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
 
@@ -308,8 +311,10 @@ class Runner(Stages):
             Key of a training -> its member, and key of a training -> why it failed. Where the time
             is up, members lack what was not made, and trainings that were not begun are in neither.
         """
+        jobs = [job for group in groups for job in group.jobs]
+        self.origins |= {job.plan.key: self.origin(job) for job in jobs}
         if self.weights is not None and TRAIN not in self.force:
-            self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
+            self._take_published([job.plan for job in jobs], self.weights)
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
@@ -364,24 +369,54 @@ class Runner(Stages):
         return [group for group in reduced if group.jobs]
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
-        """Take models that are published under the key of a training and are not there."""
-        published = [plan for plan in plans if plan.key in weights and find(plan) is None]
-        for plan in published if not self.dry_run else ():
+        """Take models that are published under the key of a training, or under its origin, and are
+        not there.
+        """
+        published = [
+            (plan, key)
+            for plan in plans
+            if (key := weights.published_key(plan.key, self.origins[plan.key])) is not None
+            and find(plan) is None
+        ]
+        for plan, key in published if not self.dry_run else ():
             ensured(
-                plan,
-                partial(weights.write, plan.key),
-                False,
-                self.stop.requested,
-                self.print_waiting,
+                plan, partial(weights.write, key), False, self.stop.requested, self.print_waiting
             )
             self.stop.raise_if_requested()
         if published:
+            n_other = sum(key != plan.key for plan, key in published)
+            other = (
+                f" ({n_other} of them were trained on these recordings as another processor makes "
+                "them: their last bits differ)"
+                if n_other
+                else ""
+            )
             self.messages.line(
                 "note",
                 TRAIN,
                 f"{len(published)} of {len(plans)}",
-                f"taken from {weights.path}; --retrain trains them",
+                f"taken from {weights.path}{other}; --retrain trains them",
             )
+
+    def origin(self, job: TrainJob) -> str:
+        """The key of a training with the origins of its recordings in place of their digests: the
+        keys of their ingests, and how they were downsampled.
+        """
+        ingests = {
+            artefact.label: artefact.key
+            for artefact in self.artefacts.values()
+            if artefact.stage == INGEST
+        }
+        origins = {
+            name: [ingests[name], dict(data.config), data.code]
+            for name, data in job.data.items()
+            if name in ingests
+        }
+        inputs = {
+            name: origins.get(name.partition("/")[0], digest)
+            for name, digest in job.plan.inputs.items()
+        }
+        return hash_of({**job.plan.keyed_content, "inputs": inputs})
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
         """Print what groups are going to do; a dry run ends here."""
@@ -447,7 +482,9 @@ class Runner(Stages):
         if (
             self.publishes_to is not None
             and not self.dry_run
-            and not publish_weights(self.publishes_to, models, self.output, self.messages)
+            and not publish_weights(
+                self.publishes_to, models, self.origins, self.output, self.messages
+            )
         ):
             self.publishes_to = None
 

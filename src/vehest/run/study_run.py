@@ -308,21 +308,23 @@ def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None
     """
     if runner.weights is None or not runner.weights.path.is_file() or runner.train_first:
         return
-    plans = {
-        job.plan.key: job.plan
+    jobs = {
+        job.plan.key: job
         for comparison in comparisons.values()
         for group in comparison.groups
         for job in group.jobs
         if not job.is_learnt_at_once
     }
     missing = [
-        plan for key, plan in plans.items() if key not in runner.weights and find(plan) is None
+        job
+        for key, job in jobs.items()
+        if runner.weights.published_key(key, runner.origin(job)) is None and find(job.plan) is None
     ]
     if missing:
         runner.messages.line(
             "note",
             TRAIN,
-            f"{len(missing)} of {len(plans)}",
+            f"{len(missing)} of {len(jobs)}",
             "are neither here nor published, and are trained; --no-train-missing leaves them out",
         )
 
