@@ -42,7 +42,7 @@ COMPRESSED = "zlib,"
 earlier versions have plain text.
 """
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
-FORMAT = 3  # in the key of a report that has weights: 3 has compressed files
+FORMAT = 4  # in the key of a report that has weights: 3 has compressed files, 4 origins
 MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
 MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
 
