@@ -172,7 +172,7 @@ class EvaluatedModel:
         Returns
         -------
         Estimate
-            At the evaluation rate, with bands where the model was calibrated.
+            With all stored quantities, at the rate of the estimate.
 
         Raises
         ------
