@@ -49,6 +49,22 @@ def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> La
 
     Without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or
     `MissingError`.
+
+    Parameters
+    ----------
+    options : RunOptions
+        Launcher, address, jobs and resources.
+    output : Path
+        Output root, which machines of a cluster may share.
+    messages : Messages
+        Prints what a cluster reports.
+
+    Raises
+    ------
+    ConfigurationError
+        Options that do not belong together, or an unknown launcher.
+    MissingError
+        The launcher's package is not installed, or there is no SLURM here.
     """
     name = options.launcher
     address = options.address
