@@ -266,6 +266,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
+    """Whether a process of that number runs, whosever it is; never one of number 0 or below."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -276,6 +277,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
+    """Force the contents of a file, or of all files in a folder, onto the disk."""
     for file in (
         [entry for entry in path.rglob("*") if entry.is_file()] if path.is_dir() else [path]
     ):

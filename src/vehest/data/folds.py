@@ -117,6 +117,7 @@ def _joined(
 
 
 def _touch(first: Span, second: Span) -> bool:
+    """Whether the second range begins where the first ends, in the same recording."""
     return (first.dataset, first.recording) == (second.dataset, second.recording) and math.isclose(
         first.stop, second.start
     )

@@ -58,6 +58,9 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _first_of(recording: Recording, *names: str) -> FloatArray:
+    """Samples of the first of several channels that a recording has, 0 for NaN; `DataError` for
+    none.
+    """
     name = next((name for name in names if name in recording), None)
     if name is None:
         raise DataError(

@@ -75,6 +75,9 @@ def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
 
 
 def _without_names(content: Any, kind: Any) -> Any:
+    """Content without the key ``name``, at any depth, where the dataclass that it becomes has no
+    such field.
+    """
     kind, _ = _bare(kind)
     if not (isinstance(content, dict) and is_dataclass(kind)):
         return content
@@ -151,6 +154,10 @@ _RESTORED = {new: old for old, new in _REPLACED.items()}
 
 
 def _validated(kind: Any, content: Any) -> Any:
+    """An instance of ``kind`` by pydantic, from JSON.
+
+    Lone surrogates, which JSON cannot hold, are replaced meanwhile.
+    """
     text = json.dumps([content], ensure_ascii=False)
     replaced = text.translate(_REPLACED) if _SURROGATE.search(text) else text
     (instance,) = _adapter(kind).validate_json(replaced)
@@ -246,6 +253,7 @@ def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
 
 
 def _keys_of(kind: Any) -> str:
+    """Fields of a dataclass that may be given, for messages; empty for any other type."""
     bare, _ = _bare(kind)
     return (
         ", ".join(field.name for field in fields(bare) if field.init) if is_dataclass(bare) else ""

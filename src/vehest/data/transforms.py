@@ -420,6 +420,11 @@ class DelayCorrection:
         )
 
     def _taps(self, fraction: float) -> FloatArray:
+        """Weights of the 2 reach + 1 samples about a place that lies ``fraction`` of an interval
+        behind the middle one.
+
+        A sinc under a Kaiser window, whose sum is 1.
+        """
         distance = np.arange(-self.reach, self.reach + 1) - fraction
         inside = np.clip(1.0 - np.square(distance / (self.reach + 1)), 0.0, None)
         taps = (

@@ -210,6 +210,12 @@ def _window(covariances: FloatArray, n: int) -> int:
 
 
 def _length(covariances: FloatArray, window: int, n: int) -> float:
+    """Block length of lag weights that are flat up to M/2 and fall to 0 at M, at least 1 and
+    bounded.
+
+    The bound is the lesser of 3 √n and n/3; ``covariances`` are those from lag 0 on, ``window`` is
+    M.
+    """
     lags = np.arange(1, window + 1)
     weights = np.clip(2.0 * (1.0 - lags / window), 0.0, 1.0)
     spread = 2.0 * float(np.sum(weights * lags * covariances[1 : window + 1]))

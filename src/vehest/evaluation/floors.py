@@ -424,6 +424,9 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
+    """Levels of all drives together of what an estimator cannot know: of the reference, of the
+    sensors among ``inputs`` and, with ``car``, of the axles.
+    """
     parts = [drive.scored for drive in drives]
     rate = drives[0].rate_hz
     lateral = longitudinal = rear = front = None
@@ -483,6 +486,12 @@ def _unexplained(
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
+    """An axle's slip and arm by least squares over all drives, and the noise of what they leave
+    over.
+
+    The target is the lateral velocity at the centre of gravity [m/s], for the front axle less that
+    of the wheels' heading, δ u.
+    """
     columns = [
         _axle_columns(drive, inputs, front) for drive in parts
     ]  # slip and arm make up v, or v - δ u
@@ -603,10 +612,12 @@ def _in_steps(process: Noise, step: float) -> tuple[float, float]:
 
 
 def _middle(samples: FloatArray) -> FloatArray:
+    """Means of neighbouring samples, (T - 1,), as differences have their times."""
     return 0.5 * (samples[1:] + samples[:-1])
 
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+    """Lateral and forward velocity of the scored samples of all drives, (N,) each [m/s]."""
     parts = [drive.scored for drive in drives]
     return np.concatenate([drive.vy_ref for drive in parts]), np.concatenate(
         [drive.inputs["vx"] for drive in parts]
@@ -614,6 +625,7 @@ def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
 
 
 def _is_sideslip_scored(drives: Sequence[Drive]) -> BoolArray:
+    """Which of the scored samples of all drives count for the sideslip, (N,)."""
     return np.concatenate([drive.scored.is_sideslip_scored for drive in drives])
 
 

@@ -586,6 +586,10 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
 
 
 def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
+    """Figures of the states beside the lateral velocity that all parts have estimates of.
+
+    The weighted ones are there only where all states of `WEIGHTS` are.
+    """
     common = set.intersection(*(set(part.errors) for part in parts))
     figures = {
         f"rmse_{name}": float(
@@ -607,6 +611,11 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
+    """Figures of the estimated covariances and innovations; each only where all parts have them.
+
+    ``nees`` and the coverages are over all states whose covariance is estimated, and of the lateral
+    velocity, respectively.
+    """
     figures = {}
     kinds = {part.covariance_of for part in parts}
     if len(kinds) == 1 and "vy" in (names := kinds.pop()):

@@ -122,6 +122,12 @@ def flags_under_fault(
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
+    """Errors over the samples that masks select of all parts: of the sideslip [deg] and of the
+    lateral velocity [m/s].
+
+    Sideslip is NaN where none of these samples counts for it; its error is turned into ±180°.
+    """
+
     def over_all(error_of: Callable[[Scored], FloatArray]) -> FloatArray:
         return np.concatenate(
             [error_of(part)[mask] for part, mask in zip(parts, masks, strict=True)]
