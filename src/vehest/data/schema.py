@@ -69,7 +69,19 @@ def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
     """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups
     in them.
 
-    `ConfigurationError`.
+    Parameters
+    ----------
+    kind : type
+        Dataclass of the settings.
+    config : mapping
+        Values by field.
+    group : str
+        Group of the configuration, for messages that say how a value is set.
+
+    Raises
+    ------
+    ConfigurationError
+        A value is missing, unknown or wrong.
     """
     return validated(kind, _without_names(config, kind), "", error=ConfigurationError, group=group)
 
@@ -92,7 +104,19 @@ def _without_names(content: Any, kind: Any) -> Any:
 def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) -> int:
     """The version of a file's layout, as the file states it.
 
-    `DataError` unless it is between ``oldest`` and ``newest``.
+    Parameters
+    ----------
+    version : object
+        What the file states, of any type.
+    newest, oldest : int
+        Versions that are known, both included.
+    subject : str
+        The file, for messages.
+
+    Raises
+    ------
+    DataError
+        It is no whole number, or none between ``oldest`` and ``newest``.
     """
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise DataError(f"{subject}: format must be a whole number, not {str(version)[:40]!r}")

@@ -171,9 +171,22 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on.
+    """A stretch of ranges laid end to end, which wraps around.
 
-    It wraps around; ends of seconds are left out.
+    Parameters
+    ----------
+    spans : sequence of Span
+        Ranges whose ends are finite.
+    seconds : float
+        Length of the stretch, at most that of all ranges [s].
+    at : float
+        Share of the whole at which it begins, from 0 to 1.
+
+    Returns
+    -------
+    tuple of Span
+        In the order of ``spans``; pieces shorter than `MIN_PIECE_SECONDS` are left out, unless all
+        are.
     """
     total = _seconds_of(spans)
     begin = at * total
@@ -211,7 +224,15 @@ class _Ranges:
         self._catalogues: dict[str, Mapping[str, Reader]] = {}
 
     def split(self) -> Split:
-        """The split of the ranges, or of one fold of a cross-validation."""
+        """The split of the ranges, or of one fold of a cross-validation.
+
+        Raises
+        ------
+        ConfigurationError
+            Folds are declared beside roles, or a range cannot be found.
+        DataError
+            A recording cannot be read or lacks a channel that laps or conditions need.
+        """
         file = self._file
         folds = self._file.folds
         if folds is None:

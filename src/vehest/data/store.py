@@ -254,7 +254,19 @@ def read_estimate(path: Path) -> Estimate:
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
     """The description of a recording or an estimate beside its table.
 
-    `DataError` if it is damaged or of another kind or format.
+    Parameters
+    ----------
+    schema : pyarrow.Schema
+        Schema of the file, whose metadata hold the description.
+    path : Path
+        The file, for messages.
+    kind : type
+        Dataclass of the description: that of a recording, or of an estimate.
+
+    Raises
+    ------
+    DataError
+        It is damaged, or of another kind or format.
     """
     content = "recording" if kind is RecordingDescription else "estimate"
     description = _metadata(schema, path)

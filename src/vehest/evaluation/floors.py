@@ -154,7 +154,17 @@ def drives_of(
 
 
 def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
-    """One range or sequence of a recording, with the warm-up before it."""
+    """One range or sequence of a recording, with the warm-up before it.
+
+    Parameters
+    ----------
+    reference : Recording
+        The whole recording, at the evaluation rate.
+    span : Span
+        The range; samples of the warm-up are those before it, as far as there are any.
+    protocol : Protocol
+        Warm-up, first samples that are not scored, and lowest speed.
+    """
     begin = reference.index_range(span.start - protocol.warm_up_seconds, span.stop)[0]
     first, end = scored_range(reference, span, protocol)
     inputs = {name: filled(reference[name][begin:end]) for name in INPUTS if name in reference}
@@ -206,6 +216,17 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
 
     The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which
     nothing is known.
+
+    Parameters
+    ----------
+    drives : sequence of Drive
+        Of which the scored samples count; their third differences, less what measured lateral
+        acceleration and yaw rate explain, show the noise.
+
+    Returns
+    -------
+    Floor or None
+        Deviations of v [m/s] and of the sideslip [deg] at samples at which it is scored.
     """
     third = []
     explained = []
@@ -409,7 +430,21 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
-    """A process by its root mean square and the time in which its autocorrelation falls to 1/e."""
+    """A process by its root mean square and the time in which its autocorrelation falls to 1/e.
+
+    Parameters
+    ----------
+    series : sequence of FloatArray
+        Samples of uninterrupted stretches, any unit.
+    rate_hz : float
+        Their rate [Hz].
+
+    Returns
+    -------
+    Noise
+        Without a white part; its time constant is one interval at least, and at most the length of
+        the longest stretch [s].
+    """
     deviation = _rms(series)
     longest = max(len(samples) for samples in series)
     total = np.zeros(longest)

@@ -86,6 +86,15 @@ def flags_under_fault(
     which nothing is flagged before the fault's end, ``detection_delay`` mean time to the first flag
     of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures
     that there is something for.
+
+    Parameters
+    ----------
+    parts : sequence of Scored
+        Ranges or sequences that were scored.
+    flagged : sequence of Flags
+        Of each the half width of the band [rad], NaN without, and its health, 0 where it is valid.
+    windows : sequence of Window
+        Of each first and end time of the fault [s].
     """
     inside = []
     valid = []
