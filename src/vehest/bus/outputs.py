@@ -48,7 +48,7 @@ class Output:
 
     A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and
     ``sampled``, the instant of the sample. A log has the frames of estimates as they came off the
-    bus. Raises `MissingError`: a file cannot be written.
+    bus.
 
     Parameters
     ----------
@@ -58,6 +58,11 @@ class Output:
         Quantities that estimates may have.
     first_id : int
         Identifier of the estimates, for the DBC.
+
+    Raises
+    ------
+    MissingError
+        A file cannot be written.
     """
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:

@@ -98,7 +98,10 @@ class Bus:
     def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
         """The sender's end of the bus, and the control unit's, which hears the messages only.
 
-        Raises `MissingError`: it cannot be opened.
+        Raises
+        ------
+        MissingError
+            It cannot be opened.
         """
         import can
 

@@ -168,9 +168,12 @@ class Sampler:
     def samples_before(self, now: float) -> Iterator[Sample]:
         """Samples whose instant lies before ``now`` [s].
 
-        Raises `DataError`: a time so far ahead that they would be more than the limits allow.
-
         The instant of the next sample moves on with each one that is taken.
+
+        Raises
+        ------
+        DataError
+            The time is so far ahead that they would be more than the limits allow.
         """
         check_samples(self.next_time, now, self.timing.rate_hz, "the bus")
         while self.next_time < now:

@@ -524,7 +524,10 @@ def as_yaml(config: Config) -> str:
 def positive_rate(value: Any, name: str) -> float:
     """A rate [Hz] of a configuration.
 
-    Raises `ConfigurationError` unless it is a positive number.
+    Raises
+    ------
+    ConfigurationError
+        It is no positive number.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
         raise ConfigurationError(

@@ -35,8 +35,12 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     Parameters
     ----------
     recording : Recording
-        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks
-        them.
+        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref).
+
+    Raises
+    ------
+    DataError
+        It lacks one of them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")

@@ -350,12 +350,15 @@ def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Est
 def _cross_validated_map(reference: Recording, start: float, stop: float) -> FloatArray:
     """Lateral velocity of a static map of the other half of the range [m/s].
 
-    Raises `DataError` where the car turns too little.
-
     Returns
     -------
     FloatArray
         (T,); each half of the range is estimated by a map that was fitted to the other half.
+
+    Raises
+    ------
+    DataError
+        The car turns too little.
     """
     middle = 0.5 * (start + stop)
     vy = np.zeros(len(reference))

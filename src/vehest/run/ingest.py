@@ -247,7 +247,7 @@ def recording_file(recording_id: str) -> str:
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     """Configuration of a simulated data set's ingest.
 
-    Override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`.
+    Override ``seed=1`` is short for ``dataset.seed=1``.
 
     Raises
     ------

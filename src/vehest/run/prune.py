@@ -81,7 +81,7 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
     """Remove files and folders, each renamed first so that no half is found.
 
-    ``on_removed`` is called after each; raises `MissingError`.
+    ``on_removed`` is called after each.
 
     Parameters
     ----------

@@ -53,8 +53,6 @@ def published_values(
     """Validation value of each trial of those searches that a published file has in full, with
     today's keys.
 
-    Raises `DataError`.
-
     Parameters
     ----------
     study : Study

@@ -152,8 +152,6 @@ def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a training that enter its key: those that differ from their defaults, and the
     seed.
 
-    Raises `ConfigurationError`.
-
     Parameters
     ----------
     config : mapping
@@ -163,6 +161,11 @@ def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
     -------
     dict
         ``estimator``, ``training`` and ``seed``; options of `UNKEYED` are left out.
+
+    Raises
+    ------
+    ConfigurationError
+        The estimator is unknown, or one of its settings or of the training is wrong.
     """
     estimator = new_estimator(config["estimator"])
     training: Any = settings_from_config(estimator.training_type, config["training"], "training")

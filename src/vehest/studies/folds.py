@@ -35,8 +35,6 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as
     the appendix.
 
-    Raises `DataError`.
-
     Parameters
     ----------
     artefacts : StudyArtefacts

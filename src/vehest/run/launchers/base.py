@@ -47,8 +47,7 @@ class RunOptions:
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
     """A command's launcher.
 
-    Without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or
-    `MissingError`.
+    Without ``jobs`` it runs as many groups at a time as cores.
 
     Parameters
     ----------

@@ -204,8 +204,6 @@ def pack(folders: set[Path]) -> Files:
 def unpack(packed: Files) -> None:
     """Put artefacts in their places, each whole or not at all, unless they are there.
 
-    Raises `DataError` or `MissingError`.
-
     Raises
     ------
     DataError

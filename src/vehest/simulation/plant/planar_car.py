@@ -102,8 +102,7 @@ def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
-    """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no
-    parameter or a value makes no sense.
+    """The car with some of its parameters scaled.
 
     Parameters
     ----------
@@ -111,6 +110,11 @@ def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
         The car of the configuration.
     factors : mapping
         Parameter -> scale; parameters that are not named keep their value.
+
+    Raises
+    ------
+    ConfigurationError
+        A name is no parameter, or a scaled value makes no sense.
     """
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
