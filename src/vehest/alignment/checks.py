@@ -1,4 +1,9 @@
-"""Checks of a recording: each looks for one kind of fault and names where it is."""
+"""Checks of a recording: each looks for one kind of fault and names where it is.
+
+Flow: recording -> parts of a long drive -> where the car moves (`standstill`) -> each function of
+`_CHECKS` -> findings, merged over the parts and sorted by level. A check yields nothing where its
+channels are missing.
+"""
 
 from __future__ import annotations
 
@@ -69,6 +74,11 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
     Of a part of a drive in which the car stands throughout only impossible values count.
 
+    Parameters
+    ----------
+    recording : Recording
+        Any channels, in SI units.
+
     Returns
     -------
     list of Finding
@@ -83,6 +93,7 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
 
 def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
+    """Findings of one part; only impossible values where the car stands throughout a part."""
     moving = ~standstill(recording)
     checks = _CHECKS if is_undivided or moving.any() else (_impossible_values,)
     return [finding for check in checks for finding in check(recording, moving)]
@@ -91,6 +102,11 @@ def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
 def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
     """Findings in the parts of a drive, the gravest first: of each level, check and channel those
     of the first part that has any.
+
+    Parameters
+    ----------
+    parts : iterable of sequence of Finding
+        In the order of time.
     """
     merged: list[Finding] = []
     for part in parts:
@@ -115,6 +131,11 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
     place : str
         Beginning of an error's message.
 
+    Returns
+    -------
+    list of Finding
+        All of them, for the user to see.
+
     Raises
     ------
     DataError
@@ -131,6 +152,9 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
 
 
 def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Samples outside the range that a channel's description allows; an error, unless a simulated
+    car spun.
+    """
     spun = bool(dict(recording.provenance.get("flags") or {}).get("spun"))
     for name, samples in recording.channels.items():
         channel = CHANNELS[name]
@@ -155,6 +179,10 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels that planar motion ties together: signs and units first, the rest with these put
     right.
+
+    Units are corrected one after another, at most MAX_WRONG_UNITS, so that one wrong unit is not
+    reported of every channel that is compared with it. Where a delay or low-pass of ay, yaw rate or
+    vy explains poor kinematics, only the former is reported.
     """
     motion = motion_of(recording, moving)
     if not motion.moving.any():
@@ -222,6 +250,7 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
 
 
 def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """A note of the share of missing samples of each channel with gaps."""
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:
@@ -523,6 +552,7 @@ def _lasting_runs(backwards: BoolArray, recording: Recording) -> NDArray[np.int6
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
+    """Length and begin of the longest run, (N, 2), as text."""
     begin, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
     return f"for {(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} s"
 

@@ -43,6 +43,19 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     it is scored.
 
     All levels are in proportion to that at 90 %.
+
+    Parameters
+    ----------
+    parts : sequence of Scored
+        Ranges or sequences of a test set, with the half widths of the bands at 90 % [m/s, rad].
+    bands : Bands
+        Their calibration, which has the half widths of the other levels.
+
+    Returns
+    -------
+    dict
+        ``vy`` and ``sideslip`` -> errors, (N,), half widths, (N, levels), and which samples of all
+        parts these are.
     """
     sideslip_error = np.concatenate(
         [
@@ -86,6 +99,13 @@ def band_figures(
     manoeuvres, which are the blocks that bands are calibrated by; ``error_icc`` intraclass
     correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres
     these are spread over. Nothing of a quantity that is scored at no sample.
+
+    Parameters
+    ----------
+    banded_errors : mapping
+        As `banded` makes it of ``parts``.
+    turns : sequence of FloatArray or None
+        Yaw rate of each part, one a scored sample.
     """
     manoeuvres = np.concatenate(
         manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0]
@@ -126,6 +146,12 @@ def coverage_intervals(
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`;
     nothing where there are too few.
+
+    Returns
+    -------
+    dict
+        Name of a coverage, such as ``coverage_90_vy`` -> lower and upper end of its interval, as
+        fractions.
     """
     all_segments = segments_of(parts, rate_hz)
     intervals = {}

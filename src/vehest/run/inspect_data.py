@@ -49,6 +49,12 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
     """Data sets with their files' presence, licences and citations: for JSON and for a terminal.
 
     Why others cannot be listed.
+
+    Returns
+    -------
+    tuple
+        Rows with ``dataset``, ``kind``, ``source``, ``here``, ``title``, ``licence`` and
+        ``citation``; lines and tables; errors, a line each.
     """
     rows = []
     errors = []
@@ -85,6 +91,13 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
     """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal.
 
     Raises `VehestError`.
+
+    Parameters
+    ----------
+    source : str
+        Name of a data set, or path of a file.
+    overrides : sequence of str
+        Of conf/ingest.yaml or conf/estimate.yaml.
     """
     with reading(source, overrides) as config:
         recordings = [_described(read()) for _, read in _readers(source, config)]
@@ -111,6 +124,11 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
     """Findings of the checks, for JSON and for a terminal.
 
     A recording that cannot be read is an error too.
+
+    Returns
+    -------
+    tuple
+        Rows with ``level``, ``recording``, ``check``, ``channel`` and ``message``, and lines.
     """
     rows: list[dict[str, str]] = []
     with reading(source, overrides) as config:
@@ -149,6 +167,12 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
     terminal.
 
     Raises `VehestError`.
+
+    Returns
+    -------
+    tuple
+        Missing channels, unused columns and a row an estimator (`Usability.as_plain`); and lines
+        and tables.
     """
     with reading(source, overrides) as config:
         recordings = _contents(source, config)
@@ -184,6 +208,11 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
 @contextmanager
 def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
     """The configuration that reads a data set or a file, while its limits hold.
+
+    Yields
+    ------
+    Config
+        As composed for ``ingest`` or, of a file, for ``estimate``.
 
     Raises
     ------
@@ -234,6 +263,9 @@ def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Re
 
 
 def _described(recording: Recording) -> dict[str, Any]:
+    """Rate, range, channels with their spread, provenance and origin of a recording, as plain
+    values.
+    """
     return {
         "id": recording.id,
         "vehicle": recording.vehicle,
@@ -271,6 +303,9 @@ def _stretch(start: float, end: float) -> str:
 
 
 def _is_here(dataset: dict[str, Any]) -> str:
+    """``yes``, ``no``, or ``no root`` where VEHEST_DATA is not set; simulated data are always
+    here.
+    """
     if dataset.get("source") == "simulated":
         return "yes"
     if not os.environ.get("VEHEST_DATA"):

@@ -86,7 +86,20 @@ class Stages:
         )
 
     def ingest(self, config: Config) -> Artefact:
-        """The recordings of a data set at their native rate."""
+        """The recordings of a data set at their native rate.
+
+        Parameters
+        ----------
+        config : Config
+            As composed for ``ingest``.
+
+        Raises
+        ------
+        DryRunStop
+            In a dry run, where it is not there.
+        VehestError
+            As `plan_ingest` and `write_ingest` do.
+        """
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
@@ -100,7 +113,17 @@ class Stages:
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
     ) -> Artefact:
-        """The recordings of a data set at another rate."""
+        """The recordings of a data set at another rate.
+
+        Parameters
+        ----------
+        ingested : Artefact
+            Recordings at their native rate.
+        rate_hz : float
+            [Hz].
+        options : mapping
+            ``downsample`` of a configuration.
+        """
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
 
@@ -139,6 +162,7 @@ class Stages:
                 open_source(dataset).inputs()
 
     def _ingested(self, name: str, config: Config) -> Artefact:
+        """The ingested recordings of a data set, looked for once a run."""
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
@@ -163,6 +187,11 @@ class Stages:
         it.
 
         No samples are read.
+
+        Returns
+        -------
+        dict
+            Data set -> summaries of its recordings.
         """
 
         def read(name: str) -> tuple[RecordingSummary, ...]:
@@ -191,6 +220,7 @@ class Stages:
                 )
 
     def _warn_of_reference(self, dataset: str, recording: str, config: Config) -> None:
+        """Warn of findings in the references of one stored recording."""
         ingested = self._ingested(dataset, config)
         file = recording_file(recording)
         if file not in ingested.outputs:
@@ -202,7 +232,22 @@ class Stages:
             )
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
-        """Every data set of a split at a rate."""
+        """Every data set of a split at a rate.
+
+        Parameters
+        ----------
+        split : Split
+            Names the data sets.
+        rate_hz : float
+            [Hz].
+        config : Config
+            With options of ``downsample``.
+
+        Returns
+        -------
+        dict
+            Data set -> its recordings at the rate.
+        """
         return {
             name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"])
             for name in split.datasets
@@ -230,6 +275,15 @@ class Stages:
     ) -> Evaluation:
         """How a configuration is evaluated: against references that are resampled like everything,
         but never filtered further.
+
+        Parameters
+        ----------
+        config : Config
+            As composed for ``eval``.
+        data : mapping
+            Data set -> recordings at the estimator's rate.
+        faults : tuple of FaultSettings
+            Faults under which it is evaluated too.
         """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
@@ -253,7 +307,27 @@ class Stages:
         )
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-        """Make an artefact unless it is there."""
+        """Make an artefact unless it is there.
+
+        Parameters
+        ----------
+        plan : StagePlan
+            What is to be made.
+        write : callable
+            Writes it into a folder.
+
+        Returns
+        -------
+        Artefact
+            Found, made, or made by another process for which this one waited.
+
+        Raises
+        ------
+        DryRunStop
+            In a dry run, where it is not there.
+        Stopped
+            A signal came while it was made.
+        """
 
         def print_waiting(waiting: Waiting) -> None:
             self.messages.end(plan.stage, plan.label)
@@ -304,6 +378,11 @@ class Runner(Stages):
 
         Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
         at a signal; finished artefacts stay.
+
+        Parameters
+        ----------
+        groups : sequence of Group
+            As `Comparison.plan` makes them.
 
         Returns
         -------

@@ -53,7 +53,24 @@ def published_values(
     """Validation value of each trial of those searches that a published file has in full, with
     today's keys.
 
-    Raises `DataError`.
+    Parameters
+    ----------
+    study : Study
+        With its searches.
+    comparisons : mapping
+        Part -> its planned jobs.
+    path : Path
+        searches.csv of the published study.
+
+    Returns
+    -------
+    dict
+        Trial -> value; empty where the file is not there.
+
+    Raises
+    ------
+    DataError
+        The file is damaged.
     """
     if not path.is_file():
         return {}
@@ -79,6 +96,20 @@ def trials_of(
 ) -> list[Trial]:
     """The trials of every search of which all have a value: a published one, or that of their
     evaluation.
+
+    Parameters
+    ----------
+    study : Study
+        With its searches.
+    comparisons : mapping
+        Part -> its comparison.
+    published : mapping
+        Trial -> published value.
+
+    Returns
+    -------
+    list of Trial
+        The one with the lowest value of its search is chosen, the first of equals.
     """
     finished: list[Trial] = []
     for names in study.searches.values():
@@ -137,6 +168,7 @@ def write_trials(trials: Sequence[Trial], path: Path) -> None:
 
 
 def _options(study: Study, name: str) -> tuple[str, ...]:
+    """The overrides that a trial tries."""
     search = study.parts[name].search
     assert search is not None
     return search.candidates[0]
@@ -192,7 +224,15 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
 def settings_to_compare(
     config: Config, tried: set[str] | frozenset[str] = frozenset()
 ) -> dict[str, Any]:
-    """What determines a training, without its seed and the options that are tried."""
+    """What determines a training, without its seed and the options that are tried.
+
+    Parameters
+    ----------
+    config : Config
+        Of a job.
+    tried : set of str
+        Dotted keys to leave out.
+    """
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}
     for key in tried:

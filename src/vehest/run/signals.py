@@ -52,6 +52,11 @@ class StopSignals:
 
         Raises `Stopped` in place of an exception after a signal: compiled modules turn one into
         another, and what a signal ends may fail.
+
+        Raises
+        ------
+        Stopped
+            A signal came; also in place of what it made fail.
         """
         former = {
             number: signal.signal(number, self._handle)
@@ -76,6 +81,7 @@ class StopSignals:
             self._deferred = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        """Record a signal, and raise `Stopped` unless it is the first one and deferred."""
         first = self.number is None
         self.number = self.number or number
         if not (self._deferred and first):
@@ -104,6 +110,13 @@ class TimeLimit:
     """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s].
 
     None for no limit.
+
+    Parameters
+    ----------
+    stop : StopSignals
+        Signals, which end the work too.
+    until : float or None
+        Reading of the clock.
     """
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:

@@ -161,7 +161,24 @@ def failure_messages(jobs: Iterable[Job]) -> str:
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
     """Read a pipeline by path or name.
 
-    ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`.
+    Parameters
+    ----------
+    name : str
+        Path of a file, or name of one in ./pipelines or of those that come with vehest.
+    overrides : sequence of str
+        Of the command; they enter ``command`` and ``words`` of the study.
+
+    Returns
+    -------
+    Study
+        Folds of a cross-validated split, and candidates of searches, are parts of it.
+
+    Raises
+    ------
+    MissingError
+        There is no such pipeline.
+    ConfigurationError
+        The file is no pipeline, or does not fit the module that draws its report.
     """
     file, content = _content_of(name, location_overrides(overrides))
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
@@ -351,8 +368,23 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
     """Every job of a pipeline.
 
-    Further overrides apply to the sweeps, or data sets, that have their key; raises
-    `ConfigurationError`.
+    Parameters
+    ----------
+    study : Study
+        The pipeline.
+    overrides : sequence of str
+        Each applies to the sweeps, or data sets, that have its key.
+
+    Returns
+    -------
+    Jobs
+        Part -> its jobs, each configuration once.
+
+    Raises
+    ------
+    ConfigurationError
+        An override matches nothing or belongs to the study; sweeps of a part disagree in what they
+        share; there are more jobs than the limit.
     """
     unit, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
@@ -419,6 +451,10 @@ def _part_jobs(
     suiting: Callable[[Config], list[str]],
     compose: Callable[[tuple[str, ...]], Config],
 ) -> list[Job]:
+    """Jobs of one part: all combinations of its sweeps, each once, with the overrides that they
+    have keys for; raises `ConfigurationError` where they disagree in `SHARED_KEYS`.
+    """
+
     def config_of(job: Sequence[str]) -> Config:
         """Composed without its split, which other jobs share, as other parts share the rest."""
         of_split = tuple(override for override in job if key_of(override).split(".")[0] == "split")
@@ -464,10 +500,27 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
     """A study with one sweep: all combinations of overrides over their seeds, in the order of the
-    command; raises `ConfigurationError`.
+    command.
 
-    A combination that its estimator refuses stays in the list with the reason. By default the study
-    is named after estimators and split.
+    A combination that its estimator refuses stays in the list with the reason.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        With several values for the keys that are swept.
+    name : str or None
+        Of the study; by default estimators and split.
+
+    Returns
+    -------
+    tuple
+        The study, and its jobs under the part ``""``.
+
+    Raises
+    ------
+    ConfigurationError
+        A key is named twice or takes one value only, all combinations are refused, or there are
+        more jobs than the limit.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")
@@ -530,6 +583,9 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
+    """The job of one combination, with the values that are swept; refused ones have a failure and
+    no configuration.
+    """
     values: dict[str, Value] = {}
     for override in overrides:
         if key_of(override) in swept:

@@ -123,6 +123,20 @@ def record_tables(
 def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
     """What a key of a table in ``folder`` is today; without ``data`` where raw files are not here.
 
+    Parameters
+    ----------
+    key : str
+        ``TABLE: WHAT``.
+    folder : Path
+        Of the table, in results/.
+    overrides : sequence of str
+        Of where raw files come from.
+
+    Returns
+    -------
+    dict
+        ``code`` or ``data``, or both.
+
     Raises
     ------
     ConfigurationError
@@ -159,6 +173,17 @@ def changes_of_tables(
     """Pairs of what differs from when tables were made and its cause.
 
     A note on what was not compared.
+
+    Parameters
+    ----------
+    records : mapping
+        Table -> its record.
+    keys : mapping
+        Key -> what it was.
+    folder : Path
+        Of the tables.
+    overrides : sequence of str
+        Of where raw files come from.
     """
     changes = []
     missing = []

@@ -65,6 +65,11 @@ class PublishedModel:
 class PublishedWeights:
     """Models of a study by the keys of their trainings; none where there is no such file.
 
+    Parameters
+    ----------
+    path : Path
+        weights.safetensors of a published study.
+
     Raises
     ------
     DataError
@@ -158,6 +163,13 @@ class PublishedWeights:
         """Write a model into the folder of its training, byte for byte as that did, but without
         times.
 
+        Parameters
+        ----------
+        key : str
+            Of the training.
+        folder : Path
+            Of the artefact, while it is made.
+
         Raises
         ------
         DataError
@@ -232,6 +244,7 @@ def uncompressed(text: str) -> bytes:
 
 
 def _record_of(model: Artefact, origin: str) -> PublishedModel:
+    """What is published of a model beside its weights."""
     files = {
         name: compressed((model.folder / name).read_bytes())
         for name in FILES
@@ -250,6 +263,17 @@ def publish_weights(
     """Add models of finished trainings, with their origins by key, to a study's published weights.
 
     Returns whether there was room for them.
+
+    Parameters
+    ----------
+    weights : PublishedWeights
+        Of the study.
+    models : sequence of Artefact
+        Finished trainings.
+    output : Path
+        Output root, where the lock lies.
+    messages : Messages
+        Prints how many were added, or that there is no room.
     """
     study = weights.path.parent.name
     with held(Lock(output, "publish", study), lambda: False):

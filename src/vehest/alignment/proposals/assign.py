@@ -216,6 +216,9 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
 
 
 def _is_standing(columns: Sequence[Candidate]) -> bool:
+    """Whether columns are named as speeds with units, and none of them ever exceeds
+    MAX_STANDSTILL_SPEED.
+    """
     speeds = [column for column in columns if "vx" in column.hints and column.unit]
     speeds = [column for column in speeds if column.measures("vx")]
     limit = MAX_STANDSTILL_SPEED
@@ -241,6 +244,7 @@ def _turnings_of_any_axes(
 
 
 def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: float) -> Search:
+    """A search of the remaining columns, given speed, yaw rate and lateral acceleration."""
     chosen = turning.columns.values()
     free = [column for column in columns if column not in chosen and not column.is_wheel_mean]
     return Search(turning, turning.motion(rate_hz), free)
@@ -304,7 +308,17 @@ def _rate_by_ax(search: Search) -> float | None:
 
 
 def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels) -> Proposals:
-    """Proposals whose signs are right if that of the yaw rate's column is."""
+    """Proposals whose signs are right if that of the yaw rate's column is.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        All columns, the mean of the wheels among them.
+    search : Search or None
+        With the motion; None where no speed and yaw rate were found, so that only names decide.
+    wheels : Wheels
+        Columns that are named for a wheel.
+    """
     channels: dict[str, Proposal] = {}
     radius: float | None = None
     notes: tuple[str, ...] = ()
@@ -696,4 +710,5 @@ def _left_right_clues(
 
 
 def _first_named(columns: Sequence[Candidate], role: str) -> Candidate | None:
+    """The first column whose name suggests a role; None where none does."""
     return next((column for column in columns if role in column.hints), None)

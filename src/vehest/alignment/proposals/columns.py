@@ -98,7 +98,20 @@ class Candidate:
 
 
 def si_factor(unit: str, channel: str) -> float:
-    """Factor from a unit to that of a channel."""
+    """Factor from a unit to that of a channel.
+
+    Parameters
+    ----------
+    unit : str
+        As vehest spells it.
+    channel : str
+        A channel, whose SI unit is the target.
+
+    Raises
+    ------
+    DataError
+        The unit is unknown, or of another quantity.
+    """
     return factor_to_si(unit, CHANNELS[channel].unit)
 
 
@@ -107,6 +120,19 @@ def candidates(
 ) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see
     `vehest.alignment.proposals.assign.propose`.
+
+    Parameters
+    ----------
+    columns : sequence of tuple
+        Name, unit (empty if unknown), samples (T,) with NaN for missing ones, and device (``car``,
+        ``reference`` or empty).
+    rate_hz : float
+        Of the samples [Hz].
+
+    Returns
+    -------
+    list of Candidate
+        Missing and stray samples are bridged by lines.
     """
     usable = []
     for name, unit, values, device in columns:
@@ -165,7 +191,21 @@ def _stray(values: FloatArray) -> NDArray[np.bool_]:
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
-    """Low-passed at `SLOW_HZ` and thinned out."""
+    """Low-passed at `SLOW_HZ` and thinned out.
+
+    Parameters
+    ----------
+    values : FloatArray
+        (T,), without gaps.
+    rate_hz : float
+        Sampling rate [Hz]; a slow or short column is not filtered.
+
+    Returns
+    -------
+    FloatArray
+        (S,), at about SLOW_RATE_HZ and at most MAX_SLOW_SAMPLES long; the filter runs both ways and
+        delays nothing.
+    """
     if rate_hz > 4.0 * SLOW_HZ and len(values) > 30:
         sections = signal.butter(2, SLOW_HZ, fs=rate_hz, output="sos")
         values = np.asarray(signal.sosfiltfilt(sections, values), dtype=np.float64)
@@ -174,7 +214,13 @@ def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def correlation(left: FloatArray, right: FloatArray) -> float:
-    """Of two signals about their means; 0 where one does not change."""
+    """Of two signals about their means; 0 where one does not change.
+
+    Parameters
+    ----------
+    left, right : FloatArray
+        Of one length.
+    """
     a = left - left.mean()
     b = right - right.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))

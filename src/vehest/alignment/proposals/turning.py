@@ -88,7 +88,19 @@ class Turning:
         return {"vx": ahead, "yaw_rate": 1, "ay": -ahead if self.correlation < 0.0 else ahead}
 
     def motion(self, rate_hz: float) -> Motion:
-        """The motion by these columns."""
+        """The motion by these columns.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the samples [Hz].
+
+        Returns
+        -------
+        Motion
+            In SI units, with signs by which the car drives ahead and ay is +vx·yaw_rate; a sign of
+            the yaw rate that is wrong stays, and is that of ay too.
+        """
         signs = self.signs
         channels = {
             name: column.values * signs[name] * si_factor(self.units[name], name)
@@ -153,7 +165,19 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing."""
+    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        All columns.
+
+    Returns
+    -------
+    Turning or None
+        Units by the header, else the first in which the size is plausible; ``decided`` if the
+        header has both.
+    """
     columns_by_channel = {}
     units = {}
     for channel in ("vx", "yaw_rate"):
@@ -240,7 +264,17 @@ def is_evident(ay: Candidate, scale: float) -> bool:
 
 
 def is_plausible(size: float, channel: str, unit: str) -> bool:
-    """Whether a car has a speed, yaw rate or acceleration of a size."""
+    """Whether a car has a speed, yaw rate or acceleration of a size.
+
+    Parameters
+    ----------
+    size : float
+        99th percentile of the magnitude, in ``unit``.
+    channel : str
+        ``vx``, ``yaw_rate`` or ``ay``.
+    unit : str
+        Of the size.
+    """
     low, high = RANGES[channel]
     return low <= size * si_factor(unit, channel) <= high
 
@@ -389,6 +423,12 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
     """With the speed as vx_ref where it is named as a reference, or like the lateral velocity.
 
     Wheels supply the car's own speed.
+
+    Parameters
+    ----------
+    channels : dict
+        Channel -> its proposal; without a lateral velocity, or with a vx_ref, it is returned as it
+        is.
     """
     speed = channels.get("vx")
     lateral = channels.get("vy_ref")

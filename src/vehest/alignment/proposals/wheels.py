@@ -37,7 +37,10 @@ Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its sp
 
 
 def find_wheels(columns: Sequence[Candidate]) -> Wheels:
-    """Columns that are named for a wheel each; of several for one, the first."""
+    """Columns that are named for a wheel each; of several for one, the first.
+
+    Columns with a unit that is none of a wheel's speed are left out.
+    """
     wheels: dict[str, Candidate] = {}
     for column in columns:
         for role in column.hints:
@@ -49,6 +52,18 @@ def find_wheels(columns: Sequence[Candidate]) -> Wheels:
 def turning_left(wheels: Wheels, motion: Motion) -> float:
     """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is
     missing.
+
+    Parameters
+    ----------
+    wheels : Wheels
+        Corner -> column.
+    motion : Motion
+        With the yaw rate.
+
+    Returns
+    -------
+    float
+        Of the axle that decides more clearly; positive where the yaw rate is positive to the left.
     """
     rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     axles = [
@@ -64,6 +79,11 @@ def speed_of_wheels(
 ) -> list[Candidate]:
     """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that
     make ay = vx·yaw_rate.
+
+    Returns
+    -------
+    list of Candidate
+        One, or none.
     """
     if not wheels or any("vx" in column.hints for column in columns):
         return []
@@ -107,6 +127,23 @@ def wheel_proposals(
 ) -> tuple[list[Proposal], float | None]:
     """A channel each, and the rolling radius by which they make the speed, if it has no column; of
     it, the motion's may be made.
+
+    Parameters
+    ----------
+    wheels : Wheels
+        Corner -> column, at least one.
+    motion : Motion or None
+        Whose speed decides the unit; None where it is not known.
+    has_speed : bool
+        Whether a column is the speed.
+    is_wheel_mean : bool
+        Whether the motion's speed was made of the wheels.
+
+    Returns
+    -------
+    tuple
+        Proposals in rad/s or rpm, a speed at the rim brought to rad/s by NOMINAL_RADIUS; and the
+        radius [m], None where there is a column of the speed.
     """
     mean = _mean(wheels)
     units = _units(wheels)
@@ -173,17 +210,20 @@ def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -
 
 
 def _mean(wheels: Wheels) -> FloatArray:
+    """Mean of the wheels' columns in the file's unit, (T,)."""
     return np.asarray(
         np.mean([column.values for column in wheels.values()], axis=0), dtype=np.float64
     )
 
 
 def _units(wheels: Wheels) -> Sequence[str]:
+    """The header's unit of the first wheel, or all that are tried."""
     unit = next(iter(wheels.values())).unit
     return [unit] if unit else UNITS
 
 
 def _named(columns: Sequence[Candidate], channel: str) -> Candidate | None:
+    """The column whose name suggests a channel most clearly; None where none does."""
     named = [column for column in columns if channel in column.hints and column.measures(channel)]
     return max(named, key=lambda column: column.hints[channel], default=None)
 

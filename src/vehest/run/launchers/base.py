@@ -47,8 +47,23 @@ class RunOptions:
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
     """A command's launcher.
 
-    Without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or
-    `MissingError`.
+    Without ``jobs`` it runs as many groups at a time as cores.
+
+    Parameters
+    ----------
+    options : RunOptions
+        Launcher, address, jobs and resources.
+    output : Path
+        Output root, which machines of a cluster may share.
+    messages : Messages
+        Prints what a cluster reports.
+
+    Raises
+    ------
+    ConfigurationError
+        Options that do not belong together, or an unknown launcher.
+    MissingError
+        The launcher's package is not installed, or there is no SLURM here.
     """
     name = options.launcher
     address = options.address

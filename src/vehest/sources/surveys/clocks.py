@@ -62,11 +62,28 @@ MOST_RESTARTS = 0.01  # of the rows
 def find_clock(
     columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
-    """The column, (N,), that grows evenly, by name or unit before another, or one that is named so
-    and grows; None where none does.
+    """The column that is the clock of a table.
 
-    With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's
-    options by which runs begin.
+    It grows evenly, by name or unit before another, or is named so and grows. One that counts rows,
+    by 1 from 0 or 1 without a name or unit of time, is none.
+
+    Parameters
+    ----------
+    columns : mapping
+        Name -> numbers, shape (N,); one at least.
+    units : mapping
+        Name -> unit as the file writes it, of those that have one.
+
+    Returns
+    -------
+    stamps : Stamps or None
+        The column, its unit and what tells them; None where none is a clock.
+    seconds : FloatArray or None
+        Times of the rows from the first on, shape (N,) [s].
+    runs : tuple of slice
+        Rows of each run, the longest first; one of all without a clock.
+    options : dict
+        Options of the source by which runs begin.
     """
     best = None
     likely = -1
@@ -107,11 +124,23 @@ def find_clock(
 
 
 def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
-    """Times, (N,), that go on where a counter wrapped or rows stood out of order, and the options.
+    """Times that go on where a counter wrapped or rows stood out of order.
 
     A counter wraps if each of its steps back is that of one modulus. Rows are out of order if
     sorting makes the times even, and either puts none of them beside another of nearly the same
     time, as two drives would, or moves none far; others that go back begin a run.
+
+    Parameters
+    ----------
+    times : FloatArray
+        Numbers of a column in its unit, shape (N,).
+
+    Returns
+    -------
+    times : FloatArray
+        Shape (N,); as they were where nothing is to be put in order.
+    options : dict
+        ``wraps_at`` or ``sort`` of the column of times; empty where nothing is.
     """
     steps = np.diff(times)
     if not (np.isfinite(times).all() and (steps < 0).any()):
@@ -135,8 +164,22 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
-    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option
-    ``max_gap``, if they pause.
+    """Rows of each run of times, which ends where they restart or pause.
+
+    Parameters
+    ----------
+    seconds : FloatArray
+        Times, shape (N,) [s].
+    step : float
+        Their typical step [s]; a pause is a step above `FEWEST_STEPS` of it, and above `MAX_GAP`.
+
+    Returns
+    -------
+    runs : list of slice
+        Rows of each run, in their order; where pauses end them, none that last less than
+        ``max_gap``.
+    options : dict
+        The option ``max_gap``, if times pause and seldom; else empty.
     """
     steps = np.diff(seconds)
     longest = float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
@@ -152,7 +195,9 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
 
 
 def plain_name(name: str) -> str:
-    """In lower case, without marks, words apart."""
+    """A column's name in lower case, without marks, words apart: ``wheelSpeed_FL`` is ``wheel speed
+    fl``.
+    """
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
     return re.sub(r"[\W_]+", " ", words).strip().lower()
 
@@ -181,7 +226,23 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     """A column of time in the unit in which a step makes a rate that loggers have.
 
-    None where no unit does.
+    Parameters
+    ----------
+    name : str
+        The column.
+    step : float
+        Its typical step, in the column's unit.
+    unit : str
+        Unit that the header states, as `STATED_UNITS` has it; empty where it states none.
+    named : bool
+        Whether the column is named as time.
+
+    Returns
+    -------
+    Stamps or None
+        None where no unit is stated or fits and the column is not named as time, or where its rate
+        would be too high. ``asked`` where the unit that is taken does not fit, or is not the stated
+        one.
     """
     offered = UNITS | ({unit: STATED_UNITS[unit]} if unit else {})
     fitting = [

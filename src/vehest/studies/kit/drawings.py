@@ -74,7 +74,30 @@ def signals_of(
     test_set: str,
     lines: Mapping[Name, Line],
 ) -> DriveSignals:
-    """Signals of the rows of a board, of each the seed chosen on validation."""
+    """Signals of the rows of a board, of each the seed chosen on validation.
+
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        The comparison.
+    board : pd.DataFrame
+        Rows of a leaderboard with estimator, variant, seed and title; their order is that of
+        drawing.
+    test_set : str
+        The test set whose estimates are read.
+    lines : mapping
+        (estimator, variant) -> colour, dash and marker.
+
+    Returns
+    -------
+    DriveSignals
+        Estimates of all candidates at the evaluation rate.
+
+    Raises
+    ------
+    DataError
+        An estimate is damaged, or does not cover its range.
+    """
     models = {(*model.name, model.seed): model for model in artefacts.models}
     candidates = {
         (row["estimator"], row["variant"]): (
@@ -117,6 +140,18 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
     """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`.
 
     On the page, all traces of the test set, which begin there.
+
+    Parameters
+    ----------
+    signals : DriveSignals
+        At most MAX_IN_ZOOM estimates are drawn, the first ones.
+    file : str
+        End of the figure's name.
+
+    Returns
+    -------
+    Figure
+        With the content of the page's interactive plot (`explorer_of`).
     """
     drive = signals.reference
     start, stop = signals.busiest
@@ -261,6 +296,7 @@ def _explorer(signals: DriveSignals) -> str:
 
 
 def _reference_trace(signals: DriveSignals) -> figures.Traces:
+    """The reference as a trace, its sideslip NaN where it is not drawn."""
     drive = signals.reference
     return figures.Traces(
         "measured", REFERENCE, drive.vy_ref, _where_drawn(drive, drive.sideslip_ref)
@@ -268,6 +304,7 @@ def _reference_trace(signals: DriveSignals) -> figures.Traces:
 
 
 def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
+    """Estimates as traces, in the order of the candidates."""
     return [
         figures.Traces(title, line, drive.vy, _where_drawn(drive, drive.sideslip))
         for (_, title, line), drive in zip(
@@ -277,6 +314,7 @@ def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
 
 
 def _errors(signals: DriveSignals) -> list[figures.Errors]:
+    """Title, line and sideslip error [deg] at the scored samples, (K,), of each candidate."""
     return [
         (title, line, np.degrees(drive.sideslip_error)[drive.is_sideslip_scored])
         for (_, title, line), drive in zip(
@@ -286,7 +324,11 @@ def _errors(signals: DriveSignals) -> list[figures.Errors]:
 
 
 def _joined(parts: Sequence[Scored], step: float) -> Scored:
-    """Ranges one after another; a single one keeps its times."""
+    """Ranges one after another; a single one keeps its times.
+
+    Times of several ranges are replaced by equal steps from zero; samples of the gaps are NaN and
+    not scored.
+    """
     if len(parts) == 1:
         return parts[0]
     gap = _gap_of(parts)
