@@ -178,22 +178,11 @@ class Replay:
         out: Path | None,
         view: View,
     ) -> Figures:
-        """Estimate at the rate of the samples; the first stepper is for warming up.
+        """Estimate at the rate of the samples, into ``out`` (a table or a log of frames), and
+        return the figures, also of a replay that was stopped.
 
-        Parameters
-        ----------
-        make_stepper : callable
-            Takes the clock that judges the stamps of frames; None in real time, where the
-            receiver's clock stamps them.
-        out : Path or None
-            Table or log of frames.
-        view : View
-            Shows how it goes.
-
-        Returns
-        -------
-        Figures
-            Also of a replay that was stopped.
+        ``make_stepper`` takes the clock that judges the stamps of frames; None in real time, where
+        the receiver's clock stamps them. Its first stepper is for warming up.
 
         Raises
         ------

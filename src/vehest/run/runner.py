@@ -88,17 +88,7 @@ class Stages:
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate.
 
-        Parameters
-        ----------
-        config : Config
-            As composed for ``ingest``.
-
-        Raises
-        ------
-        DryRunStop
-            In a dry run, where it is not there.
-        VehestError
-            As `plan_ingest` and `write_ingest` do.
+        ``config`` is composed for ``ingest``. Raises as `ensure`, `plan_ingest` and `write_ingest`.
         """
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
@@ -113,16 +103,8 @@ class Stages:
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
     ) -> Artefact:
-        """The recordings of a data set at another rate.
-
-        Parameters
-        ----------
-        ingested : Artefact
-            Recordings at their native rate.
-        rate_hz : float
-            [Hz].
-        options : mapping
-            ``downsample`` of a configuration.
+        """The ingested recordings of a data set at another rate [Hz]; ``options`` are
+        ``downsample`` of a configuration.
         """
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
@@ -148,14 +130,8 @@ class Stages:
         ]
 
     def look_for_files(self, config: Config) -> None:
-        """Make sure that the raw files of every data set of a split are here.
-
-        Read nothing.
-
-        Raises
-        ------
-        MissingError
-            Some are not.
+        """Raise `MissingError` where raw files of a data set of a split are not here; nothing is
+        read.
         """
         for dataset in self.datasets_of(config):
             if not missing_keys(dict(dataset)):  # which its ingest reports
@@ -183,15 +159,8 @@ class Stages:
         )
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
-        """Channels and rates of the recordings of every data set of a split, which are ingested for
-        it.
-
-        No samples are read.
-
-        Returns
-        -------
-        dict
-            Data set -> summaries of its recordings.
+        """Data set of a split -> channels and rates of its recordings, which are ingested for it;
+        no samples are read.
         """
 
         def read(name: str) -> tuple[RecordingSummary, ...]:
@@ -232,22 +201,7 @@ class Stages:
             )
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
-        """Every data set of a split at a rate.
-
-        Parameters
-        ----------
-        split : Split
-            Names the data sets.
-        rate_hz : float
-            [Hz].
-        config : Config
-            With options of ``downsample``.
-
-        Returns
-        -------
-        dict
-            Data set -> its recordings at the rate.
-        """
+        """Data set of a split -> its recordings at a rate [Hz], by ``downsample`` of ``config``."""
         return {
             name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"])
             for name in split.datasets
@@ -273,17 +227,9 @@ class Stages:
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
-        """How a configuration is evaluated: against references that are resampled like everything,
-        but never filtered further.
-
-        Parameters
-        ----------
-        config : Config
-            As composed for ``eval``.
-        data : mapping
-            Data set -> recordings at the estimator's rate.
-        faults : tuple of FaultSettings
-            Faults under which it is evaluated too.
+        """How a configuration is evaluated, also under ``faults``: against references that are
+        resampled like everything, but never filtered further. ``data`` are the recordings of each
+        data set at the estimator's rate.
         """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
