@@ -233,7 +233,9 @@ def run_study(
         messages.end(PLAN, name or SWEEP)
         values = {}
         if study.publish and not (options.retrain or TRAIN in runner.force):
-            values = published_values(study, planned, RESULTS / study.study / SEARCHES)
+            values = published_values(
+                study, planned, runner.origin, RESULTS / study.study / SEARCHES
+            )
         if values:
             runner.messages.line(
                 "note",
@@ -257,7 +259,7 @@ def run_study(
         if sweep:
             report, summary = draw_sweep(study, comparisons[""], runner)
         else:
-            trials = trials_of(study, planned, values)
+            trials = trials_of(study, planned, runner.origin, values)
             remarks = remarks_on(study, planned, trials)
             for remark in remarks:
                 runner.messages.warn(remark)

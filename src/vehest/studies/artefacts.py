@@ -324,7 +324,7 @@ class Trial:
     training: Mapping[str, Any]  # how it was trained, as configured
     metric: str  # that chooses
     validation: float  # value of the metric on the validation range, to six significant digits
-    key: str  # of its training
+    origin: str  # of its training: `vehest.run.weights`
     evaluation: str  # version and options of its evaluation
     chosen: bool = False  # whether it has the lowest value of its search
 
