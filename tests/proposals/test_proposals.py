@@ -3,6 +3,7 @@ not see through.
 """
 
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
+from vehest.data.units import factor_to_si
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import _busiest, inspect
 from vehest.run.own_car.questions import ask, questions_of
@@ -150,6 +152,71 @@ def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp
         [],
     )
     assert sum("wheel_speed" in note and "missing samples" in note for note in log_draft.notes) == 4
+
+
+WHEEL_SCALES = {  # unit -> value at a wheel speed of 1 rad/s
+    "km/h": 3.6 * RADIUS,
+    "mph": RADIUS / 0.44704,
+    "cm/s": 100.0 * RADIUS,
+    "ft/s": RADIUS / 0.3048,
+    "0.01*km/h": 360.0 * RADIUS,
+    "rpm": 30.0 / np.pi,
+    "rev/s": 0.5 / np.pi,
+    "deg/s": 180.0 / np.pi,
+}
+
+
+@pytest.mark.parametrize(
+    ("unit", "header"),
+    [
+        *product(WHEEL_SCALES, ["{} [{}]"]),
+        *((unit, "{}") for unit in WHEEL_SCALES if unit != "ft/s"),  # rad/s at 0.305 m
+    ],
+)
+def test_wheel_speeds_are_read_in_any_unit_of_a_speed(tmp_path, unit, header):
+    d = drive(60.0)
+    wheels = {
+        header.format(f"Wheel{corner.upper()}", unit): WHEEL_SCALES[unit] * d[f"wheel_{corner}"]
+        for corner in CORNERS
+    }
+    proposals = proposals_of(tmp_path, usual(d).assign(**wheels))
+    names = [f"wheel_speed_{corner}" for corner in CORNERS]
+    is_ambiguous = unit == "mph" and "[" not in header  # from rad/s of a wheel of 0.447 m
+    for name in names:
+        proposal = proposals.by_channel[name]
+        if is_ambiguous:
+            assert "mph fits equally well" in proposal.question
+        else:
+            factor = proposal.factor * factor_to_si(proposal.unit, "rad/s") * WHEEL_SCALES[unit]
+            expected = 1.0 if proposal.factor == 1.0 else RADIUS / 0.3
+            assert factor == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "problem"),
+    [
+        ("WheelFL [mm]", 1.0, "is left out: it is named like wheel_speed_fl, but its unit"),
+        ("WheelFL [rpm]", 30.0 / np.pi, "another wheel in km/h"),
+    ],
+)
+def test_a_wheel_in_another_unit_is_named_with_the_remedy(tmp_path, name, scale, problem):
+    d = drive(60.0)
+    wheels = {
+        f"Wheel{corner} [km/h]": 3.6 * RADIUS * d[f"wheel_{corner}"] for corner in ("rl", "rr")
+    }
+    wheels[name] = scale * d["wheel_fl"]
+    proposals = proposals_of(tmp_path, usual(d).assign(**wheels))
+    note = next(note for note in proposals.notes if problem in note)
+    assert "wheel_speed_fl: {column:" in note
+    assert "wheel_speed_fl" not in proposals.by_channel
+
+
+def test_wheel_speeds_in_counts_of_no_known_unit_are_left_out_with_a_question(tmp_path):
+    d = drive(60.0)
+    wheels = {f"Wheel{corner.upper()}": 20.0 * d[f"wheel_{corner}"] for corner in CORNERS}
+    proposal = proposed(tmp_path, usual(d).assign(**wheels))["wheel_speed_fl"]
+    assert "does not agree with the speed" in proposal.question
+    assert proposal.is_weak
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def propose(
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     usable = candidates(columns, clock_hz)
-    wheels = find_wheels(usable)
+    wheels, wheel_notes = find_wheels(usable)
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
     is_standing = _is_standing(usable)
@@ -150,7 +150,7 @@ def propose(
     search = None if is_standing else _best_search(usable, turnings, clock_hz)
     motion = search.motion if search else None
     proposals = _assign(usable, search, wheels)
-    proposals = _with_pose(proposals, usable, motion)
+    proposals = _with_pose(proposals.with_notes(*wheel_notes), usable, motion)
     if is_standing:
         standstill = f"speed below {MAX_STANDSTILL_SPEED:g} m/s"
         proposals = proposals.with_notes(

@@ -91,15 +91,20 @@ class Candidate:
 
     def measures(self, channel: str) -> bool:
         """Whether the header's unit, if there is one, is of a channel's quantity."""
-        try:
-            return not self.unit or si_factor(self.unit, channel) > 0.0
-        except DataError:
-            return False
+        return not self.unit or is_unit_of(self.unit, channel)
 
 
 def si_factor(unit: str, channel: str) -> float:
     """Factor from a unit to that of a channel."""
     return factor_to_si(unit, CHANNELS[channel].unit)
+
+
+def is_unit_of(unit: str, channel: str) -> bool:
+    """Whether a unit is of a channel's quantity."""
+    try:
+        return si_factor(unit, channel) > 0.0
+    except DataError:
+        return False
 
 
 def candidates(
