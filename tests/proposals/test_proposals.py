@@ -195,8 +195,8 @@ def test_wheel_speeds_are_read_in_any_unit_of_a_speed(tmp_path, unit, header):
 @pytest.mark.parametrize(
     ("name", "scale", "problem"),
     [
-        ("WheelFL [mm]", 1.0, "is left out: it is named like wheel_speed_fl, but its unit"),
-        ("WheelFL [rpm]", 30.0 / np.pi, "another wheel in km/h"),
+        ("WheelFL [mm]", 1.0, "since the unit is of no speed"),
+        ("WheelFL [rpm]", 30.0 / np.pi, "since another wheel is in km/h"),
     ],
 )
 def test_a_wheel_in_another_unit_is_named_with_the_remedy(tmp_path, name, scale, problem):
@@ -1661,3 +1661,48 @@ def test_a_steering_wheel_that_turns_no_further_than_road_wheels_is_left_out(tmp
     channels, open_questions = left_out(tmp_path, table)
     assert not {"steer", "handwheel"} & set(channels)
     assert "its name suggests a steering wheel" in open_questions["Lenkradwinkel"].text
+
+
+@pytest.mark.parametrize("rate_hz", [25.0, 100.0])
+def test_the_same_signal_in_another_unit_is_no_second_measurement(tmp_path, rate_hz):
+    d = drive(60.0, rate_hz)
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "Speed (km/h)": 3.6 * d["vx"],
+            "Speed (mph)": d["vx"] / 0.44704,
+            "Yaw Rate (rad/s)": d["r"],
+            "Yaw Rate (deg/s)": np.degrees(d["r"]),
+            "LatAcc (g)": d["ay"] / G,
+        }
+    )
+    proposals = proposals_of(tmp_path, table)
+    assert not {"vx_ref", "yaw_rate_ref"} & set(proposals.by_channel)
+    speed = proposals.by_channel["vx"]
+    assert any("holds the same samples in" in text for text in speed.evidence)
+    assert not speed.question
+    second = 3.6 * d["vx"] + 0.05 * np.random.default_rng(1).standard_normal(len(d["t"]))
+    by_channel = proposed(tmp_path, table.assign(**{"Speed (mph)": second / 1.609344}))
+    assert "vx_ref" in by_channel
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("Gyro", 0.0), ("LatAcc", 0.0123), ("Speed", 55.0), ("Steer", -7.5), ("WheelFL [km/h]", 0.0)],
+)
+def test_a_sensor_that_never_changes_is_named(tmp_path, column, value):
+    proposals = proposals_of(tmp_path, usual(drive(60.0)).assign(**{column: value}))
+    assert column not in {proposal.column for proposal in proposals.channels}
+    (note,) = (note for note in proposals.notes if note.startswith("constant, or of few values"))
+    assert f"'{column}' ({value:g})" in note
+
+
+@pytest.mark.parametrize("column", ["Gyro", "LatAcc", "Speed", "Steer"])
+def test_a_sensor_that_freezes_for_half_of_the_drive_is_named(tmp_path, column):
+    table = usual(drive(60.0))
+    table.loc[1500:, column] = table.loc[1500, column]
+    log_draft = drafted(tmp_path, table)
+    named = [*log_draft.remarks, *log_draft.notes]
+    is_channel = column in {proposal.column for proposal in log_draft.examined.proposals.channels}
+    expected = "constant at" if is_channel else f"'{column}' is left out"
+    assert any(expected in text for text in named)

@@ -64,6 +64,8 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
+COPY_QUANTILE = 0.99  # of the difference of two columns, which is rounding in a copy
+COPY_TOLERANCE = 1e-6
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
@@ -360,8 +362,12 @@ def repeated(search: Search) -> Iterator[Proposal]:
             ):
                 # named as a speed, and one but for its scale, as a motor's speed is
                 scaled.append(column)
-        for repeat in repeats:
+        for repeat in list(repeats):
             search.free.remove(repeat.column)
+            if _is_copy(repeat, first, channel):
+                repeats.remove(repeat)
+                evidence = f"'{repeat.column.name}' holds the same samples in {repeat.unit}"
+                yield Proposal(first.column.name, channel, first.unit, first.sign, (evidence,))
         family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
         if repeats:
             yield from _separated(family, channel)
@@ -407,6 +413,19 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
     return {name: proposal for name, proposal in channels.items() if name != "vx"} | {
         "vx_ref": reference
     }
+
+
+def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
+    """Whether a column holds the samples of another one, but for unit, sign and rounding."""
+    if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
+        return False
+    factors = [each.sign * si_factor(each.unit, channel) for each in (repeat, first)]
+    samples = [
+        each.column.values * factor for each, factor in zip((repeat, first), factors, strict=True)
+    ]
+    rounding = sum(float(np.diff(np.unique(values)).min()) for values in samples)
+    difference = float(np.quantile(np.abs(samples[0] - samples[1]), COPY_QUANTILE))
+    return difference <= rounding + COPY_TOLERANCE * rms(samples[1])
 
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:

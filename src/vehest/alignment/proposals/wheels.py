@@ -54,7 +54,7 @@ def find_wheels(columns: Sequence[Candidate]) -> tuple[Wheels, list[str]]:
     are left out for their unit.
     """
     wheels: dict[str, Candidate] = {}
-    notes = []
+    left_out: dict[str, list[str]] = {}
     for column in columns:
         if not column.is_wheel:
             continue
@@ -62,17 +62,19 @@ def find_wheels(columns: Sequence[Candidate]) -> tuple[Wheels, list[str]]:
         unit = _header_unit(wheels)
         problem = ""
         if not column.measures("vx") and not column.measures(role):
-            problem = f"its unit '{column.unit}' is of no speed"
+            problem = "the unit is of no speed"
         elif unit and column.unit not in ("", unit):
-            problem = f"it is in {column.unit}, another wheel in {unit}"
+            problem = f"another wheel is in {unit}"
         if problem:
-            notes.append(
-                f"'{column.name}' is left out: it is named like {role}, but {problem}; "
-                f"if it is one, add {role}: {{column: '{column.name}', unit: rad/s, factor: …}} "
-                "to the channels of the data set"
-            )
+            left_out.setdefault(problem, []).append(f"{role}: {{column: '{column.name}'")
         else:
             wheels.setdefault(role.removeprefix(PREFIX), column)
+    notes = [
+        f"named like wheel speeds and left out, since {problem}: to add one, write "
+        + ", ".join(f"{entry}, unit: rad/s, factor: …}}" for entry in entries)
+        + " below channels in the data set"
+        for problem, entries in left_out.items()
+    ]
     return wheels, notes
 
 
