@@ -64,8 +64,8 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
-COPY_QUANTILE = 0.99  # of the difference of two columns, which is rounding in a copy
-COPY_TOLERANCE = 1e-6
+# of the steps from sample to sample; two sensors differ by as much as their noise
+MAX_COPY_DIFFERENCE = 0.05
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
@@ -419,13 +419,10 @@ def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
     """Whether a column holds the samples of another one, but for unit, sign and rounding."""
     if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
         return False
-    factors = [each.sign * si_factor(each.unit, channel) for each in (repeat, first)]
-    samples = [
-        each.column.values * factor for each, factor in zip((repeat, first), factors, strict=True)
-    ]
-    rounding = sum(float(np.diff(np.unique(values)).min()) for values in samples)
-    difference = float(np.quantile(np.abs(samples[0] - samples[1]), COPY_QUANTILE))
-    return difference <= rounding + COPY_TOLERANCE * rms(samples[1])
+    copy, samples = (
+        each.column.values * each.sign * si_factor(each.unit, channel) for each in (repeat, first)
+    )
+    return rms(copy - samples) < MAX_COPY_DIFFERENCE * rms(np.diff(samples))
 
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
