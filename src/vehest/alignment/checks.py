@@ -35,7 +35,7 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError, number_of
-from vehest.data.recording import PART, Recording, part_slices
+from vehest.data.recording import MISSING, PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
@@ -250,7 +250,12 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
 
 
 def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """A note of the share of missing samples of each channel with gaps."""
+    """Samples that are missing, that the source interpolated, or at which it ended the
+    recording.
+    """
+    for name, texts in (recording.provenance.get(MISSING) or {}).items():
+        for text in texts:
+            yield Finding("warning", "missing", name, text)
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.alignment.findings import Finding
 from vehest.artefacts.artefact import find
 from vehest.configuration.composition import Config, compose_config
 from vehest.configuration.files import choices
@@ -33,7 +32,6 @@ from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.printing import TerminalTable
 from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
-from vehest.sources.signals import MISSING
 from vehest.sources.tabular import unused_columns
 
 # Time stamps between these count from 1970.
@@ -146,20 +144,13 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
                     }
                 )
             else:
-                findings = [*_missing_samples(recording), *checks_of_recording(recording)]
+                findings = checks_of_recording(recording)
                 rows += [{"recording": recording.id, **asdict(finding)} for finding in findings]
     lines: Lines = []
     for row in rows:
         channel = f" {row['channel']}:" if row["channel"] else ""
         lines.append(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
     return rows, lines or ["no findings"]
-
-
-def _missing_samples(recording: Recording) -> Iterator[Finding]:
-    """Samples that the source interpolated, or at which it ended the recording."""
-    for name, texts in (recording.provenance.get(MISSING) or {}).items():
-        for text in texts:
-            yield Finding("warning", "missing", name, text)
 
 
 def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:

@@ -23,7 +23,7 @@ from pydantic import Field
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import MISSING, Recording
 from vehest.sources.base import require_files
 from vehest.sources.clocks import (
     SLACK,
@@ -41,7 +41,6 @@ from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 MIN_COVERED = 0.5  # share of a file's time that its segments must cover
-MISSING = "missing_samples"  # key of a recording's provenance: channel -> texts
 FASTER = 1.05  # than the raster: the rest would fold into it
 
 

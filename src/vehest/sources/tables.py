@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,7 +23,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, printable
+from vehest.data.errors import DataError, number_of, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked, current_limits
 from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
@@ -30,9 +31,11 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
+TAIL = 1 << 16  # bytes at the end of the rows, in which the last ones are
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
 # a row with a cell that is a number, or whose first one is missing
 ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
+UNFINISHED = re.compile(r"[-+]|[-+]?\.|[-+]?[\d.]+e[-+]?", re.IGNORECASE)  # a number, cut short
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -48,6 +51,7 @@ class TextLayout:
     missing: tuple[str, ...] = ()  # cells without a sample, beside empty ones, NaN, NA and null
     names: tuple[str, ...] | None = None  # of the columns where the file has no line of them
     clock: str | None = None  # column of times as a clock shows them, which become seconds
+    n_bytes: int | None = None  # of the file that are read; None for all of them
 
 
 def is_parquet(file: Path) -> bool:
@@ -225,7 +229,11 @@ def read_columns(
     if is_parquet(file):
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, selected)
-    opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
+    opened = (
+        partial(table_stream, file, layout.n_bytes)
+        if text is None
+        else partial(pa.BufferReader, text)
+    )
     layout = with_names(file, layout)
     convert = _conversion(selected, layout)
     if text is None:
@@ -285,7 +293,7 @@ def column_parts(
             else:
                 layout = with_names(file, layout)
                 options = _options(layout, _conversion(selected, layout), [])
-                stream = opened.enter_context(table_stream(file))
+                stream = opened.enter_context(table_stream(file, layout.n_bytes))
                 opened.enter_context(decoding_failures_ignored())
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
@@ -408,9 +416,9 @@ def _conversion(selected: Sequence[str], layout: TextLayout) -> pc.ConvertOption
     )
 
 
-def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table, unpacked as it is read if it ends in ``.gz``, ``.bz2``, ``.zst`` or
-    ``.lz4``.
+def table_stream(file: Path, n_bytes: int | None = None) -> pa.NativeFile:
+    """Text of a table, or its first bytes, unpacked as it is read if it ends in ``.gz``, ``.bz2``,
+    ``.zst`` or ``.lz4``.
 
     Raises
     ------
@@ -421,9 +429,46 @@ def table_stream(file: Path) -> pa.NativeFile:
     OSError
         It cannot be opened.
     """
+    if n_bytes is not None:
+        return table_stream(file).get_stream(0, n_bytes)
     packed = PACKED.get(regular_file(file).suffix.lower())
     # pyarrow opens no name that is not UTF-8
     return pa.input_stream(open(file, "rb"), compression=packed)
+
+
+def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
+    """End of a table whose logger was switched off while it wrote: bytes before it, and its text.
+
+    It is zero bytes, a last row without an end that has fewer cells than the row above or ends
+    within a number, or both. None where the table is complete, packed or in UTF-16.
+    """
+    if is_parquet(file) or file.suffix.lower() in PACKED or layout.encoding.startswith("utf-16"):
+        return None
+    with open(regular_file(file), "rb") as stream:
+        size = end = stream.seek(0, os.SEEK_END)
+        tail = b""
+        while end and not tail:
+            start = max(end - TAIL, 0)
+            stream.seek(start)
+            tail = stream.read(end - start).rstrip(b"\0")
+            end = start + len(tail)
+    *above, last = re.split(r"\r\n|\n|\r", tail.decode(layout.encoding, errors="replace"))
+    has_zeros = end < size
+    cells, full = (
+        next(csv.reader([line], delimiter=layout.delimiter), [])
+        for line in (last, above[-1] if above else "")
+    )
+    is_row = all(re.search(ROW_OF_NUMBERS, line, re.IGNORECASE) for line in (last, *above[-1:]))
+    is_unfinished = bool(cells) and UNFINISHED.fullmatch(cells[-1].replace(layout.decimal, "."))
+    is_cut = (
+        len(cells) < len(full) or has_zeros or (is_unfinished and cells[-1] not in layout.missing)
+    )
+    if not (last.strip() and is_row and is_cut and len(cells) <= len(full)):
+        last = ""
+    texts = [f"a last row that is cut short ('{printable(last[-40:])}')"] if last else []
+    texts += [f"{number_of(size - end, 'zero byte')} at the end"] if has_zeros else []
+    n_bytes = end - len(last.encode(layout.encoding, errors="replace"))
+    return (n_bytes, " and ".join(texts)) if texts else None
 
 
 def require_memory(file: Path, layout: TextLayout) -> None:

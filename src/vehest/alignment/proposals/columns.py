@@ -25,6 +25,7 @@ MAX_STRAY_SHARE = 0.002
 MIN_CLOCK_SAMPLES = 1000  # samples
 HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
+MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -91,10 +92,7 @@ class Candidate:
 
     def measures(self, channel: str) -> bool:
         """Whether the header's unit, if there is one, is of a channel's quantity."""
-        try:
-            return not self.unit or si_factor(self.unit, channel) > 0.0
-        except DataError:
-            return False
+        return not self.unit or is_unit_of(self.unit, channel)
 
 
 def si_factor(unit: str, channel: str) -> float:
@@ -113,6 +111,28 @@ def si_factor(unit: str, channel: str) -> float:
         The unit is unknown, or of another quantity.
     """
     return factor_to_si(unit, CHANNELS[channel].unit)
+
+
+def unchanging(columns: Sequence[tuple[str, str, FloatArray, str]]) -> list[str]:
+    """Columns that are named like a channel of the motion and take too few values to be one, each
+    with its value or the number of them.
+    """
+    texts = []
+    for name, unit, values, _ in columns:
+        is_motion = any(role in UNITS or "wheel_speed" in role for role in hints(name, unit))
+        levels = np.unique(values[np.isfinite(values)][:MAX_LEVEL_SAMPLES])
+        if is_motion and 0 < len(levels) < MIN_LEVELS:
+            seen = f"{levels[0]:.4g}" if len(levels) == 1 else f"{len(levels)} values"
+            texts.append(f"'{name}' ({seen})")
+    return texts
+
+
+def is_unit_of(unit: str, channel: str) -> bool:
+    """Whether a unit is of a channel's quantity."""
+    try:
+        return si_factor(unit, channel) > 0.0
+    except DataError:
+        return False
 
 
 def candidates(
@@ -140,7 +160,7 @@ def candidates(
         if (
             1.0 - is_measured.mean() > MAX_MISSING_SHARE
             or not np.ptp(values[is_measured]) > 0.0
-            or len(np.unique(values[is_measured][:200_000])) < MIN_LEVELS
+            or len(np.unique(values[is_measured][:MAX_LEVEL_SAMPLES])) < MIN_LEVELS
         ):
             continue
         roles = hints(name, unit)

@@ -64,6 +64,8 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
+# of the steps from sample to sample; two sensors differ by as much as their noise
+MAX_COPY_DIFFERENCE = 0.05
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
@@ -394,8 +396,12 @@ def repeated(search: Search) -> Iterator[Proposal]:
             ):
                 # named as a speed, and one but for its scale, as a motor's speed is
                 scaled.append(column)
-        for repeat in repeats:
+        for repeat in list(repeats):
             search.free.remove(repeat.column)
+            if _is_copy(repeat, first, channel):
+                repeats.remove(repeat)
+                evidence = f"'{repeat.column.name}' holds the same samples in {repeat.unit}"
+                yield Proposal(first.column.name, channel, first.unit, first.sign, (evidence,))
         family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
         if repeats:
             yield from _separated(family, channel)
@@ -447,6 +453,16 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
     return {name: proposal for name, proposal in channels.items() if name != "vx"} | {
         "vx_ref": reference
     }
+
+
+def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
+    """Whether a column holds the samples of another one, but for unit, sign and rounding."""
+    if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
+        return False
+    copy, samples = (
+        each.column.values * each.sign * si_factor(each.unit, channel) for each in (repeat, first)
+    )
+    return rms(copy - samples) < MAX_COPY_DIFFERENCE * rms(np.diff(samples))
 
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:

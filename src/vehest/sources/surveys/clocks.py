@@ -25,14 +25,16 @@ COUNTER = re.compile(
     r"?(id|nr|no|number|index))?$"
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
-STATED_UNITS = {**UNITS, "cs": 0.01, "min": 60.0, "h": 3600.0}  # the last where a header says so
+# the last where a header says so
+STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
     "s": "s sec secs second seconds sekunden",
     "ms": "ms msec millis milliseconds",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
-    "cs": "cs 1/100s centiseconds hundredths",
+    "0.1*ms": "100us 100µs 100μs 0.1ms",
+    "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
     "min": "min mins minute minutes",
     "h": "h hr hrs hour hours stunden",
 }
@@ -40,6 +42,8 @@ SPELLINGS = {
     spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
+MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
+MIN_LOG_SECONDS = 5.0
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
@@ -98,7 +102,9 @@ def find_clock(
         column_step = _step(values, named=named)
         counts_rows = column_step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = (
-            None if column_step is None or counts_rows else _stamps(name, column_step, unit, named)
+            None
+            if column_step is None or counts_rows
+            else _stamps(name, column_step, unit, named, float(np.ptp(values)))
         )
         if column_step is not None and stamps is not None and 2 * bool(unit) + named > likely:
             is_unknown = bool(written.strip("-")) and not unit
@@ -223,8 +229,8 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
     return step if step > 0 and grows else None
 
 
-def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
-    """A column of time in the unit in which a step makes a rate that loggers have.
+def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> Stamps | None:
+    """A column of time, of a step and a length, in the unit that makes a rate that loggers have.
 
     Parameters
     ----------
@@ -245,10 +251,15 @@ def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
         one.
     """
     offered = UNITS | ({unit: STATED_UNITS[unit]} if unit else {})
-    fitting = [
-        name for name, factor in offered.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
-    ]
+    rates = {name: 1.0 / (step * factor) for name, factor in offered.items()}
+    fitting = [name for name, rate in rates.items() if RATES[0] <= rate <= RATES[1]]
+    slow = [name for name, rate in rates.items() if MIN_RATE_HZ <= rate < RATES[0]]
+    is_short = bool(fitting) and length * STATED_UNITS[fitting[0]] < MIN_LOG_SECONDS
+    if unit in slow:
+        fitting = slow
     chosen = unit if unit in fitting or not fitting else fitting[0]
+    if not unit and is_short and slow:
+        chosen, fitting = slow[0], []
     chosen = chosen or ("s" if named else "")
     if not chosen or step * STATED_UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None

@@ -43,6 +43,7 @@ from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_
 from vehest.sources.tables import (
     ROW_OF_NUMBERS,
     TextLayout,
+    cut_end,
     is_parquet,
     names_of,
     parse_table,
@@ -254,10 +255,11 @@ def shape_of(file: Path) -> Shape:
         limits allow, or its columns are not signals.
     """
     head = read_head(file, HEAD)
-    encoding, text = _decoded(head, file)
+    is_whole = len(head) < HEAD
+    encoding, text = _decoded(head.rstrip(b"\0") if is_whole else head, file)
     lines = [
         line[:LONGEST_LINE]
-        for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]
+        for line in re.split(r"\r\n|\n|\r", text)[: None if is_whole else -1][:MOST_LINES]
     ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
     require_columns_of_signals(file, lines, tables)
@@ -491,17 +493,22 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
     )
     require_memory(file, shape.layout)
-    opened = partial(table_stream, file)
+    n_bytes, left_out = cut_end(file, shape.layout) or (None, "")
+    opened = partial(table_stream, file, n_bytes)
     problem = None
     for convert in (inferred, text):
         lines: list[str] = []
         try:
             layout = with_names(file, shape.layout)
             table = parse_table(opened, layout, convert, lines_of_text=lines)
-            return table, [f"line '{printable(line.strip()[:60])}'" for line in lines]
+            texts = [f"line '{printable(line.strip()[:60])}'" for line in lines]
+            return table, [left_out, *texts] if left_out else texts
         except DAMAGE as error:
             problem = printable(first_line(error))
-    why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
+    why = (
+        "is it truncated, is a line of text or a second table below its rows, or are its columns "
+        "aligned by blanks?"
+    )
     raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
