@@ -79,7 +79,7 @@ class Quantity:
     factors: tuple[float, ...]  # q of each level
     # of each level, whether there are too few blocks for it (`pooled_quantile`)
     beyond: tuple[bool, ...]
-    effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
+    effective_blocks: float  # Kish's effective number of blocks, by the squared scores
 
     def __post_init__(self) -> None:
         _check_terms("weights", self.weights, 0.0)
