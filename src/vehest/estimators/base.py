@@ -205,7 +205,7 @@ class Estimator(Fittable):
         sample : array
             Values of ``channels``, (C,).
         initial_state : mapping
-            What a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
+            What a protocol passes of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
             otherwise.
         """
         return None

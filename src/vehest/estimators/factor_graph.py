@@ -134,7 +134,7 @@ class FactorGraph(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """Straight ahead and unknown, or what a protocol hands over."""
+        """Straight ahead and unknown, or the state that a protocol passes."""
         return self.first_motion(sample, np.full(2, self.noise.first_state), initial_state)
 
     def first_state(  # type: ignore[override]

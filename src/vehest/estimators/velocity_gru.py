@@ -45,7 +45,7 @@ class VelocityGruNetwork(VelocityNetwork):
 class VelocityGru(RecurrentVelocityEstimator):
     """GRU of Srinivasan et al. 2020.
 
-    An ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it.
+    An ``initial_state`` that a protocol passes is ignored: there is nothing to start from it.
     """
 
     name = "velocity_gru"

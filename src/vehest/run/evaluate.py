@@ -4,7 +4,7 @@ model, calibration, recordings -> estimates of each test set -> scored at the ev
 metrics.csv, timings.csv, blocks.csv
 
 Every fault adds rows under a condition of its own; without faults, key and files are those of an
-evaluation that knows none.
+evaluation that has none.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ class Evaluation:
         return read_recording(stored_recording(self.references, span))
 
     def measured(self, span: Span) -> Recording:
-        """A range as the estimator sees it: no references, and a warm-up before it."""
+        """A range as the estimator receives it: no references, and a warm-up before it."""
         recording = read_recording(stored_recording(self.data, span))
         recording = replace(recording, car=self.cars.get(span.dataset, UNKNOWN_CAR))
         return recording.cut(
@@ -455,7 +455,7 @@ def training_rows(
 ) -> list[dict[str, Any]]:
     """Errors on the training ranges.
 
-    None where the reference has gaps there or nothing was learnt.
+    None where the reference has gaps there or nothing was trained.
     """
     spans = [span for span in learnt_spans(model, "train") if span.dataset in evaluation.data]
     if not spans:

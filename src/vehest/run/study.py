@@ -441,7 +441,7 @@ def _part_jobs(
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change what comes out: not where data come from, where results go, or
+    """Those overrides that change the results: not where data come from, where results go, or
     tracking.
     """
     return [

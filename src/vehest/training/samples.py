@@ -16,7 +16,7 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):
-    """What is learnt from, as a network sees it."""
+    """Training data, as a network receives them."""
 
     inputs: Tensor  # (N, C)
     targets: Tensor  # (N,)

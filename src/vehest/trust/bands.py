@@ -314,7 +314,7 @@ def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A range with its estimate, as bands are learnt from it; arrays of T samples."""
+    """A range with its estimate, as bands are calibrated on it; arrays of T samples."""
 
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]

@@ -27,7 +27,7 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
 MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
-# rad and rad/s, standard deviation of a state that a protocol hands over
+# rad and rad/s, standard deviation of a state that a protocol passes
 EXACT_STATE_DEVIATION = 1e-6
 
 
@@ -98,7 +98,7 @@ class SideslipFilter(GatedFilter, Recursive):
     ) -> Gaussian[FloatArray]:
         """β and r before the first sample.
 
-        0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over.
+        0 with standard deviations (n ≥ 2), further states too, or the state that a protocol passes.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
