@@ -302,7 +302,7 @@ def test_strips_of_sensor_health_have_a_legend_and_the_estimators_names(chromium
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
     texts = chromium.execute_async_script(DRAWN_TEXTS)
     names = [text for text, _ in sorted(texts, key=lambda drawn: drawn[1])]
-    assert names == [f"Estimator {i}" for i in range(4, 0, -1)]  # from the top
+    assert names == [f"Estimator {i}" for i in range(1, 5)]  # from the top
 
 
 def test_rule_below_the_contents_is_as_wide_as_the_page_and_none_is_above_the_verdict(
