@@ -534,7 +534,7 @@ def _most_likely(
 def require_condition(
     recording: Recording, information: FloatArray, names: Sequence[str], requested: Sequence[str]
 ) -> None:
-    """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number
+    """Refuse, by a `DataError`, parameters that the drive cannot distinguish: the condition number
     of the scaled problem is too large.
 
     Parameters

@@ -25,7 +25,7 @@ from vehest.sources.clocks import mean_step, plain_rate
 GAIN = 0.02
 # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
 MAX_PERIOD_DEVIATION = 0.05
-ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is taken for it
+ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is assumed to be it
 STAMP_TOLERANCE = 1e-9  # s
 
 

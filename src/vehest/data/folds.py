@@ -30,7 +30,7 @@ class FoldsFile:
     of: Literal["recordings", "laps", "seconds"] = "laps"
     recordings: str = "*"  # pattern of those that take part
     block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
-    # taken off training and validation where they border on another fold [s]
+    # removed from training and validation where they border on another fold [s]
     gap_seconds: NonNegativeFloat = 2.0
 
 

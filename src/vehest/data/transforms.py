@@ -572,7 +572,7 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray, n_out:
 
 @cache
 def _compiled_sums() -> Callable[..., None]:
-    """`_sums` compiled, for which importing this module is not worth importing numba."""
+    """`_sums` compiled, imported on first use, so that this module does not import numba."""
     import numba
 
     compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Baseline: steady cornering of a single track from a data sheet; nothing is learnt."""
+"""Baseline: steady cornering of a single track from a data sheet; nothing is fitted."""
 
 from __future__ import annotations
 

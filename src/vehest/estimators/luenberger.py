@@ -142,6 +142,7 @@ class Luenberger(Recursive):
         box=(0.0, 0.5),
         of_largest="yaw_rate",
     )
+    trace_note = "v is set to 0 where the yaw rate is below a threshold (reset of the method)"
     style = "#5b8c00", "solid", "s"
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:

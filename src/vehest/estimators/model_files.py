@@ -53,7 +53,7 @@ class About:
 
     __pydantic_config__ = FURTHER_KEYS
     seed: int = 0
-    datasets: tuple[str, ...] = ()  # names of those that it learnt on
+    datasets: tuple[str, ...] = ()  # names of those that it was trained on
     trained_on: tuple[str, ...] = ()  # ranges
     validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
     n_parameters: int | None = None

@@ -1,4 +1,4 @@
-"""What calibrated bands are worth: how often they hold the error, how wide they are, and both in
+"""Scores of calibrated bands: how often they contain the error, how wide they are, and both in
 one score.
 
 A band is meant for v and β each: figures of β are in degrees, those of v have the suffix ``_vy``.
@@ -224,7 +224,7 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
     CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to
     it. Of a Gaussian, at levels 50, 68, 90 and 95 %, that is 2.6 % too low on average, and within 2
-    σ off by up to 0.045 σ: the tails beyond 97.5 % are taken for their end.
+    σ off by up to 0.045 σ: the tails beyond 97.5 % count as their end.
 
     Parameters
     ----------
@@ -251,10 +251,10 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
 def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
     """95 % interval of a proportion that is known by blocks: the exact binomial one of as many
-    samples as the blocks are worth.
+    samples as the blocks are equivalent to.
 
     These would have the variance that the blocks show, and are fewer for what so few blocks know of
-    it; where all are inside, or none, each block is worth one.
+    it; where all are inside, or none, each block counts as one.
 
     Parameters
     ----------

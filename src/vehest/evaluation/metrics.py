@@ -121,7 +121,7 @@ class Protocol:
     # whether estimates start at the reference state of the first sample
     initial_state: bool = False
     # test sets, with commas between them, of another car or tyre than the training's that the
-    # recordings do not tell apart by their
+    # recordings do not distinguish by their
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
     # speed of the car by its reference, from which on sideslip is scored [m/s]: on every data set,
@@ -317,7 +317,7 @@ def sequences(
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol hands over at the first sample of a range.
+    """The state that a protocol passes at the first sample of a range.
 
     Returns
     -------

@@ -76,8 +76,8 @@ def errors_under_fault(
 def flags_under_fault(
     parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float
 ) -> dict[str, float]:
-    """Whether bands hold and faults are flagged while they last, over all parts together, at
-    ``rate_hz`` [Hz].
+    """Whether bands contain the error and faults are flagged while they last, over all parts
+    together, at ``rate_hz`` [Hz].
 
     Errors count where sideslip is scored, flags at all samples.
 

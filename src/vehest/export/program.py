@@ -293,7 +293,7 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
 
 
 def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
-    """Tables of `vehest.trust.health_kernel` by name; None where no health was learnt."""
+    """Tables of `vehest.trust.health_kernel` by name; None where no health was calibrated."""
     if packed is None:
         return None
     layout = Layout(*map(int, views(Layout, packed, ())[0]))

@@ -25,7 +25,7 @@ from vehest.trust.contract import GuardedStepper
 
 SECONDS = 12.0
 COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
-RADIUS = 0.3  # m, of a wheel where nothing was learnt
+RADIUS = 0.3  # m, of a wheel where nothing was fitted
 
 
 def replayed(
@@ -132,7 +132,7 @@ def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
     """Largest and usual values of channels in training.
 
-    Round ones of a passenger car where nothing was learnt.
+    Round ones of a passenger car where nothing was fitted.
     """
     names = stepper.channels
     table = health_table(stepper.monitor.packed_health)

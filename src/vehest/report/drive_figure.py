@@ -105,7 +105,7 @@ def drive_figure(
     start: float | None = None,
     stop: float | None = None,
 ) -> Figure:
-    """Draw a drive on one page for print, in colours that colour-blind readers tell apart.
+    """Draw a drive on one page for print, in colours that colour-blind readers distinguish.
 
     Sideslip with the 90 % band and the health of the first estimate; lateral velocity; the measured
     channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over

@@ -4,7 +4,7 @@ model, calibration, recordings -> estimates of each test set -> scored at the ev
 metrics.csv, timings.csv, blocks.csv
 
 Every fault adds rows under a condition of its own; without faults, key and files are those of an
-evaluation that knows none.
+evaluation that has none.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ class Evaluation:
         return read_recording(stored_recording(self.references, span))
 
     def measured(self, span: Span) -> Recording:
-        """A range as the estimator sees it: no references, and a warm-up before it.
+        """A range as the estimator receives it: no references, and a warm-up before it.
 
         Returns
         -------

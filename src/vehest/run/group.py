@@ -241,7 +241,7 @@ def _train(
     artefacts = []
     for job, (estimator, record) in zip(jobs, fit_jobs(jobs, context), strict=True):
         if record.interrupted and not record.metrics.get("best_epoch", 1):
-            continue  # nothing learnt yet; the checkpoint knows where to go on
+            continue  # nothing trained yet; the checkpoint states where to go on
 
         def write(
             folder: Path,

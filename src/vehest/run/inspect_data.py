@@ -29,6 +29,7 @@ from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, stored_summary, summary_of
 from vehest.data.store import read_recording
 from vehest.run.ingest import plan_ingest, recording_file
+from vehest.run.named_files import require_dataset_or_file
 from vehest.run.printing import TerminalTable
 from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
@@ -207,17 +208,14 @@ def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
 
     Raises
     ------
-    ConfigurationError
-        It is neither.
+    VehestError
+        It is neither (`require_dataset_or_file`).
     """
+    require_dataset_or_file(source)
     if source in choices("dataset"):
         config = compose_config("ingest", [f"dataset={source}", *overrides])
-    elif os.path.lexists(source):  # also of a name that is too long or holds a null character
-        config = compose_config("estimate", overrides)
     else:
-        raise ConfigurationError(
-            f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file"
-        )
+        config = compose_config("estimate", overrides)
     with use_limits(limits_from_config(config["limits"])):
         yield config
 

@@ -534,7 +534,7 @@ class Runner(Stages):
 
 
 def _in_words(artefact: Artefact) -> tuple[str, str]:
-    """How a model, a calibration or an evaluation ended, and what came out."""
+    """How a model, a calibration or an evaluation ended, and its result."""
     if artefact.skipped:
         return REUSED, "up to date"
     if artefact.status == "interrupted":

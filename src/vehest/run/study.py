@@ -6,7 +6,6 @@ sweep's overrides -> `sweep_of` -> both
 
 from __future__ import annotations
 
-import difflib
 import json
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,8 +29,7 @@ from vehest.configuration.composition import (
     parsed,
     value_of,
 )
-from vehest.configuration.files import choices, find_pipeline, pipeline_names
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.folds import FoldsFile
 from vehest.data.limits import use_limits
 from vehest.data.schema import settings_from_config, validated
@@ -41,7 +39,7 @@ from vehest.estimators.registry import new_estimator
 from vehest.evaluation.metrics import UNITS
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
-from vehest.run.next_commands import command_line, location_overrides
+from vehest.run.named_files import require_pipeline
 from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, override_text, short_names
@@ -180,7 +178,7 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
     ConfigurationError
         The file is no pipeline, or does not fit the module that draws its report.
     """
-    file, content = _content_of(name, location_overrides(overrides))
+    file, content = _content_of(name, overrides)
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     datasets = [*read.datasets, *read.optional_datasets]
     forms = {"split": read.split or read.sweeps, "parts": read.parts, "datasets": datasets}
@@ -288,22 +286,13 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
 
 
 def _content_of(
-    name: str, location: Sequence[str] = (), *, as_base: bool = False
+    name: str, overrides: Sequence[str] = (), *, as_base: bool = False
 ) -> tuple[Path, dict[str, Any]]:
     """A pipeline's file and its content, on top of that of the one it is based on.
 
-    ``location``: overrides of the command that a command in an error's text needs too.
+    ``overrides``: those of the command, for the text of an error.
     """
-    file = find_pipeline(name)
-    if file is None:
-        close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
-        hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
-        if name in choices("dataset"):
-            usable = command_line("data usable", [name, *location])
-            hint = f", only a data set: '{usable}' says what its recordings suffice for"
-        raise MissingError(
-            f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})"
-        )
+    file = require_pipeline(name, overrides)
     try:
         content = read_yaml(file)
     except DataError as error:
@@ -488,7 +477,7 @@ def _part_jobs(
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change what comes out: not where data come from, where results go, or
+    """Those overrides that change the results: not where data come from, where results go, or
     tracking.
     """
     return [

@@ -613,7 +613,7 @@ def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Art
         )
         if job is not None:
             calibration = runner.ensure(*job)
-    elif learnt:  # one of a model that learns nothing may have seen these tests
+    elif learnt:  # a calibration of a model without training may have used these tests
         calibration = calibration_of(model.folder, runner.output)
     if calibration is None:
         runner.messages.line(

@@ -434,7 +434,7 @@ def _missing(
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
     """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks.
 
-    None where nothing is learnt.
+    None where nothing is trained.
     """
     required = (
         (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()

@@ -184,7 +184,7 @@ class EvaluatedModel:
 
 @dataclass(frozen=True)
 class PartArtefacts:
-    """One comparison: estimators that learnt on one split and were scored on it."""
+    """One comparison: estimators that were trained on one split and were scored on it."""
 
     study: str  # name of the study
     title: str  # its title

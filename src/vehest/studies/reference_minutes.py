@@ -64,7 +64,9 @@ OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
 )
-MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
+MAX_MINUTES_DEVIATION = (
+    0.15  # of the minutes asked for, by which ends of a few seconds may shorten them
+)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -82,7 +82,7 @@ class Quantity:
     factors: tuple[float, ...]  # q of each level
     # of each level, whether there are too few blocks for it (`pooled_quantile`)
     beyond: tuple[bool, ...]
-    effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
+    effective_blocks: float  # Kish's effective number of blocks, by the squared scores
 
     def __post_init__(self) -> None:
         """Raise `DataError` for terms, factors or floors that no calibration leaves."""
@@ -369,7 +369,7 @@ def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A range with its estimate, as bands are learnt from it; arrays of T samples."""
+    """A range with its estimate, as bands are calibrated on it; arrays of T samples."""
 
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]

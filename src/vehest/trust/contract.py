@@ -61,9 +61,9 @@ MOTION = ("vx", "yaw_rate", "ay")
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits learnt with an estimator, or those of any car.
+    """The limits calibrated with an estimator, or those of any car.
 
-    `DataError` where ``trust`` was learnt with another one.
+    `DataError` where ``trust`` was calibrated with another one.
     """
     if trust is not None:
         trust.check_fit(estimator)

@@ -88,8 +88,8 @@ class FrontEnd:
     not measured holds its last value in the filter, and is passed on as not measured. After longer
     gaps the filter starts from the first sample that is back.
 
-    ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order
-    of the columns.
+    ``limits`` of the guard are those calibrated at the estimator's rate; ``channels`` are in the
+    order of the columns.
 
     Raises `ConfigurationError`: the bus is slower than the estimator, or faster than any.
     """

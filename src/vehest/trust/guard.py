@@ -3,7 +3,7 @@
     rows -> Guard -> rows, measured, flow (use, wait, restart)
 
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has
-stood still for longer than it ever did where the estimator learnt counts as not measured. Channels
+stood still for longer than it ever did in the estimator's training counts as not measured. Channels
 that a method can do without become NaN then; the others hold the last value that was accepted, for
 half a second at most. After longer gaps the estimator starts anew when the channels
 are back.
@@ -43,22 +43,22 @@ REACHED = {
 }
 """Unit -> size and change a second that some road car reaches, and change by sensor noise.
 
-They apply where none was learnt.
+They apply where none was calibrated.
 """
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
 """Starts of names whose ranges and changes differ too much between cars.
 
-Their limits have to be learnt.
+Their limits have to be calibrated.
 """
 
 STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steering may stand still
 
 ENDLESS = 1e300  # stops of channels that have none
 
-MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that can be learnt
+MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that calibration allows
 TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
-MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that can be learnt
+MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that calibration allows
 
 STANDSTILL_SPEED = 0.5  # m/s
 STANDSTILL_YAW_RATE = 0.05  # rad/s; below both, nothing is expected to move

@@ -4,7 +4,7 @@
 
 A field is declared in one place, as ``past_x: Annotated[FloatArray, "order channels"]``: the words
 are sizes, or numbers. Fields that are ``int`` or ``float`` are scalars, and a field ``all_values``
-holds all that follow it. A kernel receives the flat array, since handing over eighty arrays one by
+holds all that follow it. A kernel receives the flat array, since passing eighty arrays one by
 one takes longer than a row.
 """
 
@@ -83,7 +83,7 @@ def allocated(kind: Any, sizes: Any) -> FloatArray:
 class Views(types.Type):  # type: ignore[misc]
     """Type of a named tuple in compiled code: where it begins, and sizes.
 
-    Handing over all fields would compile a fifth longer.
+    Passing all fields would compile a fifth longer.
     """
 
     def __init__(self, kind: Any, sizes: Any) -> None:

@@ -35,7 +35,7 @@ class About:
 
 @dataclass(frozen=True)
 class Trust:
-    """Bands, limits and health of a model; None if not learnt."""
+    """Bands, limits and health of a model; None if not calibrated."""
 
     about: About  # whose it is
     bands: Bands | None = None  # calibrated half widths

@@ -1,6 +1,6 @@
 """Relations between the measured channels of a car.
 
-Their coefficients are learnt from drives without any reference.
+Their coefficients are fitted to drives without any reference.
 
 With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r:
 

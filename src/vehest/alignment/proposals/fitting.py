@@ -104,7 +104,7 @@ class Angle(NamedTuple):
     channel: str  # ``steer`` or ``handwheel``
     unit: str  # of the column
     length: float  # wheelbase, or that times the steering ratio, by slow cornering [m]
-    largest: float  # angle, straight ahead taken off [rad]
+    largest: float  # angle, less that of straight ahead [rad]
     is_repeatable: bool  # whether both halves of the slow corners give nearly this length
 
 

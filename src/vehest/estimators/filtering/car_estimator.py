@@ -35,7 +35,7 @@ from vehest.vehicle.dynamics import STATES
 REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")
 MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")
 INPUTS = ("steer", "motor_current")
-# m/s, m/s, rad/s, m/s: standard deviations of a start that nobody hands over
+# m/s, m/s, rad/s, m/s: standard deviations of a start that is not given
 UNKNOWN = (0.5, 0.3, 0.1, 0.1)
 
 

@@ -30,7 +30,7 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
 MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
-# rad and rad/s, standard deviation of a state that a protocol hands over
+# rad and rad/s, standard deviation of a state that a protocol passes
 EXACT_STATE_DEVIATION = 1e-6
 
 

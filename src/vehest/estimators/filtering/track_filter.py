@@ -26,13 +26,13 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
 
-# m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+# m/s, rad/s: standard deviations of a motion that is not given, and of a car that rolls
 UNKNOWN_MOTION = (
     0.5,
     0.2,
 )
 ROLLING = np.diag(np.square(UNKNOWN_MOTION))
-EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is handed over
+EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is given
 KAPPA = 1.0  # n + κ = 3
 
 

@@ -37,7 +37,7 @@ class Question:
     key: str
     text: str  # for people
     proposed: str  # answer that Enter takes; empty where nothing is proposed
-    candidates: tuple[str, ...] = ()  # other answers
+    candidates: tuple[str, ...] = ()  # alternatives
     evidence: tuple[str, ...] = ()  # for the proposal
     hint: str = "a number"  # form of an answer
 

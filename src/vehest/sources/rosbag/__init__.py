@@ -47,7 +47,7 @@ class Series:
     """A topic's samples with their times."""
 
     topic: Topic
-    times: FloatArray  # the declared delay taken off [s], shape (T,)
+    times: FloatArray  # less the declared delay [s], shape (T,)
     rate_hz: float | None  # of an even clock [Hz]; None where the stamps are the times
     fields: Mapping[str, FloatArray]  # path -> values, shape (T,)
     about: Mapping[str, Any]  # what was made of the stamps, for the provenance

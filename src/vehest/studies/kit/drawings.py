@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, listed
+from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import BoolArray, Scored
 from vehest.report import figures
 from vehest.report.comparison_figures import Cloud, agreement_figure, clouds_figure
@@ -166,7 +169,8 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
         f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
         f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error "
         "(estimate − measured), "
-        f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}.",
+        f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}."
+        f"{_trace_notes(signals)}",
         figures.zoom_figure(
             drive.time[inside],
             drive.ay[inside] if signals.has_ay else None,
@@ -177,6 +181,16 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
         ),
         _explorer(signals),
     )
+
+
+def _trace_notes(signals: DriveSignals) -> str:
+    """A sentence for each family whose traces need an explanation, with their titles."""
+    titles: dict[str, list[str]] = {}
+    for (name, _), (_, title, _) in signals.candidates.items():
+        with suppress(ConfigurationError):  # a family of a package that is not installed here
+            if note := estimator_class(name).trace_note:
+                titles.setdefault(note, []).append(title)
+    return "".join(f" {listed(names)}: {note}." for note, names in titles.items())
 
 
 def _band_of_first(

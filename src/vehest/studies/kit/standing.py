@@ -183,8 +183,11 @@ def basis_sentence(ranking: Ranking, test_text: str) -> str:
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."
     return (
-        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
-        f"{ranking.block_seconds:.3g} s and over seeds, "
-        "corrected for several comparisons (Holm). The squared error of the best estimator is "
-        f"spread as over {ranking.effective_blocks:.0f} equal blocks."
+        f"{figures}. Intervals: paired bootstrap over {ranking.n_blocks} blocks of "
+        f"{ranking.block_seconds:.3g} s and over seeds. A difference of two estimators is "
+        "significant if its 95 % interval, after Holm's correction for the "
+        f"{len(ranking.pairs) // 2} comparisons of this test, excludes zero. Effective number of "
+        f"blocks: {ranking.effective_blocks:.1f} of {ranking.n_blocks}; it is small where few "
+        "blocks contain most of the squared error. Method: docs/evaluation.md, section "
+        '"Intervals and significance".'
     )
