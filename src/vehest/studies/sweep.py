@@ -106,18 +106,8 @@ class SweepArtefacts:
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was
-    made.
-
-    Parameters
-    ----------
-    artefacts : SweepArtefacts
-        Of all jobs, done and failed.
-
-    Returns
-    -------
-    Document
-        Titled after the study.
+    """The report of a sweep, titled after the study: what was chosen, all combinations, what
+    failed, heat maps, how it was made.
     """
     part = artefacts.part
     blocks: list[Block] = [
