@@ -186,9 +186,7 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
 
 
 def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
-    """A heat map for each set, where two numeric keys vary and any others are booleans.
-
-    Else none.
+    """A heat map for each set, where two numeric keys vary and any others are booleans; else none.
 
     Parameters
     ----------
