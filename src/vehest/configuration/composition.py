@@ -380,11 +380,6 @@ def count(overrides: Sequence[str]) -> int:
     """Number of combinations that `expand` gives.
 
     Of one override at most ``limits.jobs`` + 1 values count.
-
-    Parameters
-    ----------
-    overrides : sequence of str
-        With one or several values each.
     """
     return math.prod(map(len, map(_values, map(parsed, overrides))))
 

@@ -108,10 +108,12 @@ def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) ->
     ----------
     version : object
         What the file states, of any type.
-    newest, oldest : int
-        Versions that are known, both included.
+    newest : int
+        Newest version that this code reads.
     subject : str
         The file, for messages.
+    oldest : int
+        Oldest one.
 
     Raises
     ------

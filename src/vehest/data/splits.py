@@ -28,13 +28,6 @@ def check_name(name: str, subject: str) -> None:
     with none of the last, and has `MAX_NAME_CHARACTERS` characters at most. It is no word or number
     of YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
 
-    Parameters
-    ----------
-    name : str
-        The name.
-    subject : str
-        What is called so, for messages.
-
     Raises
     ------
     ConfigurationError

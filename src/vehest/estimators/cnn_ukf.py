@@ -204,10 +204,9 @@ class CnnUkf(NetworkUkf):
         )
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Angle, its variance and the process noise.
+        """Angle, its variance and the process noise of inputs (T, C) of the network.
 
-        Of inputs (T, C) of the network; without gradients. The angle is clipped to what a tangent
-        allows.
+        There are no gradients. The angle is clipped to what a tangent allows.
         """
         output = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
         return PseudoMeasurement(

@@ -42,10 +42,12 @@ def implicit_euler_observer(
     ----------
     measurements : FloatArray
         yaw_rate, vx, ay, ax, shape (T, 4).
-    gain, step : float
-        α, and the sampling time τ [s].
+    gain : float
+        α.
     threshold : float
         |yaw rate| below which the state is reset [rad/s].
+    step : float
+        Sampling time τ [s].
     v, u : float
         Lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
 

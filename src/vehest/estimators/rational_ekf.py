@@ -62,7 +62,7 @@ from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.vehicle.tyre_track import TyreTrack
 
-# Levels where nothing is tuned: steer [rad √s], tyres [1/√s].
+# Levels where nothing is tuned: steer [rad/√s], tyres [1/√s].
 ASSUMED_LEVELS = {"steer": 0.02, "tyres": 0.003}
 NOISE_CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
 # Standard deviation of the logarithms of curves that are given, where no other is.

@@ -69,16 +69,9 @@ class Tape(NamedTuple):
 
 
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
-    """A tape for n states and m measurements.
+    """A tape of T = ``steps`` samples and B = ``sequences`` for n states and m measurements.
 
-    Parameters
-    ----------
-    steps, sequences : int
-        T and B.
-    n, m : int
-        States and measurements.
-    dtype : Any
-        Precision of all but the flags.
+    ``dtype`` is the precision of all arrays but the flags.
 
     Returns
     -------

@@ -222,14 +222,7 @@ def write_document(
 def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
     """The self-contained HTML page of a document.
 
-    ``images``: its figures as SVG by name, if they are drawn already.
-
-    Parameters
-    ----------
-    document : Document
-        The report.
-    images : mapping or None
-        Drawn here if None.
+    ``images``: its figures as SVG by name; drawn here if None.
 
     Returns
     -------
@@ -243,13 +236,8 @@ def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> by
 
 
 def as_text(name: str) -> str:
-    """A name or title from a file as Markdown that shows it as it is, on one line: nothing in it is
-    a link, markup or HTML.
-
-    Parameters
-    ----------
-    name : str
-        Of unknown origin.
+    """A name or title of unknown origin as Markdown that shows it as it is, on one line: nothing in
+    it is a link, markup or HTML.
     """
     line = printable(" ".join(name.split()))
     line = re.sub(r"[\\`*\[\]]", r"\\\g<0>", line)

@@ -392,12 +392,8 @@ def label_of(training: TrainJob) -> str:
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
-    """Failures by name; jobs that differ in their seed alone and failed alike have one name.
-
-    Parameters
-    ----------
-    jobs : sequence of Job
-        Of one comparison.
+    """Failures of one comparison by name; jobs that differ in their seed alone and failed alike
+    have one name.
     """
     jobs_of_failure: dict[Failure, list[Job]] = {}
     for job in jobs:

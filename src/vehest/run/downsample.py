@@ -57,16 +57,8 @@ def plan_downsample(
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:
-    """Transform and resample every recording into ``folder``.
-
-    Parameters
-    ----------
-    ingested : Artefact
-        Recordings at their native rate.
-    config : mapping
-        Of the plan.
-    folder : Path
-        Of the artefact, while it is made.
+    """Transform and resample every ingested recording into ``folder``, as the plan's ``config``
+    says.
 
     Raises
     ------

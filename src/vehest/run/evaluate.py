@@ -130,16 +130,10 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
 
 
 def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> dict[str, Any]:
-    """Options of an evaluation that enter its key: those that differ from their defaults.
+    """Options of an evaluation that enter its key: those of its protocol and faults that differ
+    from their defaults.
 
-    Without faults none of theirs.
-
-    Parameters
-    ----------
-    protocol : Protocol
-        How estimates are scored.
-    faults : sequence of FaultSettings
-        Faults under which they are scored too.
+    Without faults, no option of faults is among them.
     """
     options: dict[str, Any] = {"protocol": changed_options(protocol)}
     return options | ({"faults": [changed_options(fault) for fault in faults]} if faults else {})
@@ -538,14 +532,7 @@ def training_rows(
 
 
 def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
-    """Metrics of an evaluation, or its times, with `COLUMNS`.
-
-    Parameters
-    ----------
-    folder : Path
-        Of an evaluation.
-    file : str
-        METRICS or TIMINGS.
+    """Metrics (METRICS) or times (TIMINGS) in the folder of an evaluation, with `COLUMNS`.
 
     Raises
     ------
@@ -558,11 +545,6 @@ def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
 def test_figures(folder: Path) -> dict[str, float]:
     """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` ->
     value.
-
-    Parameters
-    ----------
-    folder : Path
-        Of an evaluation.
 
     Returns
     -------

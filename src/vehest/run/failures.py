@@ -20,12 +20,8 @@ class Failure:
 
 
 def failure_of(error: Exception) -> Failure:
-    """The failure behind an exception; a defect unless the user or the machine can change it.
-
-    Parameters
-    ----------
-    error : Exception
-        What a job or command raised.
+    """The failure behind an exception that a job or command raised; a defect unless the user or the
+    machine can change it.
 
     Returns
     -------

@@ -132,14 +132,7 @@ class Group:
     ) -> Artefact | None:
         """The artefact of a plan, if it is there and not to be made anew.
 
-        ``warn`` is told of a damaged one.
-
-        Parameters
-        ----------
-        plan : StagePlan
-            What is looked for.
-        warn : callable
-            Takes one line.
+        ``warn`` receives a line about a damaged one.
         """
         return None if plan.stage in self.force else find(plan, warn)
 
@@ -194,12 +187,7 @@ def compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractConte
     """While kernels of calibration and evaluation are not in the compile cache, one process
     compiles them, and others wait for it.
 
-    Parameters
-    ----------
-    output : Path
-        Output root, where the lock lies.
-    should_stop : callable
-        Asked while waiting.
+    The lock lies in the output root; ``should_stop`` is called while waiting.
     """
     missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
     return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()

@@ -72,7 +72,8 @@ class Normal(NamedTuple):
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
-    """Run the filter that comes with vehest over drives of one car, and write the car's record.
+    """Run the filter that comes with vehest over drives of one car; write the car's record and
+    return it.
 
     Parameters
     ----------
@@ -81,11 +82,6 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         ``estimator.KEY=VALUE``.
     out : Path
         YAML file; an earlier record is replaced, nothing else.
-
-    Returns
-    -------
-    CarRecord
-        As it was written.
 
     Raises
     ------
@@ -227,12 +223,8 @@ def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple
 
 
 def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
-    """The same before any drive.
-
-    Parameters
-    ----------
-    model : SelfCalibrating
-        With the settings of the car.
+    """The numbers of `posterior_of` before any drive: the priors of a model with the settings of
+    the car.
     """
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights

@@ -213,17 +213,7 @@ def parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store, by its id.
-
-    Parameters
-    ----------
-    recording_id : str
-        As its source names it.
-
-    Returns
-    -------
-    str
-        ``ID.parquet``.
+    """File name ``ID.parquet`` of a recording in the store, by its id.
 
     Raises
     ------
@@ -268,15 +258,10 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
 
 
 def outcome_of(ingested: Artefact) -> dict[str, Any]:
-    """Number and hours of drives, and names of those that span, left the road or ended before their
-    manoeuvre did.
+    """Number and hours of drives of a simulated data set, and names of those that span, left the
+    road or ended before their manoeuvre did.
 
     Raises `DataError`.
-
-    Parameters
-    ----------
-    ingested : Artefact
-        Of a simulated data set.
 
     Returns
     -------

@@ -45,9 +45,8 @@ Lines = list[str | TerminalTable]
 
 
 def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
-    """Data sets with their files' presence, licences and citations: for JSON and for a terminal.
-
-    Why others cannot be listed.
+    """Data sets with their files' presence, licences and citations, for JSON and for a terminal,
+    and why others cannot be listed.
 
     Returns
     -------

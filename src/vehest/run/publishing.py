@@ -66,12 +66,7 @@ class Published:
 
 
 def published_in(folder: Path) -> Published | None:
-    """Read the record of a published study; none where nothing is published.
-
-    Parameters
-    ----------
-    folder : Path
-        results/STUDY.
+    """Read the record of a published study, in results/STUDY; None where nothing is published.
 
     Raises
     ------
@@ -225,18 +220,8 @@ def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
 
 
 def published_content(file: Path) -> bytes:
-    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits,
-    which other machines reproduce.
-
-    Parameters
-    ----------
-    file : Path
-        Of a report.
-
-    Returns
-    -------
-    bytes
-        Of other files the content as it is.
+    """Content of a report's file as it is published: numbers of a CSV file with `DIGITS`
+    significant digits, which other machines reproduce; other files as they are.
     """
     if file.suffix != ".csv":
         return file.read_bytes()

@@ -333,13 +333,8 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
 
 
 def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedModel]:
-    """Models in which estimators that share a title have their variant behind it, so that tables,
-    legends and verdicts distinguish them.
-
-    Parameters
-    ----------
-    models : sequence of EvaluatedModel
-        Of one part.
+    """The models of one part; estimators that share a title have their variant behind it, so that
+    tables, legends and verdicts distinguish them.
     """
     names: dict[str, set[tuple[str, str]]] = {}
     for model in models:
@@ -381,18 +376,9 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
 def draw_sweep(
     study: Study, comparison: Comparison, runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a sweep, unless its report is there, and sum it up for the terminal.
+    """Draw a sweep of `sweep_of`, unless its report is there, and sum it up for the terminal.
 
     A failed job has a row with its reason.
-
-    Parameters
-    ----------
-    study : Study
-        As `sweep_of` makes it.
-    comparison : Comparison
-        Of all jobs, done or failed.
-    runner : Runner
-        Makes the artefact.
     """
     configs = [job.config for job in comparison.jobs if "estimator" in job.config]
     conditions = dict.fromkeys(

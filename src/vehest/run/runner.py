@@ -253,14 +253,7 @@ class Stages:
         )
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-        """Make an artefact unless it is there.
-
-        Parameters
-        ----------
-        plan : StagePlan
-            What is to be made.
-        write : callable
-            Writes it into a folder.
+        """Make the artefact of a plan by ``write``, which receives a folder, unless it is there.
 
         Returns
         -------

@@ -233,15 +233,7 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
 def settings_to_compare(
     config: Config, tried: set[str] | frozenset[str] = frozenset()
 ) -> dict[str, Any]:
-    """What determines a training, without its seed and the options that are tried.
-
-    Parameters
-    ----------
-    config : Config
-        Of a job.
-    tried : set of str
-        Dotted keys to leave out.
-    """
+    """What determines a training, without its seed and the dotted keys that are tried."""
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}
     for key in tried:

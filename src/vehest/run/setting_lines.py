@@ -38,16 +38,10 @@ class SettingLine:
 
 
 def setting_lines(settings: Any, skipped: Collection[str] = ()) -> dict[str, SettingLine]:
-    """Name -> line of each field of a dataclass of settings but those skipped; groups come last.
+    """Name -> line with the value of each field of a dataclass of settings, but of ``skipped``
+    names; groups come last.
 
     Numbers that a fit determines are listed inside groups alone.
-
-    Parameters
-    ----------
-    settings : Any
-        Instance of a dataclass of settings, whose values are shown.
-    skipped : collection of str
-        Names of fields.
     """
     lines = {}
     groups = {}

@@ -107,16 +107,8 @@ def blocked_signals() -> Iterator[None]:
 
 
 class TimeLimit:
-    """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s].
-
-    None for no limit.
-
-    Parameters
-    ----------
-    stop : StopSignals
-        Signals, which end the work too.
-    until : float or None
-        Reading of the clock.
+    """Stops on a signal, and once ``time.monotonic`` [s] has reached ``until``; None: no time
+    limit.
     """
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:

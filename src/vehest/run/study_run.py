@@ -494,14 +494,7 @@ def _error_of(
 
 
 def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator.
-
-    Parameters
-    ----------
-    overrides : sequence of str
-        Of conf/train.yaml.
-    options : RunOptions
-        Of the command.
+    """Train and calibrate one estimator, by overrides of conf/train.yaml.
 
     Returns
     -------

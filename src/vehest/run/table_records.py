@@ -170,9 +170,8 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str] = (),
 ) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when tables were made and its cause.
-
-    A note on what was not compared.
+    """What differs from when tables were made, as pairs with its cause, and a note on what was not
+    compared.
 
     Parameters
     ----------

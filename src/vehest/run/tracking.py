@@ -68,14 +68,10 @@ class Tracker:
         return STORE if self.config.get("name") == "mlflow" and not self.config.get("uri") else ""
 
     def log(self, *artefacts: Artefact | None) -> None:
-        """Log artefacts as runs while no other process logs, each unless it is logged.
+        """Log models, calibrations and evaluations as runs while no other process logs, each unless
+        it is logged; None is skipped.
 
         A failure is printed as a warning once and ends tracking for this run; no error is raised.
-
-        Parameters
-        ----------
-        *artefacts : Artefact or None
-            Models, calibrations and evaluations.
         """
         if self.config.get("name") != "mlflow" or not self.complete:
             return

@@ -188,14 +188,7 @@ def _plain(span: Span) -> dict[str, str]:
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone.
-
-    Parameters
-    ----------
-    jobs : sequence of TrainJob
-        Of one group (`TrainJob.group`).
-    context : FitContext
-        Checkpoints, progress and stop.
+    """Train the jobs of one group (`TrainJob.group`) together, each as if it were alone.
 
     Returns
     -------
@@ -224,19 +217,8 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
-    """Write a fitted estimator, its history, its figures and, in a file of their own, its times
-    into ``folder``.
-
-    Parameters
-    ----------
-    job : TrainJob
-        What was trained.
-    estimator : Estimator
-        Fitted.
-    record : FitRecord
-        Of its fit.
-    folder : Path
-        Of the artefact, while it is made.
+    """Write a fitted estimator, the history and figures of its fit and, in a file of their own, its
+    times into ``folder``.
     """
     about = {
         "seed": job.seed,

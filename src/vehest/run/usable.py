@@ -375,15 +375,7 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
 
 
 def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
-    """Those of the channels that some recording lacks.
-
-    Parameters
-    ----------
-    channels : sequence of str
-        Channels that are needed.
-    recordings : sequence of RecordingSummary
-        That may lack them.
-    """
+    """Those of the needed channels that at least one recording lacks."""
     missing = [name for summary in recordings for name in channels if name not in summary.channels]
     return _with_supplies(missing, missing, recordings)
 

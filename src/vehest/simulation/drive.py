@@ -160,13 +160,6 @@ def simulate_drive(
 def naming(id: str, seed: int) -> Iterator[None]:
     """Names drive and seed in the errors of a simulation.
 
-    Parameters
-    ----------
-    id : str
-        Of the recording.
-    seed : int
-        Of the drive.
-
     Raises
     ------
     SimulationError

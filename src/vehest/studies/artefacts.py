@@ -74,13 +74,7 @@ def write_frame(table: pd.DataFrame, path: Path) -> None:
 
 
 def nominal_rows(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Rows of metrics over all samples without a fault.
-
-    Parameters
-    ----------
-    metrics : pd.DataFrame
-        Long table with METRIC_COLUMNS.
-    """
+    """Rows of a long table with METRIC_COLUMNS over all samples without a fault."""
     return metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
 
 
@@ -136,11 +130,6 @@ class EvaluatedModel:
 
     def segments(self, test_set: str) -> Segments:
         """Sums of its errors over segments of a test set.
-
-        Parameters
-        ----------
-        test_set : str
-            Name of the test set.
 
         Returns
         -------

@@ -122,12 +122,8 @@ class Additions:
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
-    """The verdict on each test set as lines of plain text, a line a sentence.
-
-    Parameters
-    ----------
-    artefacts : StudyArtefacts
-        The first part counts.
+    """The verdict of the study's first part on each test set as lines of plain text, a line a
+    sentence.
 
     Returns
     -------
@@ -500,12 +496,7 @@ def method_lines(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) ->
 
 
 def ranges_of(artefacts: PartArtefacts) -> pd.DataFrame:
-    """Ranges of training, validation and each test set, a row a range.
-
-    Parameters
-    ----------
-    artefacts : PartArtefacts
-        Its split is listed.
+    """Ranges of training, validation and each test set of the split, a row a range.
 
     Returns
     -------

@@ -98,13 +98,6 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     """Which estimator is recommended after a test set (`recommendation_of`), with the error to be
     expected, and what it beats.
 
-    Parameters
-    ----------
-    part : PartArtefacts
-        The comparison.
-    test_set : str
-        The test set that decides.
-
     Returns
     -------
     Verdict

@@ -348,14 +348,8 @@ def minutes_of(part: PartArtefacts) -> float:
 
 
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
-    """Sentences, figure and table of a curve; ``name`` ends the files' names.
-
-    Parameters
-    ----------
-    curve : Curve
-        Learning curves on one test set.
-    name : str
-        Of the test set, as in file names.
+    """Sentences, figure and table of the learning curves on one test set; ``name`` ends the files'
+    names.
     """
     caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [

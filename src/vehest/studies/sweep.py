@@ -106,18 +106,8 @@ class SweepArtefacts:
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was
-    made.
-
-    Parameters
-    ----------
-    artefacts : SweepArtefacts
-        Of all jobs, done and failed.
-
-    Returns
-    -------
-    Document
-        Titled after the study.
+    """The report of a sweep, titled after the study: what was chosen, all combinations, what
+    failed, heat maps, how it was made.
     """
     part = artefacts.part
     blocks: list[Block] = [
@@ -196,9 +186,7 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
 
 
 def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
-    """A heat map for each set, where two numeric keys vary and any others are booleans.
-
-    Else none.
+    """A heat map for each set, where two numeric keys vary and any others are booleans; else none.
 
     Parameters
     ----------

@@ -177,8 +177,8 @@ def learn_noise_levels(
     -------
     tuple
         Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
-        samples; and root mean squares there, (L, C), outliers cut off, between which straight
-        lines hold.
+        samples; and root mean squares there, (L, C), outliers cut off, within `LEVELS`; they
+        are interpolated linearly between the speeds.
     """
     is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
     scaled = innovations[is_finite] / np.sqrt(np.diag(covariance))

@@ -324,14 +324,7 @@ class GuardedRun:
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
-    """Accepted vx, yaw rate and ay of each row.
-
-    Parameters
-    ----------
-    channels : sequence of str
-        Of the columns.
-    cleaned : Cleaned
-        T rows after the guard.
+    """Accepted vx, yaw rate and ay of T rows after the guard, whose columns are ``channels``.
 
     Returns
     -------

@@ -433,11 +433,6 @@ def health_rows(
         Whether a sample was accepted by the guard.
     state : ndarray
         As of `HealthModel.start`; changed in place.
-
-    Returns
-    -------
-    Health
-        Of these rows.
     """
     out = np.empty((3, len(rows)))
     health_kernel(rows, measured, packed, state, out, _NO_STATISTICS)
@@ -672,8 +667,8 @@ def limits_from(
     """Limits of all K statistics from healthy drives.
 
     A limit is the largest value times `margin`. Blocks that exceed all others by `OUTLIER_FACTOR`
-    are not counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the
-    blocks, and one where there are thirty blocks or more.
+    are not counted, since recordings have faults of their own: of thirty blocks or more at most
+    `MAX_OUTLIER_SHARE`, but one at least; of fewer, none.
 
     Rules: ``share`` is at most half way from the largest value to 1; ``domain`` is
     `DAY_TO_DAY_FACTOR` alone; ``run`` has two samples more, and `MIN_RUN_SAMPLES` at least; the

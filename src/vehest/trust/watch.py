@@ -45,14 +45,12 @@ class Watched(NamedTuple):
 class Watch:
     """Watches estimates row after row; keeps the state between calls.
 
-    ``warm_up`` is the number of samples after a start for which an estimator may have no estimate.
-
     Parameters
     ----------
     limits : GuardLimits
         Of which the top speed and the largest tan β count.
     warm_up : int
-        Samples.
+        Samples after a start for which an estimator may have no estimate.
     rate_hz : float
         Of the rows [Hz].
     """

@@ -118,7 +118,7 @@ class TyreTrack:
         inputs : Tensor
             u [m/s] and δ [rad], (..., 2).
         steer : float
-            Standard deviation of the steering angle for a second's step [rad √s].
+            Standard deviation of the steering angle for a second's step [rad/√s].
         tyres : float
             Standard deviation of the adapted logarithms [1/√s].
 

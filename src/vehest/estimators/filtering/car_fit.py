@@ -91,11 +91,6 @@ def training_phases(
         Settings of both phases.
     learns_dynamics : bool
         Whether the dynamics learn through the filter too.
-
-    Returns
-    -------
-    list of Phase
-        One-step, then through the filter.
     """
     weights = torch.tensor(WEIGHTS, dtype=train[0].states.dtype)
     last = torch.zeros(1, dtype=weights.dtype)

@@ -41,7 +41,7 @@ from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")
-"""Noise levels: of the gyroscope [rad/s], the accelerometer [m/s²], the steering angle [rad √s],
+"""Noise levels: of the gyroscope [rad/s], the accelerometer [m/s²], the steering angle [rad/√s],
 and the drift of tyre parameters [1/√s].
 """
 CURVES = TYRE_PARAMETERS[:4]

@@ -48,7 +48,8 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
         minimum speed [m/s]; and the lateral acceleration |u r| below which the states from the
         fifth on stay [m/s²].
     variances
-        Of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (n - 1,).
+        Of yaw rate, ay, and, a second, of the steering angle and the states from the fifth on,
+        (n - 1,).
     bounds
         Largest absolute value of each state, (n,).
     start_tyres

@@ -12,7 +12,7 @@ from vehest.data.recording import Recording
 
 
 class StandardisedNetwork(nn.Module):
-    """Base of networks of standardised measurements and predict standardised velocities.
+    """Base of networks that read standardised measurements and predict standardised velocities.
 
     Means and standard deviations are those of the training recordings; they are kept with the
     weights and are not parameters. `prepared` standardises the inputs of ``forward``; what it

@@ -45,18 +45,10 @@ class RunOptions:
 
 
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
-    """A command's launcher.
+    """The launcher that a command's options name.
 
-    Without ``jobs`` it runs as many groups at a time as cores.
-
-    Parameters
-    ----------
-    options : RunOptions
-        Launcher, address, jobs and resources.
-    output : Path
-        Output root, which machines of a cluster may share.
-    messages : Messages
-        Prints what a cluster reports.
+    Without ``jobs`` it runs as many groups at a time as cores; ``messages`` prints what a cluster
+    reports. Machines of a cluster may share the output root.
 
     Raises
     ------

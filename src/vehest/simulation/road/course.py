@@ -51,13 +51,6 @@ def build_course(name: str, layout: Layout) -> Course:
     The corners are kept as they are and must turn by a full circle in total; the course is closed
     by the smallest change, in the sum of squares, of the lengths of its straights.
 
-    Parameters
-    ----------
-    name : str
-        In recordings and errors.
-    layout : Layout
-        Segments, crossfall, heights and patches.
-
     Returns
     -------
     Course

@@ -47,9 +47,9 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     order of the axis.
 
     It makes the sum of the squares of the curvature, and of its change, as small as the gates
-    allow; in and out it runs straight along the axis, over ``run_in`` before the first gate and the
-    last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends swing out a
-    little where the line turns, is covered by the clearance.
+    allow. It leaves the axis at most 40 m before the first gate, and is back on it a third of
+    ``run_out`` after the last. The length of the car, whose ends swing out a little where the line
+    turns, is covered by the clearance.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     width : float
         Of the car, over all [m].
     run_in, run_out : float
-        [m].
+        Length of the line before the first and after the last gate [m].
 
     Returns
     -------
@@ -160,17 +160,16 @@ def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) 
 
 
 def circle(radius: float, side: float, run_in: float, length: float, transition: float) -> Line:
-    """A straight of ``run_in``, a clothoid of ``transition``, and a circle for the rest of
-    ``length`` [m]; ``side`` 1: left, -1: right.
+    """A straight, a clothoid and an arc of a circle.
 
     Parameters
     ----------
     radius : float
         Of the circle [m].
     side : float
-        1 or -1.
+        1: to the left, -1: to the right.
     run_in, length, transition : float
-        Along the line [m].
+        Lengths of the straight, of the arc and of the clothoid between them [m].
 
     Returns
     -------

@@ -92,19 +92,12 @@ class Recommendation:
 
 
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
-    """What to recommend after a test set.
+    """Which estimator to recommend, decided by one test set.
 
     Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
     without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.
     None is recommended where none is significantly better than the zero-sideslip baseline and the
     static map, or where the test cannot rank estimators.
-
-    Parameters
-    ----------
-    part : PartArtefacts
-        The comparison.
-    test_set : str
-        The test set that decides.
 
     Returns
     -------

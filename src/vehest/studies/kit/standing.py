@@ -22,13 +22,6 @@ BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the stat
 def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
     """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds.
 
-    Parameters
-    ----------
-    artefacts : PartArtefacts
-        The comparison.
-    test_set : str
-        The test set.
-
     Returns
     -------
     Ranking
@@ -50,15 +43,8 @@ def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
-    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and
-    ``against_best`` in words.
-
-    Parameters
-    ----------
-    ranking : Ranking
-        Of all candidates.
-    name : Name
-        The candidate.
+    """``low`` and ``high`` of a candidate's RMSE(β) over seeds [deg], ``beats_zero``,
+    ``beats_static_map``, and ``against_best`` in words.
 
     Returns
     -------

@@ -31,19 +31,8 @@ MIN_RATIO_OF_PERCENTILES = (
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
-    """Sentences, each about one test set or one estimator, those first that are left out.
-
-    None where there is nothing to warn of.
-
-    Parameters
-    ----------
-    artefacts : PartArtefacts
-        The comparison.
-
-    Returns
-    -------
-    list of str
-        In Markdown.
+    """Sentences in Markdown, each about one test set or one estimator, those about estimators that
+    are left out first; empty where there is nothing to warn of.
     """
     left_out = [
         f"{as_code(name)} is left out: {as_text(reason)}"
@@ -79,13 +68,6 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     information on it; none if it can.
 
     An error below the bound shows that an estimator uses information that the bound does not.
-
-    Parameters
-    ----------
-    artefacts : PartArtefacts
-        The comparison.
-    test_set : str
-        The test set.
 
     Returns
     -------
