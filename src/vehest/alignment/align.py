@@ -163,7 +163,6 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio;
         with ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
     settings : AlignmentSettings
-    settings : AlignmentSettings
         What to estimate, and cut-off, largest delay, tilt, wheelbase and limits of the steering.
 
     Returns

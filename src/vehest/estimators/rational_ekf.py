@@ -84,7 +84,7 @@ class TrackNoise(Group):
         None, "of the accelerometer, and of what the model misses", unit="m/s²", positive=True
     )
     steer: float | None = setting(
-        None, "of the steering angle, over a second's step", unit="rad √s", positive=True
+        None, "of the steering angle, over a second's step", unit="rad/√s", positive=True
     )
     tyres: float | None = setting(
         None,
