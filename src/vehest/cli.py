@@ -21,7 +21,7 @@ from vehest.run.launchers.base import LAUNCHERS, RunOptions
 from vehest.run.named_files import (
     file_words,
     require_dataset_or_file,
-    require_files,
+    require_paths,
     require_pipeline,
 )
 from vehest.run.printing import (
@@ -223,7 +223,7 @@ def new_car(
     have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
     Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
-    require_files(files)
+    require_paths(files)
     from vehest.run.console import Messages
 
     vehicle = {"wheelbase": wheelbase, "mass": mass, "steering_ratio": steering_ratio}
@@ -471,7 +471,8 @@ def estimate(
     `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    require_files([*file_words(words[:2])[-1:], car])
+    logs = file_words(words[:2])[-1:]  # the recording, or what stands in its place without a model
+    require_paths([*logs, car])
     from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
 
@@ -523,7 +524,7 @@ def plot_drive(
     in colours of β; with a reference also estimate over reference. The course is integrated from
     u, v and the yaw rate, and drifts over minutes.
     """
-    require_files(file_words([recording, *(words or [])]))
+    require_paths(file_words([recording, *(words or [])]))
     from vehest.run.plot import plot_files
 
     emit(as_json, plot_files([recording, *(words or [])], out, start, stop))
@@ -549,7 +550,7 @@ def identify(
     Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest
     estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
-    require_files(file_words(words))
+    require_paths(file_words(words))
     from vehest.run.identify import identify_files, in_words
 
     record = identify_files(words, out)
@@ -646,7 +647,7 @@ def replay(
         for name, value in locals().items()
         if name not in ("log", "overrides", "as_json")
     }
-    require_files([log, dbc])
+    require_paths([log, dbc])
     from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
@@ -724,7 +725,7 @@ def export(
     dataset=NAME gives the values of the car, as for `vehest estimate`, and so does
     dataset.car.wheelbase=2.7 without one.
     """
-    require_files([vectors])
+    require_paths([vectors])
     from vehest.api import read_recording
     from vehest.configuration.estimate_options import estimate_options
     from vehest.export.folder import export_model
@@ -811,7 +812,7 @@ def compare(
     drive; an estimate is called best only if it is significantly below all others. A model that was
     trained on the recording is listed and left out of the verdict.
     """
-    require_files([recording, *file_words(words or [])])
+    require_paths([recording, *file_words(words or [])])
     from vehest.run.compare_files import compare_files
 
     emit(as_json, *compare_files(recording, words or [], models or [], columns or [], shift))

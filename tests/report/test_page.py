@@ -310,7 +310,7 @@ def test_rule_below_the_contents_is_as_wide_as_the_page_and_none_is_above_the_ve
 ):
     opened(chromium, toy[0], width=1280)
     rules = chromium.execute_script(
-        "return ['header', 'nav'].map((own) => document.querySelector(own).clientWidth)"
+        "return ['header', 'nav'].map((tag) => document.querySelector(tag).clientWidth)"
     )
     assert rules[0] == rules[1] > 1000
     verdict, contents = (

@@ -424,13 +424,14 @@ def test_reset_of_the_luenberger_observer_is_explained_below_its_traces(artefact
         " Luenberger: v is set to 0 where the yaw rate is below a threshold (reset of the method)."
     )
     others = replace(
-        artefacts, models=[own for own in artefacts.models if own.estimator != "luenberger"]
+        artefacts, models=[model for model in artefacts.models if model.estimator != "luenberger"]
     )
     (busiest,) = [block for block in comparison(others).blocks if names_zoom(block)]
     assert "Luenberger" not in busiest.caption
 
 
 def names_zoom(block):
+    """Whether a block of a report is the figure of the busiest 20 s."""
     return isinstance(block, Figure) and block.name == "zoom_test"
 
 

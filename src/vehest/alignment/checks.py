@@ -126,6 +126,7 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
     Parameters
     ----------
     recording : Recording
+        As `checks_of_recording` takes it.
     accepted : collection of str
         Checks whose errors are accepted.
     place : str

@@ -88,8 +88,9 @@ def cross_spectra(
     Parameters
     ----------
     signals : mapping of str to (T,)
+        Name -> samples, all of one length and clock, without gaps.
     rate_hz : float
-        Sampling rate.
+        Sampling rate [Hz].
     selected : (T,) of bool, optional
         Only segments whose samples are all selected count.
 
@@ -224,6 +225,7 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     Parameters
     ----------
     spectra : CrossSpectra
+        Of both signals, as `cross_spectra` makes them.
     source, follower : str
         Names of the signals.
     low_pass : bool

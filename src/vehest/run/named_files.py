@@ -14,14 +14,19 @@ from vehest.data.errors import ConfigurationError, MissingError, closest, sugges
 from vehest.data.files import missing_file
 
 
-def require_files(paths: Iterable[str | Path | None]) -> None:
-    """Raise `MissingError` for the first path where there is nothing.
+def require_paths(paths: Iterable[str | Path | None]) -> None:
+    """Refuse paths where there is nothing; what is there but cannot be read is reported by its
+    reader.
 
     Parameters
     ----------
     paths : iterable of str, Path or None
-        None stands for an option that was left out. What is there but cannot be read is reported
-        by its reader.
+        None stands for an option that was left out.
+
+    Raises
+    ------
+    MissingError
+        For the first of them; it names the closest file of the folder.
     """
     for path in paths:
         if path is None:
@@ -53,7 +58,7 @@ def require_dataset_or_file(source: str) -> None:
         return
     path = Path(source)
     if path.suffix or path.name != source:
-        require_files([path])
+        require_paths([path])
     meant = suggestion(source, names) or ";"
     raise ConfigurationError(
         f"'{source}' is neither a data set nor a file{meant} 'vehest data list' lists the data sets"
@@ -67,8 +72,13 @@ def require_pipeline(name: str, overrides: Sequence[str] = ()) -> Path:
     ----------
     name : str
         Path, or name in ./pipelines or in the package.
-    location : sequence of str
-        Overrides of the command that a command in the error's text needs too.
+    overrides : sequence of str
+        Of the command; those that a command in the error's text needs too are repeated there.
+
+    Returns
+    -------
+    Path
+        Its file.
 
     Raises
     ------

@@ -133,9 +133,14 @@ class Stages:
         """Raise `MissingError` where raw files of a data set of a split are not here; nothing is
         read.
         """
-        for dataset in self.datasets_of(config):
+
+        def look(name: str) -> None:
+            dataset = self.dataset_config(name, config)["dataset"]
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()
+
+        for name in dataset_names(config["split"]):
+            self._once("files", name, partial(look, name))
 
     def _ingested(self, name: str, config: Config) -> Artefact:
         """The ingested recordings of a data set, looked for once a run."""

@@ -71,6 +71,7 @@ def ask(
     Parameters
     ----------
     examined : Examined
+        The logs and what is proposed for their columns, as `inspect` returns it.
     answers : sequence of str
         ``KEY=ANSWER`` each.
     interactive : bool

@@ -242,6 +242,8 @@ def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> St
         Unit that the header states, as `STATED_UNITS` has it; empty where it states none.
     named : bool
         Whether the column is named as time.
+    length : float
+        Its largest value less its smallest, in the column's unit.
 
     Returns
     -------
