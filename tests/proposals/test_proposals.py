@@ -1697,6 +1697,12 @@ def test_a_sensor_that_never_changes_is_named(tmp_path, column, value):
     assert f"'{column}' ({value:g})" in note
 
 
+def test_a_constant_component_in_the_unit_of_another_quantity_is_no_dead_sensor(tmp_path):
+    table = usual(drive(60.0)).assign(**{"angular_velocity.y [rad/s]": 0.0})
+    notes = proposals_of(tmp_path, table).notes
+    assert not [note for note in notes if note.startswith("constant, or of few values")]
+
+
 @pytest.mark.parametrize("column", ["Gyro", "LatAcc", "Speed", "Steer"])
 def test_a_sensor_that_freezes_for_half_of_the_drive_is_named(tmp_path, column):
     table = usual(drive(60.0))

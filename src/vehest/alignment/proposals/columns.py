@@ -114,12 +114,25 @@ def si_factor(unit: str, channel: str) -> float:
 
 
 def unchanging(columns: Sequence[tuple[str, str, FloatArray, str]]) -> list[str]:
-    """Columns that are named like a channel of the motion and take too few values to be one, each
-    with its value or the number of them.
+    """Columns that are named like a channel of the motion, in a unit of it, and take too few values
+    to be one.
+
+    Parameters
+    ----------
+    columns : sequence of tuple
+        As `candidates` takes them.
+
+    Returns
+    -------
+    list of str
+        Name of each, with its value or the number of values.
     """
     texts = []
     for name, unit, values, _ in columns:
-        is_motion = any(role in UNITS or "wheel_speed" in role for role in hints(name, unit))
+        is_motion = any(
+            "wheel_speed" in role or (role in UNITS and (not unit or is_unit_of(unit, role)))
+            for role in hints(name, unit)
+        )
         levels = np.unique(values[np.isfinite(values)][:MAX_LEVEL_SAMPLES])
         if is_motion and 0 < len(levels) < MIN_LEVELS:
             seen = f"{levels[0]:.4g}" if len(levels) == 1 else f"{len(levels)} values"
