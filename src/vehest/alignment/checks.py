@@ -7,7 +7,7 @@ channels are missing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -35,11 +35,12 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError, number_of
-from vehest.data.recording import MISSING, PART, Recording, part_slices
+from vehest.data.recording import DERIVED, MISSING, PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
 
+AX_OF_SPEED = "acceleration_from_speed"  # the transform
 MAX_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
 MIN_STUCK_SAMPLES = 3
@@ -185,7 +186,7 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     reported of every channel that is compared with it. Where a delay or low-pass of ay, yaw rate or
     vy explains poor kinematics, only the former is reported.
     """
-    motion = motion_of(recording, moving)
+    motion = motion_of(_without_ax_of_speed(recording), moving)
     if not motion.moving.any():
         return []
     relations = relations_of(motion)
@@ -215,6 +216,17 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
         finding for finding in _kinematics(motion) if finding.level == "note" or not explained
     ]
     return findings + kinematics + offset_findings(motion) + clocks
+
+
+def _without_ax_of_speed(recording: Recording) -> Recording:
+    """The recording without an ax that a transform made from its speed: that one is late by the
+    transform's filter, as it has to be on a car, and says nothing of the log.
+    """
+    derived = recording.provenance.get(DERIVED)
+    transforms = derived.get("transforms", ()) if isinstance(derived, Mapping) else ()
+    if not any(entry.get("name") == AX_OF_SPEED for entry in transforms):
+        return recording
+    return recording.select([name for name in recording.channels if name != "ax"])
 
 
 def _kinematics(motion: Motion) -> Iterator[Finding]:

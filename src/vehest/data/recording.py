@@ -20,6 +20,7 @@ Kind = Literal["real", "simulated"]
 
 MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
+DERIVED = "derived"  # likewise: the data set's transforms and points of its sensors
 MISSING = "missing_samples"  # likewise: channel, empty for all of them -> texts
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6

@@ -21,7 +21,7 @@ from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable, suggestion
 from vehest.data.files import regular_file
-from vehest.data.recording import Kind, Recording
+from vehest.data.recording import DERIVED, Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import first_line
@@ -32,7 +32,6 @@ ENTRY_POINTS = "vehest.sources"
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 # key of a recording's provenance: transforms of its data set, and where its channels were measured
-DERIVED = "derived"
 SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
