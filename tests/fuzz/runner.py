@@ -22,7 +22,7 @@ import pandas as pd
 
 from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
-from fuzz.watched import READER, become
+from fuzz.watched import READER, STACK_SIGNAL, become
 from processes import die_with_parent, status_kb
 from vehest.data.errors import printable
 
@@ -174,6 +174,7 @@ def _watch(case, command):
     while not select.select([process], [], [], POLL_SECONDS)[0]:
         readers.look()
         if time.monotonic() - started > min(case.seconds + readers.waited, MOST_WALL_SECONDS):
+            _ask_for_stack(child, case.folder / "log" / "stack")
             os.killpg(child, signal.SIGKILL)
             break
     os.close(process)
@@ -206,6 +207,15 @@ def _watch(case, command):
             line.strip() for line in _text(logs / "stack").splitlines() if line.startswith("  File")
         )[:1500],
     )
+
+
+def _ask_for_stack(child, file):
+    """Let a command write where it is, and wait until it has, or for at most a second."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, STACK_SIGNAL)
+    asked = time.monotonic()
+    while not _text(file) and time.monotonic() - asked < 1:
+        time.sleep(POLL_SECONDS)
 
 
 class _Readers:

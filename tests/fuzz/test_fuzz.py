@@ -61,6 +61,9 @@ def test_each_misdeed_gets_its_verdict(tmp_path):
     )
     verdicts = {row["command"].removeprefix("PLANTED:"): row["verdict"] for row in rows}
     assert verdicts == {name: verdict for name, (verdict, _) in MISDEEDS.items()}
+    for row in rows:
+        if row["verdict"] == "slow":
+            assert "planted.py" in row["detail"], "a command that is stopped says where it was"
     assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}
 
 

@@ -7,6 +7,7 @@ import faulthandler
 import json
 import os
 import resource
+import signal
 import sys
 import tempfile
 import traceback
@@ -18,6 +19,8 @@ from processes import die_with_parent, status_kb
 
 ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
+STACK_SIGNAL = signal.SIGUSR1
+"""Signal at which the child writes its stack to the case's log."""
 
 # What runs, and what asks for code to be run. Each is noted; a program that would start is stopped.
 PROGRAMS = {
@@ -270,9 +273,10 @@ def _prepare(case, command):
     """Streams, folders, environment, limits; returns the descriptor of the report."""
     logs = case.folder / "log"
     report = os.open(logs / "events", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    # open as long as the process lives, like the streams below
+    # open as long as the process lives, like the streams below; the thread that gets the signal
+    # writes its own stack, since a watchdog that reads another thread's frames may crash
     stack = open(logs / "stack", "w")  # noqa: SIM115
-    faulthandler.dump_traceback_later(case.seconds, file=stack)
+    faulthandler.register(STACK_SIGNAL, file=stack, all_threads=False)
     _redirect(0, "/dev/null", os.O_RDONLY)
     _redirect(1, logs / "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     _redirect(2, logs / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)

@@ -61,6 +61,12 @@ def _leave_half_a_file():
     Path("outputs/.writing-1-aaaaaaaa-model").write_text("")
 
 
+def _compute():
+    """Call functions without an end."""
+    while True:
+        sum(map(abs, range(100)))
+
+
 def _read_by(reader):
     """Read a file by one of the readers below, in a limited process."""
     with suppress(DataError), use_limits(Limits(memory=3_500_000_000)):
@@ -98,6 +104,7 @@ MISDEEDS = {
     "writes_far_away": ("outside", lambda: Path("/tmp/vehest-fuzz-far-away").write_text("")),
     "changes_an_input": ("outside", lambda: Path("raw/given.csv").write_text("time\n1\n")),
     "sleeps": ("slow", lambda: time.sleep(60)),
+    "computes": ("slow", _compute),
     "allocates": ("memory", lambda: len(bytearray(b"x") * MUCH)),
     "dies": ("crash", lambda: os.kill(os.getpid(), signal.SIGSEGV)),
     "raises": ("traceback", _raise),
