@@ -295,7 +295,7 @@ def excitation_table(datasets: Sequence[StoredDataset]) -> Table:
         "drives": Column("drives", decimals=0),
         "ay": Column("|ay| 99 % [m/s²]", decimals=2),
         "sideslip": Column("|β| 99 % [deg]", decimals=2),
-        "map": Column("FVU of the own static map", decimals=3),
+        "map": Column("FVU of a static map fitted to it", decimals=3),
     }
     columns |= {
         f"above_{hz:g}": Column(f"v̇ over noise at {hz:g} Hz [dB]", decimals=1)
