@@ -322,6 +322,6 @@ def test_models_are_inputs_and_are_resolved_by_name(place):
     code, out, _ = place("train", *common, "training.start_from=pretrained")
     assert code == 0
     assert "skipped: False" in out or "up to date" not in out
-    assert place.refused("train", *common, "training.start_from=nobody")[1].startswith(
-        "error: there is no model 'nobody'"
-    )
+    refusal = place.refused("train", *common, "training.start_from=nobody")[1]
+    assert refusal.startswith("error: there is no model 'nobody'")
+    assert refusal.rstrip().endswith("comes with vehest: pretrained, self_calibrating")

@@ -49,8 +49,10 @@ from vehest.data.transforms import Preparation
 
 Config = dict[str, Any]
 
-COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "name", "out", "quiet")
-"""Options of commands that are easily mistaken for keys of the configuration."""
+COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "name", "out", "quiet")
+OPTION_HINTS = {option: f"an option is written --{option}" for option in COMMAND_OPTIONS}
+OPTION_HINTS["model"] = "an option is written --model; vehest estimate MODEL FILE has none"
+"""Option of a command that is easily mistaken for a key of the configuration -> how to write it."""
 
 # key of a configuration: the rates that overrides set, which are not lowered to the rate of the
 # recordings, as a default is
@@ -451,8 +453,8 @@ def key_of(override: str) -> str:
 
 def option_hint(key: str) -> str:
     """A hint for a key that is an option of the command, not of the configuration; else empty."""
-    option = key.replace("_", "-")
-    return f"; an option is written --{option}" if option in COMMAND_OPTIONS else ""
+    hint = OPTION_HINTS.get(key.replace("_", "-"), "")
+    return hint and f"; {hint}"
 
 
 def close_key(key: str, config: Any) -> str:

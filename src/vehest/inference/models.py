@@ -82,7 +82,8 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
             f"'{output / 'train'}', which contains {counted([folder.name for folder in models])}"
         )
         raise MissingError(
-            f"there is no model '{name}', neither a folder nor in {places}; train one first"
+            f"there is no model '{name}', neither a folder nor in {places}; train one first, or "
+            f"take one that comes with vehest: {', '.join(WITH_VEHEST)}"
         )
     newest = max(matches, key=lambda folder: folder.stat().st_mtime_ns)
     if len(matches) > 1:
