@@ -96,6 +96,11 @@ class Parameter:
     model: float = 0.0  # contribution of an understeer gradient that is not constant
 
     @property
+    def may_be_zero(self) -> bool:
+        """Whether the 95 % interval contains zero."""
+        return self.low <= 0.0 <= self.high
+
+    @property
     def unit(self) -> str:
         """SI unit."""
         return UNITS[self.name]
@@ -233,20 +238,26 @@ def _parameter(
 
 
 def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
-    """Delay, then offsets (they are in the sensor's axes), then mounting."""
-    values = {parameter.name: _rounded(parameter.value) for parameter in parameters}
+    """Delay, then offsets (they are in the sensor's axes), then mounting, of those parameters whose
+    interval excludes zero.
+    """
+    values = {
+        parameter.name: _rounded(parameter.value)
+        for parameter in parameters
+        if not parameter.may_be_zero
+    }
     transforms: list[dict[str, Any]] = []
     if "delay" in values:
         transforms.append(
             {"name": "delay_correction", "delay": values["delay"], "channels": list(IMU_CHANNELS)}
         )
-    if "offset_ax" in values:
-        transforms.append(
-            {
-                "name": "offset_correction",
-                "offsets": {channel: values[f"offset_{channel}"] for channel in IMU_CHANNELS},
-            }
-        )
+    offsets = {
+        channel: values[f"offset_{channel}"]
+        for channel in IMU_CHANNELS
+        if f"offset_{channel}" in values
+    }
+    if offsets:
+        transforms.append({"name": "offset_correction", "offsets": offsets})
     mounting: dict[str, Any] = {
         name: values[name] for name in ("lever_x", "lever_y", "yaw") if name in values
     }
@@ -302,13 +313,11 @@ def _imu_notes(
             f"each fitted alone: {suspected}. If they are requested too, the other estimates may "
             "change."
         )
-    unproven = [
-        parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high
-    ]
+    unproven = [parameter.name for parameter in parameters if parameter.may_be_zero]
     if unproven:
         notes.append(
             f"The 95 % interval of {listed(unproven)} contains zero: this drive does not justify a "
-            "correction."
+            "correction, and none is proposed."
         )
     if signals.speed == "vx":
         notes.append(
@@ -440,7 +449,7 @@ def _align_steering(
         _parameter(name, value, size, 0.0, blocks - 1, model) for name, value, size, model in values
     ]
     by_scatter = _parameter(names[0], ratio, float(scatter[0]), 0.0, blocks - 1)
-    if by_scatter.low <= 0.0 <= by_scatter.high:
+    if by_scatter.may_be_zero:
         problem = (
             f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± "
             f"{scatter[0]:.2g})"
