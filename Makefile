@@ -42,7 +42,7 @@ endif
 	$(BIN)/python -m pip install -q $(LOCKED) -e ".[dev]"
 	touch $@
 
-run: $(INSTALLED) ## train and compare four families on simulated drives (a minute, after installing)
+run: $(INSTALLED) ## train and compare four families on simulated drives (after installing, three minutes of processor time the first time, seconds when repeated)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
 test: $(INSTALLED) ## tests (6 to 9 minutes on two cores, 5 to 7 from the second time on); `make lint` has style, types and layers
@@ -245,7 +245,7 @@ own_car: $(INSTALLED) ## from a raw CSV of the real Ferrari to a verdict, timed:
 export_all: $(INSTALLED) ## every family in C against Python: digits, time, bytes; with VEHEST_DATA and trained models also over real drives
 	$(BIN)/python benchmarks/export.py --out results/export
 
-examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
+examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (minutes; the first time kernels are compiled)
 	$(BIN)/python tools/compare_examples.py
 
 bench-workflow: $(INSTALLED) ## a finished study run again, estimates of a minute and of 15 hours, against loading libraries and reading the file

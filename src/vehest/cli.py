@@ -18,6 +18,12 @@ import typer
 from vehest.configuration.files import GROUPS, choices, is_file_name, pipeline_names
 from vehest.data.errors import ConfigurationError, VehestError, counted, printable
 from vehest.run.launchers.base import LAUNCHERS, RunOptions
+from vehest.run.named_files import (
+    file_words,
+    require_dataset_or_file,
+    require_paths,
+    require_pipeline,
+)
 from vehest.run.printing import (
     OutputClosed,
     TerminalTable,
@@ -217,6 +223,7 @@ def new_car(
     have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
     Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
+    require_paths(files)
     from vehest.run.console import Messages
 
     vehicle = {"wheelbase": wheelbase, "mass": mass, "steering_ratio": steering_ratio}
@@ -463,10 +470,12 @@ def estimate(
     Columns named like channels, in SI units, are read as they are; others are described once by
     `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
+    words = [word for word in (model, recording, *(overrides or [])) if word is not None]
+    logs = file_words(words[:2])[-1:]  # the recording, or what stands in its place without a model
+    require_paths([*logs, car])
     from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
 
-    words = [word for word in (model, recording, *(overrides or [])) if word is not None]
     if plot is not None:
         from vehest.run.plot import check_plot_of_estimate, plot_estimate
 
@@ -515,6 +524,7 @@ def plot_drive(
     in colours of β; with a reference also estimate over reference. The course is integrated from
     u, v and the yaw rate, and drifts over minutes.
     """
+    require_paths(file_words([recording, *(words or [])]))
     from vehest.run.plot import plot_files
 
     emit(as_json, plot_files([recording, *(words or [])], out, start, stop))
@@ -540,6 +550,7 @@ def identify(
     Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest
     estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
+    require_paths(file_words(words))
     from vehest.run.identify import identify_files, in_words
 
     record = identify_files(words, out)
@@ -636,6 +647,7 @@ def replay(
         for name, value in locals().items()
         if name not in ("log", "overrides", "as_json")
     }
+    require_paths([log, dbc])
     from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
@@ -713,6 +725,7 @@ def export(
     dataset=NAME gives the values of the car, as for `vehest estimate`, and so does
     dataset.car.wheelbase=2.7 without one.
     """
+    require_paths([vectors])
     from vehest.api import read_recording
     from vehest.configuration.estimate_options import estimate_options
     from vehest.export.folder import export_model
@@ -799,6 +812,7 @@ def compare(
     drive; an estimate is called best only if it is significantly below all others. A model that was
     trained on the recording is listed and left out of the verdict.
     """
+    require_paths([recording, *file_words(words or [])])
     from vehest.run.compare_files import compare_files
 
     emit(as_json, *compare_files(recording, words or [], models or [], columns or [], shift))
@@ -1110,6 +1124,7 @@ def data_show(
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
+    require_dataset_or_file(source)
     from vehest.run.inspect_data import describe
 
     emit(as_json, *describe(source, overrides or []))
@@ -1124,6 +1139,7 @@ def data_check(
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units
     and signs; exit code 3 on errors.
     """
+    require_dataset_or_file(source)
     from vehest.run.inspect_data import check
 
     findings, lines = check(source, overrides or [])
@@ -1141,6 +1157,7 @@ def data_usable(
     """List for every estimator whether these recordings suffice, which channels are missing, and
     how to supply them.
     """
+    require_dataset_or_file(source)
     from vehest.run.inspect_data import examine_usability
 
     emit(as_json, *examine_usability(source, overrides or []))
@@ -1220,6 +1237,7 @@ def data_align(
     Prints the estimates with their uncertainty, and the transforms that would correct it. Applies
     nothing.
     """
+    require_dataset_or_file(source)
     from vehest.alignment.settings import AlignmentSettings
     from vehest.run.align import align_recording, as_plain, in_words, write_alignment
 
@@ -1328,6 +1346,8 @@ def _run_study(
     """Run a study or sweep, or repeat its record; prints tables and the report's path; raises
     `JobsFailedError` where some jobs failed.
     """
+    if name is not None and not sweep:
+        require_pipeline(name, overrides)
     from vehest.run.console import PLAN, Messages
     from vehest.run.run_cache import RunCache
 

@@ -1,9 +1,18 @@
 """Vectors in registers for compiled code: written like code for one window, run on many at once.
 
-`load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below
-work on it lane by lane, with a number as the same in every lane; a product and a sum are fused
-where the processor can, but not of vectors from `load_unfused`. Without compilation vectors are
-arrays.
+`load` makes a vector of 64 bytes of an array: 16 numbers in float32, 8 in float64 (`width`).
+Operators, comparisons, `abs` and the functions below work on it lane by lane, with a number as the
+same in every lane; a product and a sum are fused where the processor can, but not of vectors from
+`load_unfused`.
+
+    array --load, load_unfused--> vector --operators, choose, root, each--> vector --store--> array
+                                                                           --total--> number
+
+Each function below exists twice. Its Python body is what uncompiled code runs, where vectors are
+NumPy arrays; beside it a typing rule and a code generator are registered with numba, which write
+LLVM instructions for the whole vector. A vector has the type `Lanes` in compiled code. Compiled
+loads and stores do not check bounds: whoever allocates an array leaves room behind it for one
+vector.
 """
 
 from __future__ import annotations
@@ -24,7 +33,18 @@ _FUSED = ("contract",)
 
 
 class Lanes(types.Type):  # type: ignore[misc]
-    """Type of a vector of numbers, or of truth values."""
+    """Type of a vector of numbers, or of truth values.
+
+    Parameters
+    ----------
+    dtype : Any
+        numba type of an element: ``float32``, ``float64`` or ``boolean`` (result of a comparison).
+    count : int
+        Number of lanes.
+    fused : bool, default True
+        Whether LLVM may contract a product and a sum to one rounding. It is part of the type, so
+        that vectors from `load` and from `load_unfused` do not mix in one operation.
+    """
 
     def __init__(self, dtype: Any, count: int, fused: bool = True) -> None:
         super().__init__(f"lanes({dtype}, {count}, {fused})")
@@ -35,7 +55,10 @@ class Lanes(types.Type):  # type: ignore[misc]
 
 @register_model(Lanes)
 class _Model(models.PrimitiveModel):  # type: ignore[misc]
+    """LLVM's representation of `Lanes`: one vector of floats, doubles or bits."""
+
     def __init__(self, manager: Any, kind: Lanes) -> None:
+        """Receive numba's data model manager and the `Lanes` type to represent."""
         bits = {
             types.float32: ir.FloatType(),
             types.float64: ir.DoubleType(),
@@ -45,12 +68,26 @@ class _Model(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def width(array: Any) -> int:
-    """Lanes of a vector of an array's precision."""
+    """Number of lanes of a vector of an array's precision: 16 in float32, 8 in float64."""
     return BYTES // array.itemsize
 
 
 def load(array: Any, at: int) -> Any:
-    """The vector that begins at index ``at`` of a contiguous array, which is indexed as flat."""
+    """Vector that begins at an index of a contiguous array.
+
+    Parameters
+    ----------
+    array : Any
+        Contiguous array of floats of any shape.
+    at : int
+        Index of the first element, in the flattened array.
+
+    Returns
+    -------
+    Any
+        `width` elements. Beyond the end of the array uncompiled code reads zeros, and compiled code
+        whatever lies there.
+    """
     vector = np.zeros(width(array), array.dtype)
     there = array.reshape(-1)[at : at + width(array)]
     vector[: len(there)] = there
@@ -58,48 +95,80 @@ def load(array: Any, at: int) -> Any:
 
 
 def load_unfused(array: Any, at: int) -> Any:
-    """The same vector, of which products and sums are rounded one by one, as those of numbers."""
+    """The same vector, of which products and sums are rounded one by one, as those of numbers.
+
+    Results then have the same digits as those of a loop over single numbers.
+    """
     return load(array, at)
 
 
 def store(array: Any, at: int, vector: Any) -> None:
-    """Write a vector to where `load` reads it."""
+    """Write a vector to where `load` reads it.
+
+    A number is written to every lane. Compiled code writes a whole vector, also beyond the array's
+    end; `store_some` is for arrays without room there.
+    """
     array.reshape(-1)[at : at + width(array)] = vector
 
 
 def store_some(array: Any, at: int, vector: Any, count: int) -> None:
-    """Write the first lanes of a vector, ``count`` of them, or all if it has no more."""
+    """Write the first lanes of a vector, ``count`` of them, or all if it has no more.
+
+    It uses LLVM's masked store, so that no memory outside of these lanes is touched.
+    """
     count = min(count, width(array))
     array.reshape(-1)[at : at + count] = vector[:count]
 
 
 def choose(condition: Any, one: Any, other: Any) -> Any:
-    """``one`` in the lanes where the condition is true, else ``other``; either may be a number."""
+    """Select lane by lane: ``one`` where the condition is true, else ``other``.
+
+    Parameters
+    ----------
+    condition : Any
+        Vector of truth values, from a comparison.
+    one, other : Any
+        Vectors or numbers, at least one of them a vector. Both are evaluated in every lane; what is
+        not selected may be NaN or infinite without an effect on the result.
+    """
     return np.where(condition, one, other)
 
 
 def least(one: Any, other: Any) -> Any:
-    """The smaller one of each lane."""
+    """Smaller value of each lane; compiled, a NaN in ``one`` stays and a NaN in ``other`` is
+    ignored.
+    """
     return np.minimum(one, other)
 
 
 def most(one: Any, other: Any) -> Any:
-    """The larger one of each lane."""
+    """Larger value of each lane; compiled, a NaN in ``one`` stays and a NaN in ``other`` is
+    ignored.
+    """
     return np.maximum(one, other)
 
 
 def total(vector: Any) -> Any:
-    """Sum over the lanes."""
+    """Sum over the lanes, a number; compiled code may add the lanes in any order."""
     return vector.sum()
 
 
 def root(vector: Any) -> Any:
-    """Square root."""
+    """Square root of each lane; NaN where it is negative."""
     return np.sqrt(vector)
 
 
 def each(function: Any, vector: Any) -> Any:
-    """What a function of a number gives for each lane."""
+    """Apply a function of a number to each lane.
+
+    Parameters
+    ----------
+    function : Any
+        Function of one number; compiled code calls it once a lane, which costs as much as a loop.
+        It is for functions without a vector instruction, such as ``math.tan``.
+    vector : Any
+        Arguments.
+    """
     return np.array([function(value) for value in vector], vector.dtype)
 
 
@@ -138,6 +207,7 @@ def _between(function: Any, write: Any, truth: bool = False) -> None:
             return kind and signature(Lanes(types.boolean, kind.count) if truth else kind, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Write the instruction for two operands, with a number copied to every lane."""
         kind = _pair(*sig.args)
         one, other = (
             _vector(context, builder, value, own, kind)
@@ -204,7 +274,12 @@ class _Own(AbstractTemplate):  # type: ignore[misc]
 
 
 def _by_llvm(name: str) -> Any:
+    """Return the code generator of a function of one vector that is an LLVM intrinsic of this
+    name.
+    """
+
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Call the intrinsic for the vector's type."""
         own = args[0].type
         return builder.call(
             builder.module.declare_intrinsic(
@@ -222,10 +297,14 @@ lower_builtin(root, Lanes)(_by_llvm("sqrt"))
 
 @lower_builtin(operator.neg, Lanes)  # type: ignore[untyped-decorator]
 def _neg(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write LLVM's negation."""
     return builder.fneg(args[0])
 
 
 def _pointer(context: Any, builder: Any, kind: Any, place: Any, vector: Lanes) -> Any:
+    """Return the address of an element of an array, ``place`` = (array, index), as a pointer to
+    a vector.
+    """
     data = context.make_array(kind)(context, builder, place[0]).data
     return builder.bitcast(
         builder.gep(data, [place[1]]), context.get_value_type(vector).as_pointer()
@@ -233,10 +312,12 @@ def _pointer(context: Any, builder: Any, kind: Any, place: Any, vector: Lanes) -
 
 
 def _name_of(vector: Lanes) -> str:
+    """Return LLVM's suffix of a vector type in names of intrinsics, such as ``v16f32``."""
     return f"v{vector.count}f{vector.dtype.bitwidth}"
 
 
 def _of(array: Any, fused: bool = True) -> Lanes:
+    """Return the type of the vectors of an array type: 64 bytes of its precision."""
     return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth, fused)
 
 
@@ -256,10 +337,14 @@ def _compiled(function: Any, type_of: Any) -> Callable[[Callable[..., Any]], Any
 
 @_compiled(width, lambda array: types.intp(array))
 def _width(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write the number of lanes as a constant."""
     return context.get_constant(types.intp, _of(sig.args[0]).count)
 
 
 def _load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write a load that assumes the alignment of one element only, since a vector may begin
+    anywhere.
+    """
     array = sig.args[0]
     vector = sig.return_type
     return builder.load(
@@ -273,6 +358,7 @@ _compiled(load_unfused, lambda array, at: _of(array, False)(array, types.intp))(
 
 @_compiled(store, lambda array, at, vector: types.none(array, types.intp, vector))
 def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write a store of a vector, or of a number in every lane, aligned to one element."""
     array = sig.args[0]
     own = _of(sig.args[0])
     value = _vector(context, builder, args[2], sig.args[2], own)
@@ -286,6 +372,7 @@ def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     store_some, lambda array, at, vector, count: types.none(array, types.intp, vector, types.intp)
 )
 def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write a masked store: lane i is written where i < count."""
     array, _, vector, _ = sig.args
     place = _pointer(context, builder, array, args, _of(array))
     lane = ir.IntType(64)
@@ -315,6 +402,7 @@ def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     lambda condition, one, other: (kind := _pair(one, other)) and kind(condition, one, other),
 )
 def _choose(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write LLVM's select, with numbers copied to every lane first."""
     kinds = sig.args[1:]
     return builder.select(
         args[0],
@@ -327,6 +415,7 @@ def _choose(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @_compiled(total, lambda vector: vector.dtype(vector))
 def _total(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Write LLVM's reduction, which may reorder the additions (``reassoc``); it begins at -0."""
     number = context.get_value_type(sig.return_type)
     function = ir.FunctionType(number, [number, args[0].type])
     add = builder.module.declare_intrinsic(
@@ -337,6 +426,9 @@ def _total(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _each(typing: Any, function: Any, vector: Any) -> Any:
+    """Intrinsic behind `each`: takes lanes out one by one, calls the function, and puts results
+    back.
+    """
     own = typing.resolve_function_type(function, (vector.dtype,), {})
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:

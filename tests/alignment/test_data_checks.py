@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
+from vehest.sources.base import open_source
 
 RATE = 100.0
 LENGTH = 6000
@@ -386,3 +388,28 @@ def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
     for channels in ({**drive.channels, "ax": shaking}, standing_car):
         findings = checks_of_recording(replace(drive, channels=channels))
         assert "spike" not in [finding.check for finding in findings]
+
+
+def test_an_acceleration_that_a_transform_made_of_the_speed_is_not_called_late(tmp_path):
+    time = np.arange(0.0, 120.0, 0.02)
+    speed = 15.0 + 5.0 * np.sin(0.5 * time) + np.sin(2.0 * time) + 0.2 * np.sin(7.0 * time)
+    table = pd.DataFrame({"t": time, "vx": speed, "yaw_rate": 0.2 * np.sin(0.3 * time)})
+    table.to_csv(tmp_path / "lap.csv", index=False)
+    dataset = {
+        "name": "mine",
+        "source": "tabular",
+        "licence": "-",
+        "citation": "-",
+        "path": str(tmp_path),
+        "files": "*.csv",
+        "time": {"column": "t", "unit": "s"},
+        "channels": {
+            "vx": {"column": "vx", "unit": "m/s"},
+            "yaw_rate": {"column": "yaw_rate", "unit": "rad/s"},
+        },
+        "transforms": [{"name": "acceleration_from_speed"}],
+    }
+    recording = open_source(dataset).read("lap")
+    as_measured = replace(recording, provenance={})
+    assert ("delay", "ax") in {(f.check, f.channel) for f in checks_of_recording(as_measured)}
+    assert "delay" not in {found.check for found in checks_of_recording(recording)}

@@ -408,7 +408,7 @@ def gru_trials():
             training={"phase": {"learning_rate": rate}, "batch_size": 6},
             metric="mse_weighted",
             validation=error,
-            key="",
+            origin="",
             evaluation="",
             chosen=error == 0.01,
         )

@@ -3,6 +3,7 @@ not see through.
 """
 
 import re
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
+from vehest.data.units import factor_to_si
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import _busiest, inspect
 from vehest.run.own_car.questions import ask, questions_of
@@ -150,6 +152,71 @@ def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp
         [],
     )
     assert sum("wheel_speed" in note and "missing samples" in note for note in log_draft.notes) == 4
+
+
+WHEEL_SCALES = {  # unit -> value at a wheel speed of 1 rad/s
+    "km/h": 3.6 * RADIUS,
+    "mph": RADIUS / 0.44704,
+    "cm/s": 100.0 * RADIUS,
+    "ft/s": RADIUS / 0.3048,
+    "0.01*km/h": 360.0 * RADIUS,
+    "rpm": 30.0 / np.pi,
+    "rev/s": 0.5 / np.pi,
+    "deg/s": 180.0 / np.pi,
+}
+
+
+@pytest.mark.parametrize(
+    ("unit", "header"),
+    [
+        *product(WHEEL_SCALES, ["{} [{}]"]),
+        *((unit, "{}") for unit in WHEEL_SCALES if unit != "ft/s"),  # rad/s at 0.305 m
+    ],
+)
+def test_wheel_speeds_are_read_in_any_unit_of_a_speed(tmp_path, unit, header):
+    d = drive(60.0)
+    wheels = {
+        header.format(f"Wheel{corner.upper()}", unit): WHEEL_SCALES[unit] * d[f"wheel_{corner}"]
+        for corner in CORNERS
+    }
+    proposals = proposals_of(tmp_path, usual(d).assign(**wheels))
+    names = [f"wheel_speed_{corner}" for corner in CORNERS]
+    is_ambiguous = unit == "mph" and "[" not in header  # from rad/s of a wheel of 0.447 m
+    for name in names:
+        proposal = proposals.by_channel[name]
+        if is_ambiguous:
+            assert "mph fits equally well" in proposal.question
+        else:
+            factor = proposal.factor * factor_to_si(proposal.unit, "rad/s") * WHEEL_SCALES[unit]
+            expected = 1.0 if proposal.factor == 1.0 else RADIUS / 0.3
+            assert factor == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "problem"),
+    [
+        ("WheelFL [mm]", 1.0, "since the unit is of no speed"),
+        ("WheelFL [rpm]", 30.0 / np.pi, "since another wheel is in km/h"),
+    ],
+)
+def test_a_wheel_in_another_unit_is_named_with_the_remedy(tmp_path, name, scale, problem):
+    d = drive(60.0)
+    wheels = {
+        f"Wheel{corner} [km/h]": 3.6 * RADIUS * d[f"wheel_{corner}"] for corner in ("rl", "rr")
+    }
+    wheels[name] = scale * d["wheel_fl"]
+    proposals = proposals_of(tmp_path, usual(d).assign(**wheels))
+    note = next(note for note in proposals.notes if problem in note)
+    assert "wheel_speed_fl: {column:" in note
+    assert "wheel_speed_fl" not in proposals.by_channel
+
+
+def test_wheel_speeds_in_counts_of_no_known_unit_are_left_out_with_a_question(tmp_path):
+    d = drive(60.0)
+    wheels = {f"Wheel{corner.upper()}": 20.0 * d[f"wheel_{corner}"] for corner in CORNERS}
+    proposal = proposed(tmp_path, usual(d).assign(**wheels))["wheel_speed_fl"]
+    assert "does not agree with the speed" in proposal.question
+    assert proposal.is_weak
 
 
 @pytest.mark.parametrize(
@@ -1594,3 +1661,54 @@ def test_a_steering_wheel_that_turns_no_further_than_road_wheels_is_left_out(tmp
     channels, open_questions = left_out(tmp_path, table)
     assert not {"steer", "handwheel"} & set(channels)
     assert "its name suggests a steering wheel" in open_questions["Lenkradwinkel"].text
+
+
+@pytest.mark.parametrize("rate_hz", [25.0, 100.0])
+def test_the_same_signal_in_another_unit_is_no_second_measurement(tmp_path, rate_hz):
+    d = drive(60.0, rate_hz)
+    table = pd.DataFrame(
+        {
+            "t": d["t"],
+            "Speed (km/h)": 3.6 * d["vx"],
+            "Speed (mph)": d["vx"] / 0.44704,
+            "Yaw Rate (rad/s)": d["r"],
+            "Yaw Rate (deg/s)": np.degrees(d["r"]),
+            "LatAcc (g)": d["ay"] / G,
+        }
+    )
+    proposals = proposals_of(tmp_path, table)
+    assert not {"vx_ref", "yaw_rate_ref"} & set(proposals.by_channel)
+    speed = proposals.by_channel["vx"]
+    assert any("holds the same samples in" in text for text in speed.evidence)
+    assert not speed.question
+    second = 3.6 * d["vx"] + 0.05 * np.random.default_rng(1).standard_normal(len(d["t"]))
+    by_channel = proposed(tmp_path, table.assign(**{"Speed (mph)": second / 1.609344}))
+    assert "vx_ref" in by_channel
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("Gyro", 0.0), ("LatAcc", 0.0123), ("Speed", 55.0), ("Steer", -7.5), ("WheelFL [km/h]", 0.0)],
+)
+def test_a_sensor_that_never_changes_is_named(tmp_path, column, value):
+    proposals = proposals_of(tmp_path, usual(drive(60.0)).assign(**{column: value}))
+    assert column not in {proposal.column for proposal in proposals.channels}
+    (note,) = (note for note in proposals.notes if note.startswith("constant, or of few values"))
+    assert f"'{column}' ({value:g})" in note
+
+
+def test_a_constant_component_in_the_unit_of_another_quantity_is_no_dead_sensor(tmp_path):
+    table = usual(drive(60.0)).assign(**{"angular_velocity.y [rad/s]": 0.0})
+    notes = proposals_of(tmp_path, table).notes
+    assert not [note for note in notes if note.startswith("constant, or of few values")]
+
+
+@pytest.mark.parametrize("column", ["Gyro", "LatAcc", "Speed", "Steer"])
+def test_a_sensor_that_freezes_for_half_of_the_drive_is_named(tmp_path, column):
+    table = usual(drive(60.0))
+    table.loc[1500:, column] = table.loc[1500, column]
+    log_draft = drafted(tmp_path, table)
+    named = [*log_draft.remarks, *log_draft.notes]
+    is_channel = column in {proposal.column for proposal in log_draft.examined.proposals.channels}
+    expected = "constant at" if is_channel else f"'{column}' is left out"
+    assert any(expected in text for text in named)

@@ -11,9 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from planted_logs import G, drive, usual, write
 
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
+from vehest.run.own_car.questions import ask
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.not_measured import codes_of_not_measured
@@ -448,3 +449,34 @@ def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path)
     channels = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel
     assert channels["yaw_rate"].unit == "mdeg/s"
     assert channels["vx"].unit == "m/s"
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "step", "unit"),
+    [
+        ("timestamp_100us", 1e4, 0.04, "0.1*ms"),
+        ("time (10ms)", 100.0, 0.04, "cs"),
+        ("time [s]", 1.0, 0.5, "s"),  # a slow logger
+    ],
+)
+def test_steps_of_a_counter_and_slow_clocks_are_read_as_the_header_states(
+    tmp_path, name, factor, step, unit
+):
+    table = usual(drive(60.0)).iloc[:: round(50 * step)]
+    table = table.rename(columns={"Time [s]": name}).assign(**{name: factor * table["Time [s]"]})
+    clock = survey_table(write(tmp_path / "lap.csv", table)).clock
+    assert (clock.unit, clock.asked) == (unit, False)
+
+
+def test_a_clock_of_two_rows_a_second_without_a_unit_is_asked_and_not_read_as_ms(tmp_path):
+    table = usual(drive(60.0)).iloc[::25].rename(columns={"Time [s]": "t"})
+    clock = survey_table(write(tmp_path / "lap.csv", table)).clock
+    assert (clock.unit, clock.asked) == ("s", True)
+
+
+def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):
+    d = drive(60.0)
+    table = pd.DataFrame({"t": d["t"], "v": [f"{v:.3f} m/s" for v in d["vx"]], "r": d["r"]})
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table.assign(ay=d["ay"]))])
+    with pytest.raises(ConfigurationError, match="column 'v' holds numbers with a unit"):
+        ask(examined, [], interactive=False)

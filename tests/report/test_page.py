@@ -280,12 +280,46 @@ def test_legend_names_the_lines_and_the_reference_lies_below_the_estimates(chrom
     assert "Estimator 2" not in chromium.execute_script(LEGEND)
 
 
-def test_strip_of_sensor_health_has_a_legend(chromium, hour):
+DRAWN_TEXTS = """const done = arguments[arguments.length - 1];
+const drawn = [];
+const { fillText } = CanvasRenderingContext2D.prototype;
+CanvasRenderingContext2D.prototype.fillText = function (text, left, bottom, ...rest) {
+  drawn.push([text, bottom]);
+  return fillText.call(this, text, left, bottom, ...rest);
+};
+document.querySelector("figure.live").explorer.plots[3].redraw();
+requestAnimationFrame(() => {
+  CanvasRenderingContext2D.prototype.fillText = fillText;
+  done(drawn);
+});"""
+
+
+def test_strips_of_sensor_health_have_a_legend_and_the_estimators_names(chromium, hour):
     opened(chromium, hour)
     heads = [head.text for head in chromium.find_elements("css selector", ".panel .head")]
     (strip,) = [text for text in heads if text.startswith("sensor health")]
-    words = ("valid", "degraded", "invalid", *(f"Estimator {i}" for i in range(1, 5)))
+    words = ("valid", "degraded", "invalid")
     assert [strip.index(word) for word in words] == sorted(strip.index(word) for word in words)
+    texts = chromium.execute_async_script(DRAWN_TEXTS)
+    names = [text for text, _ in sorted(texts, key=lambda drawn: drawn[1])]
+    assert names == [f"Estimator {i}" for i in range(1, 5)]  # from the top
+
+
+def test_rule_below_the_contents_is_as_wide_as_the_page_and_none_is_above_the_verdict(
+    chromium, toy
+):
+    opened(chromium, toy[0], width=1280)
+    rules = chromium.execute_script(
+        "return ['header', 'nav'].map((tag) => document.querySelector(tag).clientWidth)"
+    )
+    assert rules[0] == rules[1] > 1000
+    verdict, contents = (
+        chromium.execute_script(
+            f"return getComputedStyle(document.querySelector('{selector}')).{side}"
+        )
+        for selector, side in (("h2", "borderTopWidth"), ("nav", "borderBottomWidth"))
+    )
+    assert (verdict, contents) == ("0px", "1px")
 
 
 def test_appendices_are_a_folded_list_at_the_end(chromium, toy):

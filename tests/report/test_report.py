@@ -399,6 +399,42 @@ def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
     assert "is close to the noise of the reference, at least 0.05°" in warned(floor_reference=0.05)
 
 
+def test_basis_of_the_verdict_names_blocks_correction_and_where_they_are_explained(artefacts):
+    text = " ".join(block for block in comparison(artefacts).blocks if isinstance(block, str))
+    basis = re.search(
+        r"paired bootstrap over (\d+) blocks of \S+ s and over seeds\. A difference of two "
+        r"estimators is significant if its 95 % interval, after Holm's correction for the (\d+) "
+        r"comparisons of this test, excludes zero\. Effective number of blocks: (\S+) of (\d+);",
+        text,
+    )
+    assert basis is not None
+    n_blocks, n_comparisons, effective, n_blocks_again = map(float, basis.groups())
+    assert n_blocks == n_blocks_again >= effective >= 1.0
+    n_candidates = len(FAMILIES) - 2  # the others are zero and static_map
+    # the best with every other, and every candidate with both baselines, each pair once
+    assert n_comparisons == (len(FAMILIES) - 1) + 2 * (n_candidates - 1)
+    page = Path(__file__).parents[2] / "docs/evaluation.md"
+    assert "docs/evaluation.md" in text
+    assert "\n## Intervals and significance\n" in page.read_text(encoding="utf-8")
+
+
+def test_reset_of_the_luenberger_observer_is_explained_below_its_traces(artefacts):
+    (busiest,) = [block for block in comparison(artefacts).blocks if names_zoom(block)]
+    assert busiest.caption.endswith(
+        " Luenberger: v is set to 0 where the yaw rate is below a threshold (reset of the method)."
+    )
+    others = replace(
+        artefacts, models=[model for model in artefacts.models if model.estimator != "luenberger"]
+    )
+    (busiest,) = [block for block in comparison(others).blocks if names_zoom(block)]
+    assert "Luenberger" not in busiest.caption
+
+
+def names_zoom(block):
+    """Whether a block of a report is the figure of the busiest 20 s."""
+    return isinstance(block, Figure) and block.name == "zoom_test"
+
+
 def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(
     artefacts, tmp_path
 ):

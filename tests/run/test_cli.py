@@ -279,6 +279,59 @@ def test_help_shows_choices_and_answers_quickly(place):
     assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
 
 
+def test_missing_file_is_reported_before_heavy_libraries_are_imported(place):
+    (place.folder / "lap.csv").write_text("time,vx\n")
+    commands = {
+        "estimate none.csv": "none.csv",
+        "estimate self_calibrating none.csv dataset=mine": "none.csv",
+        "estimate lap.csv --car none.yaml": "none.yaml",
+        "new my_car none.csv --yes": "none.csv",
+        "new my_car lap.csv none.csv": "none.csv",
+        "data show none.csv": "none.csv",
+        "data check none.csv": "none.csv",
+        "data usable folder/none": "folder/none",
+        "data align none.csv -e delay": "none.csv",
+        "compare none.csv lap.csv": "none.csv",
+        "compare lap.csv none.parquet dataset=mine": "none.parquet",
+        "plot none.csv": "none.csv",
+        "plot lap.csv none.parquet start=1": "none.parquet",
+        "identify lap.csv none.csv estimator.wheelbase=2.7": "none.csv",
+        "replay none.asc --dbc lap.csv": "none.asc",
+        "replay lap.csv --dbc none.dbc": "none.dbc",
+        "export pretrained --vectors none.csv": "none.csv",
+        "run none.yaml": "none.yaml",
+        "report none.yaml": "none.yaml",
+    }
+    program = (
+        "import sys\nfrom vehest.cli import main\nfor line in sys.stdin:\n"
+        "    sys.argv = ['vehest', *line.split()]\n"
+        "    try: main()\n"
+        "    except SystemExit as end: code = end.code\n"
+        "    heavy = {'torch', 'numba', 'hydra', 'pandas', 'scipy', 'matplotlib', 'mlflow'}\n"
+        "    print(code, sorted(heavy & set(sys.modules)), file=sys.stderr)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        input="\n".join(commands),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = result.stderr.splitlines()
+    assert len(lines) == 2 * len(commands), result.stderr
+    for command, error, after in zip(commands, lines[::2], lines[1::2], strict=True):
+        assert f"'{commands[command]}'" in error, (command, error)
+        assert after == "4 []", (command, after)
+
+
+def test_closest_data_set_is_named_for_a_word_that_is_no_file(place):
+    code, _, err = place("data", "check", "mien")
+    assert (code, "'mien' is neither a data set nor a file; did you mean 'mine'?" in err) == (
+        2,
+        True,
+    ), err
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -14,6 +14,7 @@ import pytest
 from place import DATASET, write_drives
 from vehest.estimators.registry import new_estimator
 from vehest.report.document import Document
+from vehest.run import runner
 from vehest.run.study import jobs_of, read_study
 from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
@@ -138,6 +139,21 @@ def test_parts_run_as_a_single_study_and_the_next_run_skips_all(parts_place):
         3,
         "both: stale: configuration (scheme_2: train lstm)\n",
     )
+
+
+def test_planning_opens_each_data_set_once_for_all_parts(parts_place, monkeypatch):
+    opened = []
+
+    def counted(dataset):
+        opened.append(dataset["name"])
+        return open_source(dataset)
+
+    open_source = runner.open_source
+    monkeypatch.setattr(runner, "open_source", counted)
+    monkeypatch.setattr(runner, "car_of", lambda dataset: counted(dataset).car_in_recordings)
+    parts_place("run", "both", "tracking=none", "training.max_evaluations=5")
+    # of the files and of the car; the files of the other one are not there
+    assert sorted(opened) == ["mine", "mine", "other"]
 
 
 def test_study_modules_without_an_overview_are_refused(parts_place, monkeypatch):

@@ -7,14 +7,16 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from place import write_drives
 from vehest.artefacts.artefact import read_artefact
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.text_files import read_json
-from vehest.run import runner, weights
+from vehest.run import downsample, runner, weights
 from vehest.run.weights import PublishedWeights, WeightsTooLargeError
 
 GRU = ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"]
@@ -60,8 +62,8 @@ def models_published(pair):
 def stop_once_published(patch, n_models):
     """Send Ctrl-C after so many models have been published."""
 
-    def publish_weights(published, models, output, messages):
-        has_room = publish(published, models, output, messages)
+    def publish_weights(published, *arguments):
+        has_room = publish(published, *arguments)
         if len(published.models) >= n_models:
             os.kill(os.getpid(), signal.SIGINT)
         return has_room
@@ -96,6 +98,36 @@ def test_stopped_study_continues_with_missing_trainings(pair, monkeypatch):
     assert len(digests(resumed)) == 6
     for name in set(published) - {"provenance.json"}:
         assert (pair.folder / "results/pair" / name).read_bytes() == published[name], name
+
+
+def test_models_are_taken_where_another_processor_rounds_recordings_otherwise(pair, monkeypatch):
+    pair.done(*RUN)
+    published = models_published(pair)
+    shutil.rmtree("outputs")
+
+    def resampled_elsewhere(recording, rate_hz, options):
+        result = resampled(recording, rate_hz, options)
+        channels = {name: np.nextafter(values, np.inf) for name, values in result.channels.items()}
+        return replace(result, channels=channels)
+
+    resampled = downsample.resampled
+    monkeypatch.setattr(downsample, "resampled", resampled_elsewhere)
+    _, err = pair.done(*RUN[:3])
+    message = " ".join(err.split())
+    assert "epochs," not in err
+    assert message.count("3 of 3 taken from results/pair/weights.safetensors (3 of them were") == 2
+    republished = models_published(pair)
+    assert not set(republished) & set(published)
+    assert sorted(record.digest for record in republished.values()) == sorted(
+        record.digest for record in published.values()
+    )
+    assert {record.origin for record in republished.values()} == {
+        record.origin for record in published.values()
+    }
+    shutil.rmtree("outputs")
+    _, err = pair.done(*RUN)
+    assert "added to" not in err
+    assert models_published(pair).keys() == republished.keys()
 
 
 def test_models_of_a_killed_run_are_published_by_the_next(pair, monkeypatch):
@@ -141,7 +173,7 @@ def test_weights_above_the_limit_are_refused_and_the_file_stays(pair, monkeypatc
     with pytest.raises(WeightsTooLargeError, match=r"MB of weights are more than the 0\.0"):
         published.add([second, *remaining])
     assert (os.listdir(file.parent), file.read_bytes()) == ([file.name], before)
-    assert (first.key in published, second.key in published) == (True, False)
+    assert list(published.models) == [first.key]
     _, err = pair.done(*RUN)
     message = " ".join(err.split())
     assert message.count("no more weights are published") == 1

@@ -357,7 +357,7 @@ def test_bare_files_are_assessed_by_their_columns(place):
     table.to_csv("lap.csv", index=False)
     assert place.told("data", "usable", "lap.csv")["unused_columns"] == ["AccX", "Steering"]
     assert "columns without a channel: AccX, Steering" in place("data", "usable", "lap.csv")[1]
-    assert place("data", "usable", "nowhere.csv")[0] == 2
+    assert place("data", "usable", "nowhere.csv")[0] == 4
 
 
 def test_training_without_a_channel_is_refused_with_a_working_remedy(place):

@@ -12,9 +12,9 @@ from refusals import refusal
 
 from conftest import planar_drive
 from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import MISSING
 from vehest.run.inspect_data import check
 from vehest.sources.base import open_source
-from vehest.sources.signals import MISSING
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 

@@ -10,8 +10,8 @@ from mdf_log import ONE, read_mdf, write_mdf
 from refusals import refusal
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.recording import MISSING
 from vehest.sources.base import open_source
-from vehest.sources.signals import MISSING
 from vehest.sources.unit_spellings import plain_unit
 
 asammdf = pytest.importorskip(

@@ -133,7 +133,20 @@ class Alignment:
 
 
 def in_words(name: str, value: float) -> str:
-    """A value in degrees or milliseconds, with its unit."""
+    """A value in degrees or milliseconds, with its unit.
+
+    Parameters
+    ----------
+    name : str
+        A parameter, one of `UNITS`.
+    value : float
+        In SI units.
+
+    Returns
+    -------
+    str
+        Three significant digits; a number alone where the unit is 1.
+    """
     factor, unit = READ_AS.get(UNITS[name], (1.0, UNITS[name]))
     number = f"{factor * value:.3g}"
     return number if unit == "1" else f"{number} {unit}"
@@ -150,6 +163,13 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         With ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for the steering ratio;
         with ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` (or ``vx``) for all others.
     settings : AlignmentSettings
+        What to estimate, and cut-off, largest delay, tilt, wheelbase and limits of the steering.
+
+    Returns
+    -------
+    Alignment
+        Parameters with 95 % intervals, transforms in the order in which they have to be applied,
+        residuals before and after them, and notes.
 
     Raises
     ------
@@ -259,6 +279,9 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
 def _imu_notes(
     fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings
 ) -> list[str]:
+    """Sentences on what an estimate assumes, what its residuals suggest, and which intervals
+    contain zero.
+    """
     signals = fit.signals
     values = fit.values
     notes = []
@@ -330,6 +353,27 @@ def _align_steering(
     calmly.
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
+
+    Parameters
+    ----------
+    recording : Recording
+        As the other transforms would correct it.
+    settings : AlignmentSettings
+        With the wheelbase [m].
+
+    Returns
+    -------
+    tuple
+        Steering ratio [1], steering offset [rad] and understeer gradient [rad/(m/s²)] with their
+        uncertainties, the transform, and a note.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no wheelbase, or the cut-off is too high.
+    DataError
+        A channel has gaps, the car hardly ever drives calmly, the parameters cannot be separated,
+        or the ratio is not significantly different from zero.
     """
     if settings.wheelbase is None:
         raise ConfigurationError(
@@ -434,6 +478,11 @@ def _error_of_constant_understeer(columns: FloatArray, speed: FloatArray, ratio:
         [m/s].
     ratio : float
         Of the fit.
+
+    Returns
+    -------
+    float
+        In units of the ratio; it includes LINKAGE_CHANGE.
     """
     ay = columns[2]
     weights = np.square(ay) / np.square(ay).sum()
@@ -448,8 +497,10 @@ def _error_of_constant_understeer(columns: FloatArray, speed: FloatArray, ratio:
 
 
 def _percent(share: float) -> str:
+    """A share as a percentage with one decimal."""
     return f"{round(100.0 * share, 1) + 0.0:.1f} %"  # no -0.0
 
 
 def _rounded(value: float) -> float:
+    """Six significant digits, as configurations show a value."""
     return float(f"{value:.6g}")

@@ -18,6 +18,13 @@ def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArra
 
     Source: Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.3 (bilinear
     transformation).
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        Where the band ends, -3 dB in one pass [Hz].
+    rate_hz : float
+        Sampling rate, more than twice ``high_hz`` [Hz].
     """
     low, high = 4.0 * np.tan(np.pi * np.array([low_hz, high_hz]) / rate_hz)
     half = (
@@ -37,7 +44,20 @@ def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArra
 
 
 def without_phase(sections: FloatArray, samples: FloatArray) -> FloatArray:
-    """Samples (T,), T > 15, filtered forwards, then backwards, from a steady state each."""
+    """Samples (T,), T > 15, filtered forwards, then backwards, from a steady state each.
+
+    Parameters
+    ----------
+    sections : FloatArray
+        (S, 5), as `butterworth_band` returns them.
+    samples : FloatArray
+        Without gaps.
+
+    Returns
+    -------
+    FloatArray
+        (T,). Both passes together square the magnitude of the response and cancel its phase.
+    """
     extended = np.pad(samples, EXTENSION, mode="reflect", reflect_type="odd")
     for _ in range(2):
         extended = _filtered(sections, extended)[::-1].copy()
@@ -46,6 +66,9 @@ def without_phase(sections: FloatArray, samples: FloatArray) -> FloatArray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _filtered(sections, samples):  # type: ignore[no-untyped-def]
+    """Samples through all sections one after another (transposed direct form II), from the steady
+    state of the first sample.
+    """
     state = np.empty((len(sections), 2))
     out = np.empty(len(samples))
     level = samples[0]

@@ -29,6 +29,19 @@ def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, La
 
     Where ay and yaw rate are held against each other, one that is low-passed makes the other lead;
     the one whose phase is explained better is named.
+
+    Parameters
+    ----------
+    motion : Motion
+        The channels.
+    spectra : CrossSpectra
+        Of `signals_to_compare`.
+
+    Returns
+    -------
+    dict
+        Only those with a time constant above MIN_TIME_CONSTANT_SECONDS over its whole 95 %
+        interval.
     """
     lateral = f"d({motion.velocity})/dt"
     together = {"ay": {"ay": 1.0}, "lateral": {"turning": 1.0, "sliding": 1.0}}
@@ -53,6 +66,9 @@ def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, La
 
 
 def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | None:
+    """The lag of a follower if it is surely that of a low-pass: well explained, slow, and not ahead
+    of its source; else None.
+    """
     lag = lag_of(spectra, source, follower, low_pass=True)
     if (
         lag is None
@@ -70,6 +86,15 @@ def low_pass_findings(
 ) -> list[Finding]:
     """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held
     against.
+
+    Parameters
+    ----------
+    motion : Motion
+        The channels.
+    spectra : CrossSpectra
+        Of `signals_to_compare`.
+    slow : mapping
+        As `low_passed` returns it.
     """
     findings = []
     for channel, (text, lag) in slow.items():
@@ -99,12 +124,26 @@ def low_pass_findings(
 
 
 def _seconds(measured: Measured) -> str:
+    """A time with its 95 % interval as text, its lower end at least zero."""
     return f"{measured.value:.2g} s (95 %: {max(measured.low, 0.0):.2g} to {measured.high:.2g})"
 
 
 def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of
     one rate make one finding.
+
+    Parameters
+    ----------
+    recording : Recording
+        Any channels.
+    moving : BoolArray
+        Where the car moves, (T,); other samples do not count.
+
+    Returns
+    -------
+    list of Finding
+        A warning where the mean delay by holding, half an update, exceeds
+        MIN_REPORTED_DELAY_SECONDS, else a note.
     """
     names_by_rate: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
@@ -136,6 +175,18 @@ def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does
     so too while it moves slowly, but by one quantum at a time.
+
+    Parameters
+    ----------
+    samples : FloatArray
+        (T,); NaN are left out.
+    rate_hz : float
+        Sampling rate [Hz].
+
+    Returns
+    -------
+    float or None
+        From the median distance of two changes; None also for fewer than MIN_CHANGES changes.
     """
     steps = np.diff(samples[np.isfinite(samples)])
     changes = np.flatnonzero(steps)

@@ -1,8 +1,13 @@
-"""Checks of a recording: each looks for one kind of fault and names where it is."""
+"""Checks of a recording: each looks for one kind of fault and names where it is.
+
+Flow: recording -> parts of a long drive -> where the car moves (`standstill`) -> each function of
+`_CHECKS` -> findings, merged over the parts and sorted by level. A check yields nothing where its
+channels are missing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -30,11 +35,12 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError, number_of
-from vehest.data.recording import PART, Recording, part_slices
+from vehest.data.recording import DERIVED, MISSING, PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
 
+AX_OF_SPEED = "acceleration_from_speed"  # the transform
 MAX_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
 MIN_STUCK_SAMPLES = 3
@@ -69,6 +75,11 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
     Of a part of a drive in which the car stands throughout only impossible values count.
 
+    Parameters
+    ----------
+    recording : Recording
+        Any channels, in SI units.
+
     Returns
     -------
     list of Finding
@@ -83,6 +94,7 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
 
 def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
+    """Findings of one part; only impossible values where the car stands throughout a part."""
     moving = ~standstill(recording)
     checks = _CHECKS if is_undivided or moving.any() else (_impossible_values,)
     return [finding for check in checks for finding in check(recording, moving)]
@@ -91,6 +103,11 @@ def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
 def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
     """Findings in the parts of a drive, the gravest first: of each level, check and channel those
     of the first part that has any.
+
+    Parameters
+    ----------
+    parts : iterable of sequence of Finding
+        In the order of time.
     """
     merged: list[Finding] = []
     for part in parts:
@@ -110,10 +127,16 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
     Parameters
     ----------
     recording : Recording
+        As `checks_of_recording` takes it.
     accepted : collection of str
         Checks whose errors are accepted.
     place : str
         Beginning of an error's message.
+
+    Returns
+    -------
+    list of Finding
+        All of them, for the user to see.
 
     Raises
     ------
@@ -131,6 +154,9 @@ def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -
 
 
 def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Samples outside the range that a channel's description allows; an error, unless a simulated
+    car spun.
+    """
     spun = bool(dict(recording.provenance.get("flags") or {}).get("spun"))
     for name, samples in recording.channels.items():
         channel = CHANNELS[name]
@@ -155,8 +181,12 @@ def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels that planar motion ties together: signs and units first, the rest with these put
     right.
+
+    Units are corrected one after another, at most MAX_WRONG_UNITS, so that one wrong unit is not
+    reported of every channel that is compared with it. Where a delay or low-pass of ay, yaw rate or
+    vy explains poor kinematics, only the former is reported.
     """
-    motion = motion_of(recording, moving)
+    motion = motion_of(_without_ax_of_speed(recording), moving)
     if not motion.moving.any():
         return []
     relations = relations_of(motion)
@@ -186,6 +216,17 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
         finding for finding in _kinematics(motion) if finding.level == "note" or not explained
     ]
     return findings + kinematics + offset_findings(motion) + clocks
+
+
+def _without_ax_of_speed(recording: Recording) -> Recording:
+    """The recording without an ax that a transform made from its speed: that one is late by the
+    transform's filter, as it has to be on a car, and says nothing of the log.
+    """
+    derived = recording.provenance.get(DERIVED)
+    transforms = derived.get("transforms", ()) if isinstance(derived, Mapping) else ()
+    if not any(entry.get("name") == AX_OF_SPEED for entry in transforms):
+        return recording
+    return recording.select([name for name in recording.channels if name != "ax"])
 
 
 def _kinematics(motion: Motion) -> Iterator[Finding]:
@@ -222,6 +263,12 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
 
 
 def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Samples that are missing, that the source interpolated, or at which it ended the
+    recording.
+    """
+    for name, texts in (recording.provenance.get(MISSING) or {}).items():
+        for text in texts:
+            yield Finding("warning", "missing", name, text)
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:
@@ -523,6 +570,7 @@ def _lasting_runs(backwards: BoolArray, recording: Recording) -> NDArray[np.int6
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
+    """Length and begin of the longest run, (N, 2), as text."""
     begin, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
     return f"for {(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} s"
 

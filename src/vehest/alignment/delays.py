@@ -62,7 +62,19 @@ class Late:
 
 
 def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
-    """All signals that delays and low-passes are found from, under names of their own."""
+    """All signals that delays and low-passes are found from, under names of their own.
+
+    Parameters
+    ----------
+    motion : Motion
+        Channels without gaps.
+
+    Returns
+    -------
+    dict
+        Name -> (T,), of those whose channels are there and that change. ``turned`` and ``turn`` are
+        vx·yaw_rate and ay - d(vy)/dt over the speed [rad/s], regularised near standstill.
+    """
     signals: dict[str, FloatArray] = {}
     if motion.speed and {"ay", "yaw_rate"} <= set(motion.channels):
         signals |= {"ay": motion["ay"], "turning": motion.turning}
@@ -100,7 +112,13 @@ def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
 
 
 def spectra_of(motion: Motion) -> CrossSpectra | None:
-    """Their cross-spectra; None for a drive that is too short."""
+    """Their cross-spectra; None for a drive that is too short.
+
+    Parameters
+    ----------
+    motion : Motion
+        Samples at standstill are left out.
+    """
     signals = signals_to_compare(motion)
     return cross_spectra(signals, motion.rate_hz, motion.moving) if signals else None
 
@@ -110,6 +128,21 @@ def delays_of(
 ) -> list[Delay]:
     """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed
     channels.
+
+    Parameters
+    ----------
+    motion : Motion
+        Channels without gaps.
+    spectra : CrossSpectra
+        As `spectra_of` returns them.
+    slow : frozenset of str
+        Channels whose lag is that of a low-pass.
+
+    Returns
+    -------
+    list of Delay
+        With half widths of at most MAX_HALF_WIDTH_SECONDS; lags that a pure delay does not explain
+        are left out.
     """
     delays: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
@@ -132,6 +165,7 @@ def delays_of(
 
 
 def _lateral(motion: Motion) -> list[Delay]:
+    """Delays between yaw rate, lateral velocity and ay, two by two, from the fit to all three."""
     lateness = lateral_lateness(motion)
     if lateness is None or not all(_sound(measured) for measured in lateness):
         return []
@@ -153,6 +187,9 @@ def _pair(
     *,
     tilted: bool = False,
 ) -> list[Delay]:
+    """The delay of one signal behind another, in a list; empty where it is missing or not
+    established. ``tilted``: gravity by body tilt adds to the uncertainty.
+    """
     if not {source, follower} <= set(spectra.names):
         return []
     lag = lag_of(spectra, source, follower, low_pass=False)
@@ -163,11 +200,23 @@ def _pair(
 
 
 def _sound(delay: Measured) -> bool:
+    """Whether a delay is known to MAX_HALF_WIDTH_SECONDS and inside the lags that are searched."""
     return delay.half_width <= MAX_HALF_WIDTH_SECONDS and abs(delay.value) < MAX_LAG_SECONDS
 
 
 def late_channels(recording: Recording) -> dict[str, Late]:
-    """Channel -> its delay, as the checks of a recording find it."""
+    """Channel -> its delay, as the checks of a recording find it.
+
+    Parameters
+    ----------
+    recording : Recording
+        Whose checks are repeated.
+
+    Returns
+    -------
+    dict
+        Empty for a drive that is too short; channels that are late together share one entry.
+    """
     motion = motion_of(recording, ~standstill(recording))
     spectra = spectra_of(motion)
     if spectra is None:
@@ -177,7 +226,18 @@ def late_channels(recording: Recording) -> dict[str, Late]:
 
 
 def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
-    """A warning for every channel that is later than another."""
+    """A warning for every channel that is later than another.
+
+    Parameters
+    ----------
+    delays : sequence of Delay
+        As `delays_of` returns them.
+
+    Returns
+    -------
+    list of Finding
+        With the transform that compensates for it.
+    """
     remedy = (
         "the transform {{name: delay_correction, delay: {:.3f}, channels: [{}]}} compensates for it"
     )

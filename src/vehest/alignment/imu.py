@@ -94,8 +94,31 @@ class ImuFit:
 
 
 def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
-    """Fit some of `IMU_PARAMETERS` to a drive; the others are zero. Needs and errors are those of
-    `vehest.alignment.align.align`.
+    """Fit some of `IMU_PARAMETERS` to a drive; the others are zero.
+
+    Parameters
+    ----------
+    recording : Recording
+        With the channels that `vehest.alignment.align.align` needs.
+    settings : AlignmentSettings
+        Cut-off, largest delay, and prior of the tilt.
+    names : sequence of str
+        Parameters to fit.
+
+    Returns
+    -------
+    ImuFit
+        Gains and lags of tilt are fitted too where the drive shows them (`TILT_PRIOR`), and count
+        as uncertainty where it does not.
+
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, the recording is too short, sensor and reference have
+        nothing in common, the delay is beyond ``max_delay``, or parameters cannot be separated or
+        are lost in noise.
+    ConfigurationError
+        The cut-off is too high for the recording's rate.
     """
     signals = signals_of(recording, settings)
     model = ImuModel(signals)
@@ -176,7 +199,20 @@ class Signals:
         return IMU_CHANNELS if self.reference_rate is not None else IMU_CHANNELS[:2]
 
     def low_passed(self, samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
-        """A derivative of the low-passed samples without the margins."""
+        """A derivative of the low-passed samples without the margins.
+
+        Parameters
+        ----------
+        samples : array
+            (T,), real or complex.
+        order : int
+            Of the derivative by time; 0 for the samples themselves.
+
+        Returns
+        -------
+        array
+            Every ``smoothing.step``-th sample.
+        """
         return self.smoothing(samples, order, margin=self.margin)
 
     def as_rows(self, plane: ComplexArray, turn: FloatArray | None = None) -> FloatArray:
@@ -190,8 +226,23 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Signals of a recording; raises `DataError` where one is missing, short or has gaps,
-    `ConfigurationError` for too high a cut-off.
+    """Signals of a recording, unfiltered, with the filter and the margins that it needs.
+
+    Parameters
+    ----------
+    recording : Recording
+        With ax, ay, yaw_rate, vy_ref and vx_ref or vx; yaw_rate_ref, roll and pitch are used where
+        they are there.
+    settings : AlignmentSettings
+        Cut-off, largest delay and prior of the tilt, which decides whether roll and pitch are used.
+
+    Raises
+    ------
+    DataError
+        A channel is missing or has gaps, or the recording is too short.
+    ConfigurationError
+        The cut-off is too high for the recording's rate, or a delay has more samples than the
+        limit.
     """
     quantities = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
@@ -232,7 +283,18 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
 
 
 class ImuModel:
-    """Expected signals of the sensor, low-passed, and their derivatives by every parameter."""
+    """Expected signals of the sensor, low-passed, and their derivatives by every parameter.
+
+    The equation is that of `vehest.alignment.align`, with two terms for gravity by roll and pitch
+    that follow the acceleration: a gain and a lag in each axis. Velocities between samples come
+    from cubic splines. Without a yaw rate of the reference the sensor's own is used, without a
+    delay.
+
+    Parameters
+    ----------
+    signals : Signals
+        Of the recording; the splines are made once.
+    """
 
     def __init__(self, signals: Signals) -> None:
         self.signals = signals
@@ -248,7 +310,13 @@ class ImuModel:
         )
 
     def __call__(self, at: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Prediction (C, T) and its derivatives, name -> (C, T), at a set of parameters."""
+        """Prediction (C, T) and its derivatives, name -> (C, T), at a set of parameters.
+
+        Parameters
+        ----------
+        at : mapping
+            Name -> value in SI units, of all of `IMU_PARAMETERS` and `TILT_PRIOR`.
+        """
         low = self.signals.low_passed
         now = np.clip(self._clock - at["delay"], 0.0, self._clock[-1])
         v = self._velocity(now)
@@ -313,6 +381,7 @@ class ImuModel:
 
 
 def _axiswise(factors: complex, plane: ComplexArray) -> ComplexArray:
+    """Multiply the x and the y part of a complex signal by a factor each."""
     return factors.real * plane.real + 1j * factors.imag * plane.imag
 
 
@@ -465,8 +534,24 @@ def _most_likely(
 def require_condition(
     recording: Recording, information: FloatArray, names: Sequence[str], requested: Sequence[str]
 ) -> None:
-    """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number
+    """Refuse, by a `DataError`, parameters that the drive cannot distinguish: the condition number
     of the scaled problem is too large.
+
+    Parameters
+    ----------
+    recording : Recording
+        Named in the error.
+    information : FloatArray
+        (P, P), of the least-squares problem.
+    names : sequence of str
+        Of the P parameters.
+    requested : sequence of str
+        Those that the user asked for; others are called tilt in the error.
+
+    Raises
+    ------
+    DataError
+        The condition number exceeds MAX_CONDITION, or no signal depends on a parameter.
     """
     scale = np.sqrt(np.diag(information))
     silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
@@ -495,6 +580,11 @@ def require_condition(
 def condition_of(information: FloatArray) -> float:
     """Condition number of a least-squares problem whose columns are scaled to length 1; infinite
     where one is zero.
+
+    Parameters
+    ----------
+    information : FloatArray
+        (P, P), symmetric: columns times columns.
     """
     scale = np.sqrt(np.diag(information))
     values = (
@@ -578,7 +668,22 @@ def _noise(samples: FloatArray) -> float:
 
 
 def require_length(recording: Recording, usable: float, lost: float) -> None:
-    """Refuse, by a `DataError`, what is too short for an uncertainty."""
+    """Refuse, by a `DataError`, what is too short for an uncertainty.
+
+    Parameters
+    ----------
+    recording : Recording
+        Named in the error.
+    usable : float
+        Of the signals without margins [s].
+    lost : float
+        Margins at both ends together [s].
+
+    Raises
+    ------
+    DataError
+        Fewer than MIN_BLOCKS blocks of MIN_BLOCK_SECONDS would be left.
+    """
     min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
     if usable < min_seconds:
         requirement = (
@@ -591,7 +696,13 @@ def require_length(recording: Recording, usable: float, lost: float) -> None:
 
 
 def n_blocks(seconds: float) -> int:
-    """Number of blocks that a drive is divided into: longer ones for longer drives."""
+    """Number of blocks that a drive is divided into: longer ones for longer drives.
+
+    Returns
+    -------
+    int
+        From MIN_BLOCKS to N_BLOCKS, of at least MIN_BLOCK_SECONDS where the drive allows.
+    """
     return min(max(int(seconds / MIN_BLOCK_SECONDS), MIN_BLOCKS), N_BLOCKS)
 
 
@@ -604,6 +715,13 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     Source: Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to
     empirical practice, Journal of Econometrics 232 (2), 2023, section 3; blocks of a time series as
     clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
+
+    Parameters
+    ----------
+    fit : Fit
+        With errors and derivatives at the estimate.
+    blocks : int
+        Number of blocks, of nearly equal length.
     """
     information = fit.information
     edges = np.linspace(0, fit.error.shape[1], blocks + 1).astype(int)
@@ -714,6 +832,17 @@ class Smoothing:
     ) -> NDArray[Any]:
         """A derivative of the low-passed samples (T,), real or complex, from ``margin`` (at least
         the reach) to as many before the end.
+
+        Parameters
+        ----------
+        samples : array
+            (T,), without gaps.
+        order : int
+            Of the derivative by time.
+        margin : int
+            Samples at either end that are not returned.
+        step : int
+            Every how many samples one is kept; 0 for the filter's own step.
         """
         if np.iscomplexobj(samples):  # faster than a real kernel on complex samples
             ahead, aside = (
@@ -735,6 +864,16 @@ class Smoothing:
     def kernel(self, order: int) -> FloatArray:
         """Impulse response of a derivative of the low-pass; its norm is the deviation that white
         noise of deviation 1 has after it.
+
+        Parameters
+        ----------
+        order : int
+            0 for the low-pass itself.
+
+        Returns
+        -------
+        FloatArray
+            (2·reach + 1,), in 1/s to the power of ``order``.
         """
         impulse = np.zeros(2 * self.reach + 1)
         impulse[self.reach] = 1.0
@@ -745,8 +884,19 @@ class Smoothing:
 
 
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
-    """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to
-    be sampled, or longer than the limit.
+    """The filter of -3 dB at a frequency.
+
+    Parameters
+    ----------
+    recording : Recording
+        For its rate.
+    cutoff_hz : float
+        [Hz].
+
+    Raises
+    ------
+    ConfigurationError
+        The kernel is too narrow to be sampled, or longer than the limit.
     """
     length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
     subject = (
@@ -765,7 +915,17 @@ def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
 
 
 def require_complete(recording: Recording, names: Sequence[str], quantities: str) -> None:
-    """Refuse, by a `DataError`, channels that are not there or have gaps."""
+    """Refuse, by a `DataError`, channels that are not there or have gaps.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording.
+    names : sequence of str
+        Channels that are needed.
+    quantities : str
+        What they are needed for, in the error.
+    """
     for name in names:
         if np.isnan(recording[name]).any():
             raise DataError(
@@ -775,4 +935,5 @@ def require_complete(recording: Recording, names: Sequence[str], quantities: str
 
 
 def _deviation(cutoff_hz: float, rate_hz: float) -> float:
+    """Standard deviation [samples] of the Gaussian kernel that is at -3 dB at a frequency [Hz]."""
     return math.sqrt(math.log(2.0)) / (2.0 * math.pi * cutoff_hz) * rate_hz

@@ -47,6 +47,12 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
     fitted again until next to nothing is left, since turning the phase of a segment does not shift
     its ends.
 
+    Parameters
+    ----------
+    motion : Motion
+        With ay, yaw rate, speed and lateral velocity; it is averaged down to about
+        MIN_AVERAGED_RATE_HZ.
+
     Returns
     -------
     tuple of Measured, or None

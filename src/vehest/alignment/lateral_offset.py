@@ -27,6 +27,17 @@ def lateral_offset(motion: Motion) -> Measured | None:
     The gain g holds the gravity that roll lets in, which is no offset in a drive of left turns
     only. Without a lateral velocity its derivative counts as nil, which its mean is in any drive
     that is not short.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a speed, ay and the yaw rate.
+
+    Returns
+    -------
+    Measured or None
+        None where a channel is missing, the drive is too short, or fewer than MIN_BLOCKS blocks of
+        BLOCK_SECONDS are left.
     """
     settled = settled_samples(motion)
     if settled is None or not motion.speed or not {"ay", "yaw_rate"} <= set(motion.channels):
@@ -48,6 +59,7 @@ def lateral_offset(motion: Motion) -> Measured | None:
 
 
 def _intercept(sums: FloatArray) -> FloatArray:
+    """Intercept of a straight line from sums of 1, x, y, x² and xy; NaN where x does not vary."""
     number, turning, left, squared, product = sums.tolist()
     determinant = number * squared - turning * turning
     return np.array(
@@ -56,7 +68,19 @@ def _intercept(sums: FloatArray) -> FloatArray:
 
 
 def offset_findings(motion: Motion) -> list[Finding]:
-    """A note of an offset beyond a level mounting, a warning of one beyond any road."""
+    """A note of an offset beyond a level mounting, a warning of one beyond any road.
+
+    Parameters
+    ----------
+    motion : Motion
+        Channels whose signs and units are right.
+
+    Returns
+    -------
+    list of Finding
+        At most one. An offset of ay cannot be told from an inclined sensor or road, nor, at about
+        one speed, from an offset of the yaw rate; the message states both.
+    """
     offset = lateral_offset(motion)
     if (
         offset is None

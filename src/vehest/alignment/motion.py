@@ -78,7 +78,18 @@ class Motion:
         return np.asarray(np.mean([self[name] for name in WHEELS], axis=0), dtype=np.float64)
 
     def derivative(self, samples: FloatArray) -> FloatArray:
-        """By time, with central differences, which delay nothing."""
+        """By time, with central differences, which delay nothing.
+
+        Parameters
+        ----------
+        samples : FloatArray
+            (T,), without gaps.
+
+        Returns
+        -------
+        FloatArray
+            (T,), per second; one-sided differences at both ends, zeros for a single sample.
+        """
         return (
             np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64)
             if len(samples) > 1
@@ -86,7 +97,18 @@ class Motion:
         )
 
     def slower(self, factor: int) -> Motion:
-        """Means of so many samples each, at a rate that is so many times slower."""
+        """Means of so many samples each, at a rate that is so many times slower.
+
+        Parameters
+        ----------
+        factor : int
+            At least 1; samples at the end that do not fill a mean are dropped.
+
+        Returns
+        -------
+        Motion
+            ``moving`` where all samples of a mean are.
+        """
         if factor == 1:
             return self
         count = len(self) // factor
@@ -110,8 +132,20 @@ class Motion:
 
 
 def motion_of(recording: Recording, moving: BoolArray) -> Motion:
-    """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``:
-    where the car does not stand.
+    """Channels of a recording that are complete, or nearly, and not larger than a wrong unit
+    explains.
+
+    Parameters
+    ----------
+    recording : Recording
+        Channels with a few gaps (MAX_MISSING_SHARE) are bridged by lines, others left out.
+    moving : BoolArray
+        Where the car does not stand, (T,).
+
+    Returns
+    -------
+    Motion
+        Its speed is vx_ref, else vx; its lateral velocity vy_ref, else that of sideslip_ref.
     """
     channels = {
         name: complete
@@ -126,6 +160,9 @@ def motion_of(recording: Recording, moving: BoolArray) -> Motion:
 
 
 def _bridged(recording: Recording, name: str) -> FloatArray | None:
+    """Samples of a channel without gaps; None where too many are missing, or one is beyond
+    MAX_EXCESS times what is possible.
+    """
     samples = recording[name]
     described = CHANNELS[name]
     unknown = np.isnan(samples) if name in recording.gappy else None

@@ -64,7 +64,13 @@ class AlignmentSettings:
             )
 
     def cutoff_at(self, rate_hz: float) -> float:
-        """-3 dB frequency of the low-pass [Hz]: as set, 2 Hz, or what a rate below 23 Hz allows."""
+        """-3 dB frequency of the low-pass [Hz]: as set, 2 Hz, or what a rate below 23 Hz allows.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the recording [Hz].
+        """
         if self.cutoff_hz is not None:
             return self.cutoff_hz
         return min(DEFAULT_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz)

@@ -1,4 +1,9 @@
-"""Signs and units: products of channels that contradict each other, and which one is wrong."""
+"""Signs and units: products of channels that contradict each other, and which one is wrong.
+
+Flow: motion -> relations that the drive shows clearly (two quantities that must be equal) ->
+signs: the smallest set of channels whose reversal makes all correlations positive -> units: the
+known factor that explains most wrong scales and breaks no right one -> findings.
+"""
 
 from __future__ import annotations
 
@@ -70,20 +75,45 @@ class Relation:
         return f"{self.left} vs. {self.right}"
 
     def holds(self, scale: float) -> bool:
-        """Whether left over right could be such."""
+        """Whether left over right could be such.
+
+        Parameters
+        ----------
+        scale : float
+            Left over right.
+
+        Returns
+        -------
+        bool
+            Also true where the correlation is too low for the scale to be known.
+        """
         return (
             abs(self.correlation) < self.least_correlation
             or 1.0 / self.tolerance < abs(scale) < self.tolerance
         )
 
     def without(self, channel: str, factor: float) -> float:
-        """Left over right, were a channel not that factor too large."""
+        """Left over right, were a channel not that factor too large.
+
+        A channel that the relation does not contain changes nothing.
+        """
         power = dict(zip(self.channels, self.powers, strict=True)).get(channel, 0)
         return float(self.scale / factor**power)
 
 
 def relations_of(motion: Motion) -> list[Relation]:
-    """All relations between the channels that the drive shows clearly."""
+    """All relations between the channels that the drive shows clearly.
+
+    Parameters
+    ----------
+    motion : Motion
+        Channels without gaps.
+
+    Returns
+    -------
+    list of Relation
+        Lateral ones first, then steering, longitudinal, and quantities that are measured twice.
+    """
     relations = [
         relation
         for relations_between in (_lateral, _steered, _longitudinal, _repeated)
@@ -219,7 +249,11 @@ def _related(
     min_correlation: float = MIN_STEADY_CORRELATION,
     **limits: float,
 ) -> Iterator[Relation]:
-    """The relation of two signals, about nil, whose correlation is ``least`` at least."""
+    """The relation of two signals, about nil, whose correlation is ``least`` at least.
+
+    The scale is the ratio of root mean squares with the sign of the correlation, not a regression's
+    slope, which noise would shrink.
+    """
     sizes = rms(measured), rms(expected)
     if 0.0 < min(sizes) <= max(sizes) < np.inf:
         correlation = float(np.mean(measured / sizes[0] * (expected / sizes[1])))
@@ -244,6 +278,16 @@ def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
 def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
     """The band-pass of all comparisons with a derivative, which keeps moving samples away from the
     ends; None for a short drive.
+
+    Parameters
+    ----------
+    motion : Motion
+        For its rate and where the car moves.
+
+    Returns
+    -------
+    callable or None
+        Samples (T,) -> filtered samples at the settled places, without phase.
     """
     settled = settled_samples(motion)
     if settled is None:
@@ -255,6 +299,11 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
 def settled_samples(motion: Motion) -> BoolArray | None:
     """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or
     the rate too low.
+
+    Returns
+    -------
+    BoolArray or None
+        (T,); at least MIN_SETTLED_SECONDS of samples.
     """
     if motion.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
         return None
@@ -274,6 +323,18 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
     The lateral velocity and the sideslip angle come from one sensor: reversed together they count
     once. A forward speed is only suspected where it is negative, which the check ``reverse`` speaks
     of.
+
+    Parameters
+    ----------
+    relations : sequence of Relation
+        With the signs of their correlations.
+    motion : Motion
+        For its speed.
+
+    Returns
+    -------
+    list of tuple of str
+        Also sets with one channel more than the smallest; at most MAX_REVERSED_CHANNELS in each.
     """
     if all(relation.correlation > 0.0 for relation in relations):
         return []
@@ -302,6 +363,21 @@ def sign_findings(
 ) -> list[Finding]:
     """Contradictions in sign, with `turned_channels`, and the channel that points the other way
     where steering or heading decides.
+
+    Parameters
+    ----------
+    relations : sequence of Relation
+        All that the drive shows.
+    motion : Motion
+        For its speed.
+    explanations : sequence of tuple of str
+        As `turned_channels` returns them.
+
+    Returns
+    -------
+    list of Finding
+        A warning of each channel that is reversed, or one without a channel, with suspects, where
+        the drive does not decide.
     """
     against = [relation for relation in relations if relation.correlation < 0.0]
     if not against:
@@ -363,7 +439,13 @@ class UnitMistake(NamedTuple):
 
 
 def unit_mistakes() -> Iterator[UnitMistake]:
-    """All mistakes that are looked for."""
+    """All mistakes that are looked for.
+
+    Yields
+    ------
+    UnitMistake
+        For each channel of ALTERNATIVE_UNITS: other unit read as SI, and SI read as the other.
+    """
     for channel, (factor, unit, si) in ALTERNATIVE_UNITS.items():
         yield UnitMistake(channel, factor, unit, si)
         yield UnitMistake(channel, 1.0 / factor, si, unit)
@@ -406,6 +488,11 @@ class WrongUnit:
 def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
     """The wrong unit that explains most of the scales that are wrong and breaks none that is right;
     None if all are right.
+
+    Parameters
+    ----------
+    relations : sequence of Relation
+        All that the drive shows; scales are compared by their magnitude.
     """
     wrong = [relation for relation in relations if not relation.holds(relation.scale)]
     if not wrong:
@@ -433,4 +520,5 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
 
 
 def _together(names: Sequence[str]) -> str:
+    """Names as a clause, with ``together`` where there are several."""
     return names[0] if len(names) == 1 else f"{listed(names)} together"

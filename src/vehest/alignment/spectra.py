@@ -58,7 +58,18 @@ class CrossSpectra:
         return np.asarray(self.groups.sum(axis=0), dtype=np.complex128)
 
     def combined(self, combinations: Mapping[str, Mapping[str, float]]) -> CrossSpectra:
-        """Spectra of sums of the signals: name -> signal -> factor."""
+        """Spectra of sums of the signals: name -> signal -> factor.
+
+        Parameters
+        ----------
+        combinations : mapping
+            New name -> old name -> real factor.
+
+        Returns
+        -------
+        CrossSpectra
+            Of the new signals alone.
+        """
         rows = np.array(
             [[factors.get(name, 0.0) for name in self.names] for factors in combinations.values()]
         )
@@ -77,8 +88,9 @@ def cross_spectra(
     Parameters
     ----------
     signals : mapping of str to (T,)
+        Name -> samples, all of one length and clock, without gaps.
     rate_hz : float
-        Sampling rate.
+        Sampling rate [Hz].
     selected : (T,) of bool, optional
         Only segments whose samples are all selected count.
 
@@ -154,6 +166,18 @@ class Measured:
 def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
     """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after
     another (Student's).
+
+    Parameters
+    ----------
+    groups : array
+        (G, ...), of which the fit takes a sum.
+    fit : callable
+        Sum -> (P,).
+
+    Returns
+    -------
+    list of Measured
+        P values at the sum of all groups, with 95 % intervals of G - 1 degrees of freedom.
     """
     total = groups.sum(axis=0)
     number = len(groups)
@@ -169,7 +193,13 @@ def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -
 
 
 def student(freedom: float) -> float:
-    """Half width of the 95 % interval in standard deviations."""
+    """Half width of the 95 % interval in standard deviations.
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom; infinite for the normal distribution.
+    """
     return float(scipy.special.stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE))
 
 
@@ -195,6 +225,7 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     Parameters
     ----------
     spectra : CrossSpectra
+        Of both signals, as `cross_spectra` makes them.
     source, follower : str
         Names of the signals.
     low_pass : bool
@@ -245,6 +276,9 @@ def smoothed(values: FloatArray) -> FloatArray:
 
 
 def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
+    """Delay and time constant [s] of the best point of a grid, by the real part of the weighted
+    cross-spectrum once both are compensated for.
+    """
     delays = np.linspace(-MAX_LAG_SECONDS, MAX_LAG_SECONDS, 41)
     constants = (
         np.concatenate([[0.0], np.geomspace(0.05, MAX_TIME_CONSTANT_SECONDS, 15)])
@@ -261,7 +295,19 @@ def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[
 def _refined(
     cross: ComplexArray, omega: FloatArray, start: tuple[float, float], *, low_pass: bool
 ) -> tuple[float, float]:
-    """Gauss-Newton on the weighted phase; the time constant cannot be negative."""
+    """Gauss-Newton on the weighted phase; the time constant cannot be negative.
+
+    Parameters
+    ----------
+    cross : ComplexArray
+        Weighted cross-spectrum, (F,).
+    omega : FloatArray
+        Angular frequency [rad/s], (F,).
+    start : tuple of float
+        Delay and time constant [s].
+    low_pass : bool
+        Whether the time constant is free; it stays at its start otherwise.
+    """
     delay, constant = start
     size = np.abs(cross)
     for _ in range(N_STEPS):

@@ -19,6 +19,16 @@ MAX_STANDSTILL_SHAKING = 0.3  # m/s²
 def standstill(recording: Recording) -> BoolArray:
     """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate
     nor accelerations speak of motion.
+
+    Parameters
+    ----------
+    recording : Recording
+        Without ``vx`` the car counts as moving throughout.
+
+    Returns
+    -------
+    BoolArray
+        Decided run by run of slow samples: one that shakes or turns is moving as a whole.
     """
     is_standing = np.zeros(len(recording), dtype=bool)
     if "vx" not in recording:

@@ -66,10 +66,15 @@ class StagePlan:
         }
 
     @property
-    def key(self) -> str:
-        """Hash of what determines the content, without options that have their defaults."""
+    def keyed_content(self) -> dict[str, Any]:
+        """What determines the content, without options that have their defaults."""
         config = self.config if self.key_config is None else self.key_config
-        return hash_of({**self.content, "config": config})
+        return {**self.content, "config": config}
+
+    @property
+    def key(self) -> str:
+        """Hash of what determines the content."""
+        return hash_of(self.keyed_content)
 
     @property
     def folder(self) -> Path:
@@ -159,6 +164,17 @@ def valid_artefact(
 
     None where it is missing, damaged (which ``warn`` is told), interrupted or of another key.
     ``hash_files`` is that of `read_artefact`.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the artefact.
+    key : str
+        That it must have, all 64 digits.
+    warn : callable
+        Takes one line.
+    hash_files : bool
+        Whether to compare digests too.
     """
     try:
         artefact = read_artefact(folder, hash_files=hash_files)
@@ -175,6 +191,8 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
 
     Parameters
     ----------
+    folder : Path
+        Of the artefact.
     hash_files : bool
         Whether digests are compared too, and not lengths alone: for every use of what a file holds.
 
@@ -290,6 +308,19 @@ def ensured(
     """Make an artefact under its lock, or take the one that another process made meanwhile.
 
     None if ``should_stop`` ended the wait for that process; raises as `make` does.
+
+    Parameters
+    ----------
+    plan : StagePlan
+        What is to be made.
+    write : callable
+        Fills the folder, as of `make`.
+    force : bool
+        Make it anew although it is there.
+    should_stop : callable
+        Whether to end the wait for another process.
+    on_wait : callable
+        Takes who holds the lock.
     """
     with held(plan.lock, should_stop, on_wait) as mine:
         if not mine:

@@ -42,7 +42,13 @@ def changed_keys(recorded: Keys, today: Keys) -> list[tuple[str, str]]:
 
 
 def hash_of(content: Any) -> str:
-    """SHA-256 of plain values, in hexadecimal digits."""
+    """SHA-256 of plain values, in hexadecimal digits.
+
+    Parameters
+    ----------
+    content : Any
+        What JSON holds; other values count by their text. The order of keys does not matter.
+    """
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -81,6 +87,7 @@ def _changed(value: Any, default: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
+    """A value with mappings, lists and settings inside as plain ones."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

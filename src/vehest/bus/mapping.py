@@ -41,13 +41,32 @@ def from_dataset(
     optional: Sequence[str] = (),
     dbc: Path | None = None,
 ) -> BusSignals:
-    """Signals that a data set of the source ``can`` declares for the ``required`` channels.
+    """Signals that a data set of the source ``can`` declares for the channels of a model.
 
-    ``optional`` are those of them that may be missing; ``dbc`` takes the place of the data set's.
+    Parameters
+    ----------
+    dataset : mapping
+        Configuration of the data set.
+    required : sequence of str
+        Channels that the model reads.
+    optional : sequence of str
+        Those of them that may be missing.
+    dbc : Path or None
+        Takes the place of the data set's.
 
-    Raises `ConfigurationError`: the data set is of another source, or declares no such channel.
-    Raises `MissingError`: there is no DBC. Raises `DataError`: it cannot be used, lacks a signal,
-    or contradicts a declared unit.
+    Returns
+    -------
+    BusSignals
+        Factors contain sign, factor and unit of each channel's declaration; offsets are the DBC's.
+
+    Raises
+    ------
+    ConfigurationError
+        The data set is of another source, or declares no such channel.
+    MissingError
+        There is no DBC.
+    DataError
+        The DBC cannot be used, lacks a signal, or contradicts a declared unit.
     """
     location = f"data set '{dataset.get('name')}'"
     declared = dataset.get("channels") or {}
@@ -93,12 +112,25 @@ def from_dataset(
 def from_names(
     dbc: Path, required: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()
 ) -> BusSignals:
-    """Signals that ``words`` name, such as ``ay=-IMU.AccLat:g``, and those that are called like
-    channels, in the units of the DBC.
+    """Signals that words name, and those that are called like channels, in the units of the DBC.
 
-    Raises `ConfigurationError`: a word that cannot be understood, a unit that is not known, or a
-    channel without a signal. Raises `MissingError`: there is no DBC. Raises `DataError`: it cannot
-    be used, or lacks a signal.
+    Parameters
+    ----------
+    dbc : Path
+        Describes the bus.
+    required, optional : sequence of str
+        Channels that the model reads, and those of them that may be missing.
+    words : sequence of str
+        Such as ``ay=-IMU.AccLat:g``: sign, message, signal and unit.
+
+    Raises
+    ------
+    ConfigurationError
+        A word cannot be understood, a unit is not known, or a channel has no signal.
+    MissingError
+        There is no DBC.
+    DataError
+        The DBC cannot be used, or lacks a signal.
     """
     entries = dict(map(_entry, words))
     if unknown := sorted(set(entries) - set(required)):
@@ -153,6 +185,7 @@ def _entry(word: str) -> tuple[str, dict[str, Any]]:
 def _require_channels(
     required: Sequence[str], optional: Sequence[str], available: Mapping[str, Any], fix: str
 ) -> None:
+    """Refuse, by a `ConfigurationError`, a channel that is neither available nor optional."""
     for name in required:
         if name not in available and name not in optional:
             raise ConfigurationError(f"the model reads channel '{name}', and {fix}")

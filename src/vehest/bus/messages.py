@@ -56,7 +56,15 @@ VAL_ {band} SideslipAngleBand 1048575 "not available" ;
 def dbc_text(first_id: int = FIRST_ID) -> str:
     """The DBC of vehest's two messages, whose identifiers follow each other.
 
-    Raises `ConfigurationError`: they are no standard identifiers.
+    Parameters
+    ----------
+    first_id : int
+        Standard identifier (11 bits) of the estimates; the bands have the next one.
+
+    Raises
+    ------
+    ConfigurationError
+        They are no standard identifiers.
     """
     if not 0 < first_id <= LAST_STANDARD_ID:
         raise ConfigurationError(
@@ -88,6 +96,18 @@ class EstimateFrames:
     def __call__(self, values: Mapping[str, float], stamp: float) -> list[Any]:
         """The two frames of an estimate as `vehest.trust.contract.GuardedStepper.step` returns it,
         stamped [s]; angles are in degrees.
+
+        Parameters
+        ----------
+        values : mapping
+            Quantity -> value in SI units; missing ones are sent as not available.
+        stamp : float
+            Of both frames [s].
+
+        Returns
+        -------
+        list of can.Message
+            Estimate and bands, with the same alive counter, which goes up by one with each call.
         """
         named = {
             "LateralVelocity": values.get("vy", math.nan),
@@ -117,6 +137,19 @@ def raw_value(value: float, signal: Any) -> int:
     """The nearest raw value of a signal of cantools, cut off at what it can hold.
 
     For NaN the one that says that there is none.
+
+    Parameters
+    ----------
+    value : float
+        In the signal's unit.
+    signal : cantools.database.Signal
+        With scale, length and whether it is signed; its offset is zero.
+
+    Returns
+    -------
+    int
+        The smallest raw value of a signed signal, and the largest of an unsigned one, are kept for
+        NaN.
     """
     largest = (1 << signal.length - signal.is_signed) - 1
     if math.isnan(value):

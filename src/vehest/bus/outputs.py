@@ -20,10 +20,17 @@ TRAILING_COLUMNS = ("band_vy", "band_sideslip", "health", "health_reason")
 
 
 def output_files(path: Path | None) -> list[Path]:
-    """Files that an output writes: a table, or a log of frames with its DBC beside it; none without
-    a path.
+    """Files that an output writes: a table, or a log of frames with its DBC beside it.
 
-    Raises `ConfigurationError`: the path ends in neither ``.csv`` nor ``.asc``.
+    Parameters
+    ----------
+    path : Path or None
+        None: nothing is written.
+
+    Raises
+    ------
+    ConfigurationError
+        The path ends in neither ``.csv`` nor ``.asc``.
     """
     if path is not None and path.suffix.lower() not in (".csv", ".asc"):
         raise ConfigurationError(f"'{path}' must end in .csv or .asc")
@@ -41,7 +48,21 @@ class Output:
 
     A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and
     ``sampled``, the instant of the sample. A log has the frames of estimates as they came off the
-    bus. Raises `MissingError`: a file cannot be written.
+    bus.
+
+    Parameters
+    ----------
+    path : Path or None
+        ``.csv`` or ``.asc``; None: nothing is written.
+    names : sequence of str
+        Quantities that estimates may have.
+    first_id : int
+        Identifier of the estimates, for the DBC.
+
+    Raises
+    ------
+    MissingError
+        A file cannot be written.
     """
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
@@ -69,6 +90,15 @@ class Output:
     def estimate(self, time: float, sampled: float, values: Mapping[str, float]) -> None:
         """Write an estimate that holds for ``time``, of the sample at ``sampled``, on the bus's
         clock [s].
+
+        Parameters
+        ----------
+        time : float
+            For which the estimate holds; later than the sample for a model that predicts.
+        sampled : float
+            Instant of the sample.
+        values : mapping
+            Quantity -> value in SI units, health and its reason.
         """
         if self._table is not None:
             cells = [number_cell(values.get(name, math.nan)) for name in self._names]
@@ -80,6 +110,7 @@ class Output:
             self._row([time_cell(time), time_cell(sampled), *cells, *health, *angles])
 
     def _row(self, cells: list[str]) -> None:
+        """Write a row of the table; raises `MissingError` where it cannot be written."""
         with writing(self._path):
             csv.writer(self._table, lineterminator="\n").writerow(cells)
 

@@ -44,8 +44,22 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Ti
     """Timing of a bus from the first seconds of a log, and from further on for signals that come
     later.
 
-    Raises `DataError`: it cannot be used, a signal never occurs, or its stamps span more samples
-    than the limits allow. Raises `ConfigurationError`: the rate is none.
+    Parameters
+    ----------
+    log : Frames
+        The log.
+    signals : BusSignals
+        Signals that count.
+    rate_hz : float or None
+        Of the samples [Hz]; None: that of the fastest channel.
+
+    Raises
+    ------
+    DataError
+        The log cannot be used, a signal never occurs, stamps repeat or go back, or they span more
+        samples than the limits allow.
+    ConfigurationError
+        The rate is none.
     """
     stamps = {name: array("d") for name in signals.by_channel}
     first = math.inf
@@ -84,7 +98,10 @@ class Bus:
     def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
         """The sender's end of the bus, and the control unit's, which hears the messages only.
 
-        Raises `MissingError`: it cannot be opened.
+        Raises
+        ------
+        MissingError
+            It cannot be opened.
         """
         import can
 
@@ -161,13 +178,18 @@ class Replay:
         out: Path | None,
         view: View,
     ) -> Figures:
-        """Estimate at the rate of the samples; the first stepper is for warming up.
+        """Estimate at the rate of the samples, into ``out`` (a table or a log of frames), and
+        return the figures, also of a replay that was stopped.
 
         ``make_stepper`` takes the clock that judges the stamps of frames; None in real time, where
-        the receiver's clock stamps them.
+        the receiver's clock stamps them. Its first stepper is for warming up.
 
-        Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or
-        ``out`` not be written.
+        Raises
+        ------
+        DataError
+            The log is damaged.
+        MissingError
+            The bus cannot be opened, or ``out`` not be written.
         """
         names = warmed_up(make_stepper(None), self.timing.rate_hz, tuple(self.signals.by_channel))
         self.stepper = make_stepper(self.clock if self.bus.speed is None else None)
@@ -189,6 +211,9 @@ class Replay:
         return self.figures
 
     def _as_fast_as_possible(self, frames: Iterable[Any]) -> None:
+        """Send frame after frame, and let the control unit receive each at once, by the log's
+        stamps.
+        """
         for frame in frames:
             if self.stopped():
                 return
@@ -198,6 +223,9 @@ class Replay:
         self._advance(self.last + self.sampler.cycle)
 
     def _in_real_time(self, frames: Iterator[Any]) -> None:
+        """Receive in this thread while another sends; an error of the sender is raised at the
+        end.
+        """
         head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
         all_frames = chain([head] if head else [], frames)
@@ -248,6 +276,7 @@ class Replay:
             self.over.set()
 
     def _send(self, frame: Any) -> None:
+        """Put a frame of the car on the bus, and take what the control unit has sent."""
         self.sender.send(frame)
         self.figures.frames_sent += 1
         self.last = frame.timestamp
@@ -313,6 +342,7 @@ class Replay:
             self._deal_with(sample)
 
     def _deal_with(self, sample: Sample) -> None:
+        """Estimate a sample, and count how long it took."""
         started = time.perf_counter()
         self._estimate(sample)
         took = (
@@ -324,6 +354,9 @@ class Replay:
         self.view.show(self.figures, self.stepper.last, sample.time - self.first)
 
     def _estimate(self, sample: Sample) -> None:
+        """Step the model; a new estimate is sent as frames and written. A sample without any value
+        is passed as None.
+        """
         last = self.stepper.last
         values = self.stepper.step(sample.values or None)
         if values is not last:
@@ -333,6 +366,9 @@ class Replay:
             self.output.estimate(sample.time + self.ahead, sample.time, values)
 
     def _count(self, sample: Sample, took: float) -> None:
+        """Count a sample, its missing channels and, where it took longer than a cycle, a missed
+        deadline.
+        """
         figures = self.figures
         cycle = self.sampler.cycle
         figures.seconds = figures.samples * cycle
@@ -348,6 +384,15 @@ def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]
     """Step until everything is compiled and loaded.
 
     Returns the names of what the steps returned, in their order.
+
+    Parameters
+    ----------
+    stepper : GuardedStepper
+        Thrown away afterwards.
+    rate_hz : float
+        Of the samples [Hz].
+    channels : tuple of str
+        Channels of a sample; made-up values of a slow straight drive.
     """
     model = stepper.estimator
     names: dict[str, None] = {}

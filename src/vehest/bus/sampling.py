@@ -25,7 +25,7 @@ from vehest.sources.clocks import mean_step, plain_rate
 GAIN = 0.02
 # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
 MAX_PERIOD_DEVIATION = 0.05
-ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is taken for it
+ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is assumed to be it
 STAMP_TOLERANCE = 1e-9  # s
 
 
@@ -42,10 +42,24 @@ class Timing:
 
 
 def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) -> Timing:
-    """Timing of a bus from channel -> times of its frames [s], at least two each, at ``rate_hz``,
-    by default that of the fastest channel.
+    """Timing of a bus from the times of its frames.
 
-    Raises `ConfigurationError`: a rate that is no rate.
+    Parameters
+    ----------
+    stamps : mapping
+        Channel -> times of its frames [s], ascending, at least two each.
+    rate_hz : float or None
+        Of the samples [Hz]; by default that of the fastest channel, as a plain rate.
+
+    Returns
+    -------
+    Timing
+        Instants lie in the middle of the longest pause of a cycle.
+
+    Raises
+    ------
+    ConfigurationError
+        A rate that is no rate, or stamps that repeat.
     """
     periods = {name: mean_step(np.diff(times)) for name, times in stamps.items()}
     clock = min(periods, key=lambda name: periods[name])
@@ -87,7 +101,17 @@ def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
 
 
 def check_samples(first: float, last: float, rate_hz: float, location: str) -> None:
-    """Refuse, by a `DataError`, stamps [s] so far apart that too many samples lie between them."""
+    """Refuse, by a `DataError`, stamps [s] so far apart that too many samples lie between them.
+
+    Parameters
+    ----------
+    first, last : float
+        Stamps [s].
+    rate_hz : float
+        Of the samples [Hz].
+    location : str
+        Begins the error.
+    """
     n_samples = (last - first) * rate_hz
     fault = f"from {first:.12g} s to {last:.12g} s at {rate_hz:.6g} Hz"
     remedy = "remove a frame with a stray stamp"
@@ -108,6 +132,11 @@ class Sampler:
     """Forms samples; frames are to come in the order of their stamps.
 
     ``next_time`` is the instant of the next sample [s].
+
+    Parameters
+    ----------
+    timing : Timing
+        Rate, periods and phase of the bus.
     """
 
     def __init__(self, timing: Timing) -> None:
@@ -139,7 +168,12 @@ class Sampler:
     def samples_before(self, now: float) -> Iterator[Sample]:
         """Samples whose instant lies before ``now`` [s].
 
-        Raises `DataError`: a time so far ahead that they would be more than the limits allow.
+        The instant of the next sample moves on with each one that is taken.
+
+        Raises
+        ------
+        DataError
+            The time is so far ahead that they would be more than the limits allow.
         """
         check_samples(self.next_time, now, self.timing.rate_hz, "the bus")
         while self.next_time < now:
@@ -151,7 +185,11 @@ class Sampler:
         self.next_time += cycles * self.cycle
 
     def sample(self) -> Sample:
-        """The sample at ``next_time``, which moves on by a cycle."""
+        """The sample at ``next_time``, which moves on by a cycle.
+
+        A value is fresh for as long as its channel's period, or a cycle if that is longer; older
+        ones and NaN are missing.
+        """
         time = self.next_time
         fresh = {
             name: value

@@ -74,6 +74,7 @@ class View:
 def _with_band(
     values: Mapping[str, float], name: str, factor: float, unit: str, digits: int
 ) -> str:
+    """A value with the half width of its band, in a display unit; a dash where there is none."""
     value = values.get(name, math.nan)
     band = values.get(f"band_{name}", math.nan)
     if math.isnan(value):

@@ -350,7 +350,13 @@ def _option_names() -> dict[str, list[str]]:
 
 @lru_cache(maxsize=4096)
 def parsed(text: str) -> Override:
-    """An override, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
+    """An override, read in Hydra's grammar; raises `ConfigurationError` for bad syntax.
+
+    Parameters
+    ----------
+    text : str
+        ``KEY=VALUE``, ``+KEY=VALUE``, ``++KEY=VALUE`` or ``~KEY``.
+    """
     try:
         override = OverridesParser.create().parse_override(text)
         # a choice called nan or inf
@@ -382,6 +388,11 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
     """All combinations of overrides with several values, the last one varying fastest.
 
     `ConfigurationError` above ``limits.jobs``.
+
+    Returns
+    -------
+    list of list of str
+        Overrides with a single value each.
     """
     check_jobs(count(overrides), "these overrides stand")
     return [list(job) for job in product(*map(_values, map(parsed, overrides)))]
@@ -415,7 +426,13 @@ def check_jobs(number: int, subject: str) -> None:
 
 
 def limits_of(overrides: Sequence[str]) -> Limits:
-    """The limits of conf/common.yaml, changed by overrides."""
+    """The limits of conf/common.yaml, changed by overrides.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Those with another key than ``limits`` do not count.
+    """
     overrides_of_limits = list(
         dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits")
     )
@@ -442,6 +459,13 @@ def close_key(key: str, config: Any) -> str:
     """The dotted key of a configuration that is spelt most like an unknown one; empty if none.
 
     A key without its group, such as ``n_local``, is looked for in all groups.
+
+    Parameters
+    ----------
+    key : str
+        Dotted, as the user wrote it.
+    config : Any
+        Nested mappings; anything else has no keys.
     """
     group, _, subkey = key.partition(".")
     if not isinstance(config, dict):
@@ -495,7 +519,10 @@ def as_yaml(config: Config) -> str:
 def positive_rate(value: Any, name: str) -> float:
     """A rate [Hz] of a configuration.
 
-    Raises `ConfigurationError` unless it is a positive number.
+    Raises
+    ------
+    ConfigurationError
+        It is no positive number.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
         raise ConfigurationError(
@@ -505,7 +532,15 @@ def positive_rate(value: Any, name: str) -> float:
 
 
 def missing_keys(config: Any, prefix: str = "") -> list[str]:
-    """Dotted keys that still hold ``???``."""
+    """Dotted keys that still hold ``???``.
+
+    Parameters
+    ----------
+    config : Any
+        Plain nested values.
+    prefix : str
+        Dotted name of ``config``, ending in a dot; empty at the top.
+    """
     if isinstance(config, dict):
         return [
             missing_key
@@ -516,4 +551,5 @@ def missing_keys(config: Any, prefix: str = "") -> list[str]:
 
 
 def _shortened(text: Any) -> str:
+    """A text, cut off after 80 characters where it is longer than 100."""
     return str(text) if len(str(text)) <= 100 else f"{text[:80]}…"

@@ -29,7 +29,18 @@ class EstimateOptions:
 
 
 def estimate_options(overrides: Sequence[str]) -> EstimateOptions:
-    """Compose conf/estimate.yaml with overrides; raises `ConfigurationError`."""
+    """Compose conf/estimate.yaml with overrides.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Of the command; those of ``estimator`` are settings of a model that is opened later.
+
+    Raises
+    ------
+    ConfigurationError
+        An override, or a value, is wrong.
+    """
     config = compose_config("estimate", overrides)
     same_vehicle = config["same_vehicle"]
     if same_vehicle is not None and not isinstance(same_vehicle, bool):

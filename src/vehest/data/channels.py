@@ -40,6 +40,9 @@ class Channel:
 
 
 def _table() -> dict[str, Channel]:
+    """Every channel by its name, those of the four wheels spelt out, in the order of the
+    documentation.
+    """
     corners = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
     rows = [
         Channel("vx", "m/s", "measured forward velocity at the centre of gravity", -40.0, 140.0),

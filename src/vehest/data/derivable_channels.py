@@ -65,7 +65,25 @@ def derivation_of(
 ) -> Derivation | None:
     """Derivation of a missing channel from those that are there, some with gaps.
 
-    None where nothing makes it.
+    A forward speed is made of wheel speeds, a steering angle of the steering wheel's, ``ax`` of the
+    speed, and ``vy_ref`` of the sideslip angle and a speed, which may itself be derived.
+
+    Parameters
+    ----------
+    channel : str
+        The channel that is missing.
+    channels : collection of str
+        Channels that are there.
+    gappy : collection of str
+        Those of them that have gaps; a speed with gaps is not differentiated.
+    rate_hz : float
+        Rate of the recording [Hz], by which the filter of a differentiated speed is chosen.
+
+    Returns
+    -------
+    Derivation or None
+        None where nothing makes it. Values that only the user knows, such as the radius of a wheel,
+        are None in its transforms.
     """
     wheels = tuple(name for wheel in WHEELS if (name := f"wheel_speed_{wheel}") in channels)
     if channel == "vx" and wheels:

@@ -21,6 +21,7 @@ STANDSTILL_SPEED = 0.1  # m/s
 
 
 def _checked_channel(name: str) -> str:
+    """The name itself; `ValueError` where there is no such channel."""
     if name not in CHANNELS:
         raise ValueError(f"there is no channel '{name}'; 'vehest data channels' lists them")
     return name

@@ -122,6 +122,7 @@ def unknown_option(family: str, option: str, names: Mapping[str, Sequence[str]])
 
 
 def _spelling(name: str) -> str:
+    """A name without underscores and in lower case, for comparisons."""
     return name.replace("_", "").lower()
 
 

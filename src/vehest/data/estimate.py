@@ -131,8 +131,19 @@ class Estimate(TimeSeries):
         return column_units(self)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
-        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future,
-        NaN outside the estimate.
+        """Values of ``name`` at other times: the latest that is not in the future.
+
+        Parameters
+        ----------
+        times : FloatArray
+            Shape (K,) [s].
+        name : str
+            A channel of the estimate.
+
+        Returns
+        -------
+        FloatArray
+            In the channel's unit, NaN outside the estimate, shape (K,).
         """
         index = self._held_index(times)
         return np.where(index < 0, np.nan, self[name][index])

@@ -123,6 +123,13 @@ def without_links(path: Path) -> Path:
 def file_name(name: str, ending: str = "") -> str:
     """A name as one component of a path, another for another name: what is no letter, digit or one
     of ``_-+=.`` is replaced, a name cut at 100 bytes, and the start of its hash added.
+
+    Parameters
+    ----------
+    name : str
+        Any text, an empty one too; one that is a good name already stays as it is.
+    ending : str
+        Appended as it is, such as ``.parquet``.
     """
     component = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
     if component != name or not name or len(component.encode()) > 120:
@@ -221,7 +228,13 @@ def aside_of(path: Path, name: str = "") -> Path:
 
 
 def sha256_of(path: Path) -> str:
-    """Hex digest of a file's bytes; raises a `DataError` where it cannot be read."""
+    """Hex digest of a file's bytes.
+
+    Raises
+    ------
+    DataError
+        It is not there, cannot be read, or is a folder, pipe or device.
+    """
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             regular_file(path)  # which names what it is
@@ -266,6 +279,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
+    """Whether a process of that number runs, whosever it is; never one of number 0 or below."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -276,6 +290,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
+    """Force the contents of a file, or of all files in a folder, onto the disk."""
     for file in (
         [entry for entry in path.rglob("*") if entry.is_file()] if path.is_dir() else [path]
     ):

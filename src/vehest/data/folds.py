@@ -30,14 +30,31 @@ class FoldsFile:
     of: Literal["recordings", "laps", "seconds"] = "laps"
     recordings: str = "*"  # pattern of those that take part
     block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
-    # taken off training and validation where they border on another fold [s]
+    # removed from training and validation where they border on another fold [s]
     gap_seconds: NonNegativeFloat = 2.0
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
     """The blocks of recordings, each with the span that names it, in order.
 
-    `DataError` where laps need a missing speed or yaw rate.
+    Parameters
+    ----------
+    folds : FoldsFile
+        What a block is: a recording, a lap or so many seconds. What is left before the first or
+        after the last lap belongs to that lap, a rest of less than half a block of seconds to the
+        one before.
+    recordings : iterable of tuple
+        Span that names a recording, and the recording.
+
+    Returns
+    -------
+    list of Span
+        They cover every recording without gaps.
+
+    Raises
+    ------
+    DataError
+        Laps need a speed or yaw rate that a recording does not have.
     """
     blocks = []
     for span, recording in recordings:
@@ -117,6 +134,7 @@ def _joined(
 
 
 def _touch(first: Span, second: Span) -> bool:
+    """Whether the second range begins where the first ends, in the same recording."""
     return (first.dataset, first.recording) == (second.dataset, second.recording) and math.isclose(
         first.stop, second.start
     )

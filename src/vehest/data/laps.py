@@ -35,8 +35,12 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     Parameters
     ----------
     recording : Recording
-        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks
-        them.
+        With vx (else vx_ref) and yaw_rate (else yaw_rate_ref).
+
+    Raises
+    ------
+    DataError
+        It lacks one of them.
     """
     speed = _first_of(recording, "vx", "vx_ref")
     turning = _first_of(recording, "yaw_rate", "yaw_rate_ref")
@@ -58,6 +62,9 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _first_of(recording: Recording, *names: str) -> FloatArray:
+    """Samples of the first of several channels that a recording has, 0 for NaN; `DataError` for
+    none.
+    """
     name = next((name for name in names if name in recording), None)
     if name is None:
         raise DataError(

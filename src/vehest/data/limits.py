@@ -51,9 +51,12 @@ def use_limits(limits: Limits) -> Iterator[None]:
 
 
 def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
-    """Limits from ``limits`` of a configuration.
+    """Limits from ``limits`` of a configuration; those that it leaves out are the default ones.
 
-    Raises a `ConfigurationError` where a name or a value is none.
+    Raises
+    ------
+    ConfigurationError
+        A name or a value is none.
     """
     return validated(Limits, config or {}, "", error=ConfigurationError, group="limits")
 
@@ -78,8 +81,19 @@ def check_limit(
 
 
 def check_unpacked(file: object, packed: float, unpacked: float) -> None:
-    """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times
-    its packed size [bytes].
+    """Refuse a file that unpacks to more than the limits allow.
+
+    Parameters
+    ----------
+    file : object
+        Its path, for messages.
+    packed, unpacked : float
+        Sizes [bytes].
+
+    Raises
+    ------
+    DataError
+        ``unpacked`` exceeds ``limits.memory`` and ten times ``packed`` together.
     """
     excess = unpacked - 10.0 * packed
     check_limit(

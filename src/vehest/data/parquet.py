@@ -41,9 +41,15 @@ BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else read
 
 @contextmanager
 def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file for reading.
+    """Open a Parquet file for reading; checksums of its pages, where it has any, are verified.
 
-    What it raises while it is read is a `MissingError` or a `DataError` of one line, too.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It is damaged, or its description is longer than the limits allow. What pyarrow raises while
+        the file is read, within the ``with`` statement, becomes such an error, too.
     """
     size = regular_file(path).stat().st_size
     try:
@@ -67,10 +73,28 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
 def number_batches(
     path: Path, file: pq.ParquetFile, names: Sequence[str]
 ) -> Iterator[pa.RecordBatch]:
-    """Columns of numbers or dates that are there once each, some rows at a time; `DataError` for
-    anything else.
+    """Columns of numbers or dates, some rows at a time.
 
-    Dates with times count from 1970 in the file's unit, ``unit`` of their type.
+    Parameters
+    ----------
+    path : Path
+        The file, for messages and its size.
+    file : pyarrow.parquet.ParquetFile
+        The same, opened.
+    names : sequence of str
+        Columns that are there once each. Dates with times count from 1970 in the file's unit,
+        ``unit`` of their type.
+
+    Yields
+    ------
+    pyarrow.RecordBatch
+        At most `ROWS_AT_A_TIME` rows; all batches together have as many as the file says.
+
+    Raises
+    ------
+    DataError
+        A column is of another type, the file has fewer or more rows than it says, or unpacks to
+        more than the limits allow.
     """
     for name in names:
         kind = file.schema_arrow.field(name).type
@@ -109,7 +133,13 @@ def _bytes_of_pages(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> i
 def read_numbers(
     path: Path, file: pq.ParquetFile, names: Sequence[str]
 ) -> dict[str, NDArray[np.float64]]:
-    """Columns of `number_batches`, float64 of shape (T,), missing values NaN."""
+    """Columns of `number_batches`, float64 of shape (T,), missing values NaN.
+
+    Raises
+    ------
+    DataError
+        As `number_batches` does.
+    """
     values = {name: np.empty(0) for name in names}
     done = 0
     for batch in number_batches(path, file, names):

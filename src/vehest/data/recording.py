@@ -20,6 +20,8 @@ Kind = Literal["real", "simulated"]
 
 MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # in the provenance of a part of a drive: its number and that of all
+DERIVED = "derived"  # likewise: the data set's transforms and points of its sensors
+MISSING = "missing_samples"  # likewise: channel, empty for all of them -> texts
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6
 HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
@@ -137,10 +139,15 @@ class Recording(TimeSeries):
     def with_channels(
         self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None
     ) -> Recording:
-        """The same drive with channels (T,) replaced or added: gappy where one that they were made
-        of is.
+        """The same drive with channels replaced or added.
 
-        None: as they were.
+        Parameters
+        ----------
+        changed : mapping
+            Channel -> samples in its SI unit, shape (T,).
+        made_of : iterable of str or None
+            Channels that they were made of: all of them are gappy if one of these is, and else
+            none. None leaves them as they were.
         """
         gappy = self.gappy
         if made_of is not None:
@@ -183,6 +190,11 @@ class Recording(TimeSeries):
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the
         recording.
+
+        Parameters
+        ----------
+        start, stop : float
+            On the clock of the recording, infinite ones included [s].
         """
         tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
@@ -205,6 +217,18 @@ def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float
 
     A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s
     (unix time) 0.24 µs.
+
+    Parameters
+    ----------
+    start_time, end_time : float
+        Ends of the recording, the larger of which counts [s].
+    rate_hz : float
+        Its rate [Hz].
+
+    Returns
+    -------
+    float
+        From 1e-6 to 0.25 of a sample.
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)

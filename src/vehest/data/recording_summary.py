@@ -32,9 +32,14 @@ def summary_of(recording: Recording) -> RecordingSummary:
 
 
 def stored_summary(path: Path) -> RecordingSummary:
-    """Summary of a stored recording, from its file's description.
+    """Summary of a stored recording, from its file's description; no samples are read.
 
-    ``gappy`` channels may have gaps; raises `MissingError`, `DataError`.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It is damaged, or is no recording that vehest wrote.
     """
     with parquet_file(path) as file:
         schema = file.schema_arrow

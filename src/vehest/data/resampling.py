@@ -50,6 +50,23 @@ def resampled_parts(
     """`resampled` for a recording that comes in parts, to the same bits.
 
     A preparation with other transforms needs it whole.
+
+    Parameters
+    ----------
+    parts : iterable of Recording
+        Parts that follow one another, each with its number and that of all parts in its provenance;
+        one without is the last.
+    rate_hz : float
+        Rate of the outcome [Hz].
+    preparation : mapping
+        As of `resampled`.
+    slowest_hz : float
+        As of `resampled` [Hz].
+
+    Yields
+    ------
+    Recording
+        Parts of the outcome that follow one another, perhaps of other lengths than those that came.
     """
     if preparation["transforms"]:
         parts = [joined(list(parts))]

@@ -69,12 +69,27 @@ def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
     """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups
     in them.
 
-    `ConfigurationError`.
+    Parameters
+    ----------
+    kind : type
+        Dataclass of the settings.
+    config : mapping
+        Values by field.
+    group : str
+        Group of the configuration, for messages that say how a value is set.
+
+    Raises
+    ------
+    ConfigurationError
+        A value is missing, unknown or wrong.
     """
     return validated(kind, _without_names(config, kind), "", error=ConfigurationError, group=group)
 
 
 def _without_names(content: Any, kind: Any) -> Any:
+    """Content without the key ``name``, at any depth, where the dataclass that it becomes has no
+    such field.
+    """
     kind, _ = _bare(kind)
     if not (isinstance(content, dict) and is_dataclass(kind)):
         return content
@@ -89,7 +104,21 @@ def _without_names(content: Any, kind: Any) -> Any:
 def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) -> int:
     """The version of a file's layout, as the file states it.
 
-    `DataError` unless it is between ``oldest`` and ``newest``.
+    Parameters
+    ----------
+    version : object
+        What the file states, of any type.
+    newest : int
+        Newest version that this code reads.
+    subject : str
+        The file, for messages.
+    oldest : int
+        Oldest one.
+
+    Raises
+    ------
+    DataError
+        It is no whole number, or none between ``oldest`` and ``newest``.
     """
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise DataError(f"{subject}: format must be a whole number, not {str(version)[:40]!r}")
@@ -151,6 +180,10 @@ _RESTORED = {new: old for old, new in _REPLACED.items()}
 
 
 def _validated(kind: Any, content: Any) -> Any:
+    """An instance of ``kind`` by pydantic, from JSON.
+
+    Lone surrogates, which JSON cannot hold, are replaced meanwhile.
+    """
     text = json.dumps([content], ensure_ascii=False)
     replaced = text.translate(_REPLACED) if _SURROGATE.search(text) else text
     (instance,) = _adapter(kind).validate_json(replaced)
@@ -246,6 +279,7 @@ def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
 
 
 def _keys_of(kind: Any) -> str:
+    """Fields of a dataclass that may be given, for messages; empty for any other type."""
     bare, _ = _bare(kind)
     return (
         ", ".join(field.name for field in fields(bare) if field.init) if is_dataclass(bare) else ""

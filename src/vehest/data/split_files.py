@@ -86,6 +86,9 @@ class SplitFile:
 
 
 def _read(config: Any) -> SplitFile:
+    """A split's configuration, short forms spelt out and checked; `ConfigurationError` for a
+    mistake.
+    """
     name = config.get("name") if isinstance(config, Mapping) else None
     subject = f"split '{name}'" if isinstance(name, str) else ""
     plain = _spelt_out(config, subject) if isinstance(config, Mapping) else config
@@ -168,9 +171,22 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on.
+    """A stretch of ranges laid end to end, which wraps around.
 
-    It wraps around; ends of seconds are left out.
+    Parameters
+    ----------
+    spans : sequence of Span
+        Ranges whose ends are finite.
+    seconds : float
+        Length of the stretch, at most that of all ranges [s].
+    at : float
+        Share of the whole at which it begins, from 0 to 1.
+
+    Returns
+    -------
+    tuple of Span
+        In the order of ``spans``; pieces shorter than `MIN_PIECE_SECONDS` are left out, unless all
+        are.
     """
     total = _seconds_of(spans)
     begin = at * total
@@ -182,6 +198,7 @@ def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Spa
 
 
 def _seconds_of(spans: Iterable[Span]) -> float:
+    """Length of all ranges together [s]."""
     return sum(span.stop - span.start for span in spans)
 
 
@@ -207,7 +224,15 @@ class _Ranges:
         self._catalogues: dict[str, Mapping[str, Reader]] = {}
 
     def split(self) -> Split:
-        """The split of the ranges, or of one fold of a cross-validation."""
+        """The split of the ranges, or of one fold of a cross-validation.
+
+        Raises
+        ------
+        ConfigurationError
+            Folds are declared beside roles, or a range cannot be found.
+        DataError
+            A recording cannot be read or lacks a channel that laps or conditions need.
+        """
         file = self._file
         folds = self._file.folds
         if folds is None:
@@ -251,6 +276,7 @@ class _Ranges:
         return replace(named, train=train, validation=validation)
 
     def _with_ends(self, span: Span) -> Span:
+        """A range whose start and stop, which may be infinite, lie within its recording [s]."""
         recording = self._recording(span.dataset, span.recording)
         return replace(
             span,
@@ -259,6 +285,11 @@ class _Ranges:
         )
 
     def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
+        """Ranges of a role: one for each recording that an entry names or whose name its pattern
+        matches.
+
+        Those of an entry with ``keep`` are cut further.
+        """
         spans: list[Span] = []
         for entry in entries:
             dataset = self._file.dataset_of(entry)
@@ -272,11 +303,21 @@ class _Ranges:
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
+        """Start and stop [s] of an entry in a recording, by laps or by times; infinite for its
+        ends.
+        """
         if entry.laps is not None:
             return self._laps(dataset, name, entry.laps)
         return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)
 
     def _time(self, dataset: str, name: str, bound: float | str) -> float:
+        """A time [s], or that of a share of a recording's samples; infinite for 0 and 100 %.
+
+        Raises
+        ------
+        ConfigurationError
+            The text is no share from 0 to 100 %.
+        """
         if not isinstance(bound, str):
             return bound
         match = PERCENT.fullmatch(bound)
@@ -291,6 +332,13 @@ class _Ranges:
         return recording.start_time + round(share / 100.0 * len(recording)) / recording.rate_hz
 
     def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
+        """Start of the first and end of the last of the laps that words name [s].
+
+        Raises
+        ------
+        ConfigurationError
+            The words name no laps, or the recording has no such complete laps.
+        """
         match = LAPS.fullmatch(words)
         if match is None:
             raise ConfigurationError(
@@ -315,6 +363,9 @@ class _Ranges:
     def _recording(
         self, dataset: str, name: str, channels: Iterable[str] | None = None
     ) -> Recording:
+        """A recording with some of its channels, None for all; `ConfigurationError` where there is
+        none.
+        """
         recordings = self._recordings(dataset)
         if name not in recordings:
             raise ConfigurationError(
@@ -338,6 +389,13 @@ class _Ranges:
         return names
 
     def _recordings(self, dataset: str) -> Mapping[str, Reader]:
+        """Readers of a data set's recordings by name, looked up once.
+
+        Raises
+        ------
+        ConfigurationError
+            They are needed, and no catalogue of data sets is given.
+        """
         if dataset not in self._catalogues:
             if self._catalogue is None:
                 raise ConfigurationError(

@@ -22,12 +22,16 @@ WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
 def check_name(name: str, subject: str) -> None:
-    """Refuse, by a `ConfigurationError`, a name that would not mean itself in a file name, YAML or
-    an override.
+    """Refuse a name that would not mean itself in a file name, YAML or an override.
 
     It starts with a letter, digit or ``_`` of ASCII, goes on with these, ``-`` and ``.``, ends
     with none of the last, and has `MAX_NAME_CHARACTERS` characters at most. It is no word or number
     of YAML or of Hydra's grammar (``null``, ``yes``, ``1e5``), and no device of Windows (``con``).
+
+    Raises
+    ------
+    ConfigurationError
+        The name is another.
     """
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(

@@ -254,7 +254,19 @@ def read_estimate(path: Path) -> Estimate:
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
     """The description of a recording or an estimate beside its table.
 
-    `DataError` if it is damaged or of another kind or format.
+    Parameters
+    ----------
+    schema : pyarrow.Schema
+        Schema of the file, whose metadata hold the description.
+    path : Path
+        The file, for messages.
+    kind : type
+        Dataclass of the description: that of a recording, or of an estimate.
+
+    Raises
+    ------
+    DataError
+        It is damaged, or of another kind or format.
     """
     content = "recording" if kind is RecordingDescription else "estimate"
     description = _metadata(schema, path)
@@ -268,6 +280,7 @@ def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _
 
 
 def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
+    """Named attributes of an object, name -> value."""
     return {name: getattr(of, name) for name in names}
 
 
@@ -307,6 +320,7 @@ def _write(
 
 
 def _table(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> pa.Table:
+    """Columns as an Arrow table of float64, each with its unit in the metadata where it has one."""
     buffers = {
         name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64))
         for name, values in columns.items()
@@ -325,6 +339,14 @@ def _table(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> pa.Ta
 def _read(
     path: Path, kind: type[_Description], names: list[str] | None = None
 ) -> tuple[dict[str, FloatArray], _Description]:
+    """Columns, shape (T,) each, and the description of a file of vehest's own; None in ``names``
+    for all.
+
+    Raises
+    ------
+    DataError
+        It is no such file, a column is there twice or is not float64, or a wanted one is missing.
+    """
     with parquet_file(path) as file:
         schema = file.schema_arrow
         described = description_of(schema, path, kind)

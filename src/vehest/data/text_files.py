@@ -69,7 +69,19 @@ def parse_yaml(text: str, subject: str) -> Any:
 def check_yaml_size(text: str, subject: str, max_values: int = MAX_YAML_VALUES) -> None:
     """Refuse YAML that nests too deep or grows too large by its aliases, before anything is built.
 
-    Raises `DataError`.
+    Parameters
+    ----------
+    text : str
+        The YAML.
+    subject : str
+        The file, for messages.
+    max_values : int
+        Values that it may hold, those that aliases repeat counted each time.
+
+    Raises
+    ------
+    DataError
+        It holds more, nests deeper than `MAX_DEPTH` levels, or is no YAML.
     """
     try:
         try:
@@ -138,7 +150,24 @@ def write_json(path: Path, content: Any) -> None:
 def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
     """Rows of a CSV file whose first line names its columns, such as vehest writes them.
 
-    `DataError` if one is missing or short.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : sequence of str
+        Columns that it must have, beside any others.
+
+    Returns
+    -------
+    list of dict
+        Column -> text of the cell.
+
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It is no CSV, a column is missing, or a row has more or fewer cells than the first line.
     """
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
@@ -158,7 +187,13 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
 
 
 def number_in(row: Mapping[str, str], column: str, path: Path) -> float:
-    """A number in a row of `read_rows`; raises a `DataError` where it is none."""
+    """A number in a row of `read_rows`; infinities and NaN are numbers, too.
+
+    Raises
+    ------
+    DataError
+        The cell is none.
+    """
     try:
         return float(row[column])
     except ValueError:

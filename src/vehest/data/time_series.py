@@ -54,6 +54,7 @@ class TimeSeries(ABC):
         return self.start_time + self.duration
 
     def _describe(self) -> str:
+        """Class, label, duration and rate, for ``repr``."""
         return f"{type(self).__name__} {self.label}: {self.duration:.5g} s at {self.rate_hz:.6g} Hz"
 
     def __repr__(self) -> str:

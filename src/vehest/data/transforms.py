@@ -133,7 +133,19 @@ class Resample:
         return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
 
     def taps(self, up: int, down: int) -> FloatArray:
-        """Coefficients of the anti-aliasing filter at ``up`` times the rate of the recording."""
+        """Coefficients of the anti-aliasing filter at ``up`` times the rate of the recording.
+
+        Parameters
+        ----------
+        up, down : int
+            Ratio of the new rate to that of the recording, up / down.
+
+        Returns
+        -------
+        FloatArray
+            Shape (2 half + 1,), with half ``zero_crossings`` times the larger of both. Each of the
+            ``up`` branches keeps constants and straight lines.
+        """
         slower = max(up, down)
         half = self.zero_crossings * slower
         taps, window = windowed_sinc(half, self.cutoff / slower, self.kaiser_beta)
@@ -420,6 +432,11 @@ class DelayCorrection:
         )
 
     def _taps(self, fraction: float) -> FloatArray:
+        """Weights of the 2 reach + 1 samples about a place that lies ``fraction`` of an interval
+        behind the middle one.
+
+        A sinc under a Kaiser window, whose sum is 1.
+        """
         distance = np.arange(-self.reach, self.reach + 1) - fraction
         inside = np.clip(1.0 - np.square(distance / (self.reach + 1)), 0.0, None)
         taps = (
@@ -519,6 +536,15 @@ def windowed_sinc(half: int, cutoff: float, beta: float) -> tuple[FloatArray, Fl
     in Nyquist frequencies.
 
     As by `scipy.signal.firwin` to the bit, which takes a second to import.
+
+    Parameters
+    ----------
+    half : int
+        Taps on either side of the middle one, 1 or more.
+    cutoff : float
+        Frequency at which the gain is about a half, from 0 to 1.
+    beta : float
+        Shape of the Kaiser window.
     """
     place = np.arange(2 * half + 1) - float(half)
     window = scipy.special.i0(beta * np.sqrt(1 - (place / half) ** 2)) / scipy.special.i0(beta)
@@ -546,7 +572,7 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray, n_out:
 
 @cache
 def _compiled_sums() -> Callable[..., None]:
-    """`_sums` compiled, for which importing this module is not worth importing numba."""
+    """`_sums` compiled, imported on first use, so that this module does not import numba."""
     import numba
 
     compiled = numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -3,6 +3,15 @@
 Description (description.py)  settings, channels, texts, version
 Fittable (fitting.py)         fit, weights
 Estimator                     estimates of recordings, online steps
+
+Flow of an estimate: `Estimator.estimate` checks rate, channels and gaps of each recording, makes
+the first state from an initial state or the first sample, runs the method over the whole recording
+(`run`, or `_estimate_all` where recordings are batched), and wraps the quantities on the
+recording's clock. Online, `RunStepper` calls the same `run` with one row at a time, so that both
+give the same numbers.
+
+Quantities are in SI units and ISO 8855 axes: x forwards, y to the left, yaw rate and sideslip
+positive to the left.
 """
 
 from __future__ import annotations
@@ -61,6 +70,11 @@ class Stepper(ABC):
 
         A method that has a covariance also returns ``vy_variance`` [m²/s²].
 
+        Parameters
+        ----------
+        sample : mapping
+            Channel -> value; further channels are ignored.
+
         Raises
         ------
         DataError
@@ -118,6 +132,14 @@ class Estimator(Fittable):
         return self._estimate_all([self._checked(recording) for recording in recordings], states)
 
     def _checked(self, recording: Recording) -> Recording:
+        """The channels of a recording that the method reads.
+
+        Raises
+        ------
+        DataError
+            The rate differs by more than 1e-9, a channel is missing, or one that is not skippable
+            has gaps.
+        """
         if abs(recording.rate_hz / self.settings.rate_hz - 1.0) > 1e-9:
             raise DataError(
                 f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, estimator "
@@ -205,7 +227,7 @@ class Estimator(Fittable):
         sample : array
             Values of ``channels``, (C,).
         initial_state : mapping
-            What a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
+            Known values of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty
             otherwise.
         """
         return None
@@ -304,7 +326,11 @@ class Estimator(Fittable):
 
 
 class RunStepper(Stepper):
-    """An estimator that has `run`, one sample at a time."""
+    """An estimator that has `run`, one sample at a time.
+
+    The first sample sets the state; without an initial state the estimate begins as that of a
+    recording. Estimates equal those of `Estimator.estimate` on the same samples.
+    """
 
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator

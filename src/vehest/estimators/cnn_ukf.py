@@ -1,6 +1,15 @@
 """UKF-informed neural network.
 
 A network and the unscented filter behind it, trained end to end (CNN-UKF).
+
+    recordings --identify--> tyres, sensor levels, process noise
+    samples --pre-training--> network (Eqs. 5 and 6)
+    sequences --`EndToEnd`: network, then `TrackFilter`--> loss (Eq. 7) --gradient--> network
+
+At each sample the network returns β_DD, σ_DD, σ_Vy and σ_ψ̇ (`NetworkOutput`). The filter measures
+β_DD with the variance σ_DD² + ε beside the sensors, and its step has the process noise
+diag(σ_Vy², σ_ψ̇²). Tyres and sensor levels are those of the identification and are not changed
+afterwards.
 """
 
 from __future__ import annotations
@@ -125,7 +134,7 @@ class Cuts(NamedTuple):
 class CnnUkf(NetworkUkf):
     """Filter with a sideslip angle, its variance and process noise by a network, at each sample.
 
-    Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy
+    Its 1x1 convolutions over time read one sample each, so it is a network of samples. σ_DD, σ_Vy
     and σ_ψ̇ come out of logistic functions; all three are standard deviations here, in pre-training
     too, where Eq. 6 has σ_DD as a variance: R = σ_DD² + ε, and ε is added rather than a bound, so
     that it has a gradient everywhere.
@@ -181,7 +190,11 @@ class CnnUkf(NetworkUkf):
         return super().variant + tyres + "".join(f"_no_{name}" for name in self.without)
 
     def output_of(self, outputs: Tensor) -> NetworkOutput:
-        """Outputs of the network, (..., 4), as angle and noise."""
+        """Outputs of the network, (..., 4), as angle and noise.
+
+        The first is an angle in units of the network's ``unit`` [rad]; the others pass a logistic
+        function, so that all deviations lie between 0 and 1 (σ_DD [rad], σ_Vy [m/s], σ_ψ̇ [rad/s]).
+        """
         shares = torch.sigmoid(outputs[..., 1:].double())
         return NetworkOutput(
             outputs[..., 0].double() * self.network.unit.double(),
@@ -191,7 +204,10 @@ class CnnUkf(NetworkUkf):
         )
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Angle, its variance and the process noise."""
+        """Angle, its variance and the process noise of inputs (T, C) of the network.
+
+        There are no gradients. The angle is clipped to what a tangent allows.
+        """
         output = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
         return PseudoMeasurement(
             clip_sideslip(output.sideslip.numpy()),
@@ -283,12 +299,14 @@ class CnnUkf(NetworkUkf):
     ) -> Phase:
         """Phase of the network alone (Eqs. 5 and 6).
 
-        Its loss is a likelihood of angle and distrust; process noise is at the filter's levels.
+        Its loss is ½ (ln R + e²/R) on average, with R = σ_DD² + ε and the error e of the angle
+        [rad], plus the squared differences of σ_Vy and σ_ψ̇ to the filter's levels.
         """
         network = self.network
         dropout = self.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
+            """Loss of outputs (1, N, 4) against scaled angles, one a member, (1,)."""
             output = self.output_of(outputs)
             error = output.sideslip - targets.double() * network.unit.double()
             likelihood = 0.5 * (output.variance.log() + error.square() / output.variance).mean(-1)
@@ -315,7 +333,24 @@ class CnnUkf(NetworkUkf):
 
 
 class EndToEnd:
-    """Backpropagation through network and filter over sequences (Eqs. 7 and 8)."""
+    """Backpropagation through network and filter over sequences (Eqs. 7 and 8).
+
+    Parameters
+    ----------
+    estimator : CnnUkf
+        With an identified filter; its network is trained.
+    samples : Samples
+        Scaled inputs (N, C) of the recordings, one after another, for the network.
+    recordings : sequence of Recording
+        Training recordings with ``vy_ref``.
+    training : EndToEndSettings
+        Length and number of sequences, unit and limit of the loss.
+
+    Raises
+    ------
+    DataError
+        No recording has as many samples as a sequence.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Baseline: steady cornering of a single track from a data sheet; nothing is learnt."""
+"""Baseline: steady cornering of a single track from a data sheet; nothing is fitted."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ class DataSheet(Recursive):
     axle carries m g l_f / l, and with C_r = c m g l_f / l mass and load cancel. Tyres of road and
     race cars have c of 6 to 15 per rad (Milliken & Milliken, Race Car Vehicle Dynamics, 1995); 10
     is assumed where nothing better is known.
+
+    u is the forward speed and r the yaw rate, positive to the left, as is v at the centre of
+    gravity.
     """
 
     name = "data_sheet"

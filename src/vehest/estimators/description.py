@@ -1,4 +1,9 @@
-"""What a family of estimators declares: settings, channels, texts, version."""
+"""What a family of estimators declares: settings, channels, texts, version.
+
+`Description.__init_subclass__` turns the `setting` and `fitted` entries of a class body into a
+frozen dataclass, ``settings_type``, and into properties of the class. A configuration becomes an
+estimator by `Description.from_config`.
+"""
 
 from __future__ import annotations
 
@@ -75,6 +80,7 @@ class Description(ABC):
     # in the first comparison on a new car; none: it is left out
     trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
+    trace_note: ClassVar[str] = ""  # explains a conspicuous course of its traces, below figures
     style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
     # C template of a step, in ``export/templates/methods`` or beside the family's module; or empty
     template: ClassVar[str] = ""

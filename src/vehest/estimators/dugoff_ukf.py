@@ -115,6 +115,7 @@ class AxleTyres(Group):
     reduction_rear: float | None = setting(None, "likewise", unit="s/m", least=0.0)
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` where some of the parameters are given, but not all."""
         super().__post_init__()
         values = [value for value in asdict(self).values() if value is not None]
         if values and len(values) < len(TYRES):
@@ -134,9 +135,9 @@ TYRES = tuple(entry.name for entry in fields(AxleTyres))
 class DugoffUkf(DugoffFilter):
     """Unscented filter of lateral velocity and yaw rate over `DugoffTrack`.
 
-    Measured are lateral acceleration, yaw rate and, if wanted, the lateral forces of both axles;
-    forward speed, steering angle and longitudinal acceleration are inputs. The forces' noise is
-    smaller where the car behaves non-linearly, by a hysteresis on |ay|.
+    Measured are lateral acceleration, yaw rate and, depending on the settings, the lateral forces
+    of both axles; forward speed, steering angle and longitudinal acceleration are inputs. The
+    forces' noise is smaller where the car behaves non-linearly, by a hysteresis on |ay|.
 
     Source: Bertipaglia et al. 2024, Sections III-B and IV-C.
     """
@@ -255,7 +256,12 @@ class DugoffUkf(DugoffFilter):
     def identify(
         self, data: FitData, training: IdentificationSettings, context: FitContext
     ) -> FitRecord:
-        """Fit tyres and levels."""
+        """Fit tyres and levels.
+
+        In this order: tyres by a genetic algorithm, sensor levels from quiet segments, process
+        noise and ``force_factor`` by a search for the smallest error of sideslip, each where it is
+        not given.
+        """
         started = time.monotonic()
         metrics: dict[str, float] = {"epochs": 0}
         history: dict[str, list[float]] = {}

@@ -49,6 +49,7 @@ class EnsembleSettings(SampleSettings):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for fewer trials than stages, or a limit of squared errors."""
         super().__post_init__()
         if self.scaling_trials < self.identification.stages:
             raise ConfigurationError(
@@ -142,6 +143,11 @@ class EnsembleUkf(NetworkUkf):
     def _search(
         self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext
     ) -> SearchRecord:
+        """Search p₁ and p₂ with the smallest error of the filter on recordings.
+
+        Networks are evaluated once; each evaluation of the cost scales their variances and filters
+        all recordings.
+        """
         moments = [
             self._mean_and_variance(recording.stack(self.network_inputs))
             for recording in recordings
@@ -150,6 +156,9 @@ class EnsembleUkf(NetworkUkf):
         quiet = FitContext(should_stop=context.should_stop)
 
         def cost(scaling: FloatArray) -> float:
+            """Mean squared error of sideslip [rad²] with the networks' variances scaled by p₁
+            and p₂.
+            """
             pseudo = [
                 PseudoMeasurement(sideslip, scaled_variance(variance, scaling, self.least_variance))
                 for sideslip, variance in moments
@@ -165,7 +174,10 @@ class EnsembleUkf(NetworkUkf):
         return search.search(cost, BOX, STARTS, self.fit_seed, quiet, training.scaling_trials)
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""
+        """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles.
+
+        The variance is that between networks, plus the mean of their own variances for ``mixture``.
+        """
         outputs = self.network.outputs(inputs)
         unit = float(self.network.unit)
         variance = outputs[..., 0].var(axis=0)
@@ -221,7 +233,22 @@ class EnsembleUkf(NetworkUkf):
 def scaled_variance(
     variance: FloatArray, scaling: FloatArray, least_variance: float = MIN_VARIANCE
 ) -> FloatArray:
-    """10^p₁ (σ²)^p₂, and ε on top so that no filter takes it for exact; (T,) [rad²] (Eq. 11)."""
+    """Variance of the network's angle as a measurement: ε + 10^p₁ (σ²)^p₂ (Eq. 11).
+
+    Parameters
+    ----------
+    variance : array
+        σ², (T,) [rad²]; at least `MIN_SPREAD` is used.
+    scaling : array
+        p₁ and p₂, (2,).
+    least_variance : float
+        ε [rad²], so that no filter takes the angle for exact.
+
+    Returns
+    -------
+    array
+        (T,) [rad²]; the power of ten is clipped to `VARIANCE_POWER_RANGE`.
+    """
     size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, MIN_SPREAD))
     return least_variance + 10.0 ** np.clip(size, *VARIANCE_POWER_RANGE)
 

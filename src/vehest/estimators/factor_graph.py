@@ -1,5 +1,11 @@
 """Factor graph over the linear single track.
 
+    samples (T, 4) --linear_model--> `LinearModel` --kalman_scan, smoothed_means--> β, r --> vy
+
+Without a window one chain over the whole recording is solved, offline. With a window, each sample
+solves the chain over the last N samples, whose first state has a Gaussian factor that the previous
+window left, and the estimate is the newest state.
+
 Source: the FG of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
 """
 
@@ -134,7 +140,11 @@ class FactorGraph(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """Straight ahead and unknown, or what a protocol hands over."""
+        """Straight ahead and unknown, or a known initial state.
+
+        Deviations of β [rad] and r [rad/s] are ``noise.first_state``; a known state
+        counts as exact.
+        """
         return self.first_motion(sample, np.full(2, self.noise.first_state), initial_state)
 
     def first_state(  # type: ignore[override]
@@ -176,7 +186,11 @@ class FactorGraph(SideslipFilter):
         return values, WindowState(rows[max(0, len(rows) - self.intervals) :], start, refused)
 
     def linear_model(self, samples: FloatArray) -> LinearModel[FloatArray]:
-        """Model of samples of ``channels``, (T, 4); yaw rate and a_y are measured."""
+        """Model of samples of ``channels``, (T, 4); yaw rate and a_y are measured.
+
+        The state is (β [rad], r [rad/s]); speeds below the minimum count as the minimum. Noise is
+        constant over time; levels, stated per sample at 100 Hz, are not scaled to another rate.
+        """
         _, vx, _, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         steps = len(samples)
@@ -200,10 +214,17 @@ class FactorGraph(SideslipFilter):
     ) -> FloatArray:
         """Smoothed states of a window's samples, (N, 2).
 
-        ``start`` is the first state before its measurement.
-
-        Samples are of ``channels``, (N, 4). Measurements of the newest that the gate refuses become
-        NaN in them; ``refused`` is changed in place, too (see `Gate`).
+        Parameters
+        ----------
+        model : LinearModel
+            Of the window's N samples.
+        samples : array
+            Of ``channels``, (N, 4). Measurements of the newest that the gate refuses become NaN in
+            them.
+        start : Gaussian
+            The first state before its measurement.
+        refused : array
+            Counters of the gate, (2,), changed in place (see `Gate`).
         """
         filtered = kalman_scan(model, samples[:, MEASURED], start)
         gate = self.gate_in_use()

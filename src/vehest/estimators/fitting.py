@@ -1,4 +1,9 @@
-"""How a family of estimators is fitted, and how the result is stored."""
+"""How a family of estimators is fitted, and how the result is stored.
+
+A fit changes the estimator in place and returns a `FitRecord`. Its result are arrays by name
+(`Fittable.weights`), which `load_weights` takes back after `require_shapes` and
+`require_within_bounds` have checked them.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +95,17 @@ class Fittable(Description):
         """
 
     def fit(self, data: FitData, training: Any, context: FitContext | None = None) -> FitRecord:
-        """Fit this estimator alone."""
+        """Fit this estimator alone.
+
+        Parameters
+        ----------
+        data : FitData
+            Recordings at the estimator's rate.
+        training : any
+            Of ``training_type``.
+        context : FitContext or None
+            None: no checkpoints, no progress, no stop.
+        """
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
     def require_fitted(self) -> None:

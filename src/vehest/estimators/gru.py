@@ -23,7 +23,19 @@ class GruNetwork(RecurrentNetwork):
     n_gates = 3
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
-        """Hidden state after the window, from zero."""
+        """Hidden state after the window, from zero.
+
+        Parameters
+        ----------
+        prepared_windows : Tensor
+            Scaled windows (..., N, C).
+
+        Returns
+        -------
+        Tensor
+            (..., H). The input's part of all gates is computed for all samples at once; gates are
+            in the order r, z, n.
+        """
         driven = (
             torch.einsum("...c,ghc->...gh", prepared_windows, self.input_weight) + self.gate_bias
         )

@@ -1,5 +1,11 @@
 """Kalman filter over the linear single track.
 
+    high-passed signals --read_levels--> σ_r, σ_ay, σ_δ
+    samples (T, 4) --filter_samples: `LinearModel`, kalman_scan--> β, r, offsets --> vy
+
+The model is linear in the state for a known speed, so that the filter is exact but for the
+discretisation by forward Euler.
+
 Source: the KF of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023.
 """
 
@@ -169,6 +175,7 @@ class KalmanFilter(SideslipFilter):
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
+        """Levels that are given, and those read off the measured channels of recordings."""
         return self.values | read_levels(
             recordings, self.noise.unknown, self.noise.cutoff, MIN_LEVEL
         )
@@ -203,8 +210,21 @@ class KalmanFilter(SideslipFilter):
     ) -> FilteredStates:
         """Filter by `kalman_scan`.
 
-        a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ -
-        b_δ.
+        The state is (β [rad], r [rad/s]) and the offsets of ay [m/s²] and of the steering angle
+        [rad] that are states, in this order. Measurements are a_y, then r. An offset b decays by
+        exp(-τ/T) a sample and keeps the variance of its setting: a_y is measured as a_y + b_ay, and
+        wheels stand at δ - b_δ.
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, 4); NaN in yaw rate and ay was not measured.
+        first : Gaussian
+            State before the first measurement, mean (n,).
+        gate : Gate, optional
+            Which measurements are refused.
+        refused : array, optional
+            Counters of the gate, (2,), of a_y and r, changed in place.
         """
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)

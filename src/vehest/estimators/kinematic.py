@@ -38,7 +38,11 @@ class Kinematic(Recursive):
     time_constant: float = fitted("time constant of the leak", unit="s", positive=True)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """T [s]: the best of a grid, then a search between its neighbours."""
+        """T [s]: the best of a grid, then a search between its neighbours.
+
+        The error is not convex in T; the grid of 25 values from 0.02 to 200 s finds the right
+        valley.
+        """
         grid = np.geomspace(MIN_TIME_CONSTANT, MAX_TIME_CONSTANT, N_STARTS)
         errors = [self._error_with(recordings, time_constant) for time_constant in grid]
         best = int(np.argmin(errors))
@@ -55,6 +59,7 @@ class Kinematic(Recursive):
         }
 
     def _error_with(self, recordings: Sequence[Recording], time_constant: float) -> float:
+        """Mean squared error of vy with a time constant [m²/s²]; the time constant stays set."""
         self.time_constant = time_constant
         return self.mean_squared_error(recordings)
 
@@ -64,7 +69,18 @@ class Kinematic(Recursive):
         return math.exp(-1.0 / (self.rate_hz * self.time_constant))
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """v [m/s] at each sample, from that one sample before."""
+        """v [m/s] at each sample, from that one sample before.
+
+        v⁺ = d v + (1 - d) T (a_y - u r) with d = exp(-τ/T), the exact solution for an acceleration
+        that is held over the sample.
+
+        Parameters
+        ----------
+        samples : array
+            vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3).
+        state : tuple
+            v before the first sample [m/s].
+        """
         vx, yaw_rate, ay = samples.T
         gain = (1.0 - self.decay) * self.time_constant
         (start,) = state

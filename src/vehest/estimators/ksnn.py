@@ -1,6 +1,12 @@
 """KS-NN: the kinematics-structured neural network of Da Lio, Piccinini & Biral, IEEE T-ITS 2023.
 
 The method is patented by its authors (PCT/IT2023/050058).
+
+    windows (B, N, 4) of ω, u, a_y, a_x --`kernel.recursion_of`--> v one step after each (B,)
+
+The module declares the estimator. The equations are in `vehest.estimators.networks.ksnn`, which
+torch trains and tests compare with; the compiled recursion that estimates and trains is
+`vehest.estimators.kernels.ksnn`.
 """
 
 from __future__ import annotations
@@ -111,7 +117,21 @@ class Ksnn(WindowedEstimator):
         return sum(math.prod(shape) for shape in self.weight_shapes().values())
 
     def predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
-        """By the compiled recursion alone."""
+        """Lateral velocity one step after each window, by the compiled recursion alone, so that
+        torch is not needed.
+
+        Parameters
+        ----------
+        series : array
+            Measurements in the order of ``channels``, (T, C).
+        starts : array
+            First rows of windows, (W,).
+
+        Returns
+        -------
+        array
+            (W,) [m/s], computed in the precision of the weights.
+        """
         weights = self.weights()
         settings = self.settings
         flat = np.concatenate(

@@ -1,4 +1,12 @@
-"""Unscented Kalman filter whose dynamics and noise are learnt: Węgrzynowski et al. 2024."""
+"""Unscented Kalman filter whose dynamics and noise are learnt: Węgrzynowski et al. 2024.
+
+    recordings --drive--> true states, inputs, measurements
+    --scale_network, training_phases--> trained `CarFilter` --> five states of the car
+
+A seed is trained once; members of a batch that differ only in their use (start of friction, repair,
+gate) receive copies of its weights. Filtering and single samples are in
+`filtering.car_estimator`, the equations of the car in `vehest.vehicle.dynamics`.
+"""
 
 from __future__ import annotations
 
@@ -93,6 +101,7 @@ class CarSettings(Group):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for a centre of gravity that is not within the wheelbase."""
         super().__post_init__()
         if self.cg_to_rear_axle >= self.wheelbase:
             raise ConfigurationError(

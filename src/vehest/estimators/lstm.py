@@ -20,7 +20,18 @@ class LstmNetwork(RecurrentNetwork):
     n_gates = 4
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
-        """Hidden state after the window, from zero."""
+        """Hidden state after the window, from zero.
+
+        Parameters
+        ----------
+        prepared_windows : Tensor
+            Scaled windows (..., N, C).
+
+        Returns
+        -------
+        Tensor
+            (..., H). The cell starts from zero too; gates are in the order i, f, o, g.
+        """
         driven = (
             torch.einsum("...c,ghc->...gh", prepared_windows, self.input_weight) + self.gate_bias
         )

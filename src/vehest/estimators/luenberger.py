@@ -1,5 +1,8 @@
 """Kinematic Luenberger observer with reset.
 
+    samples (T, 4) of yaw_rate, vx, ay, ax --observe--> v, u
+    training recordings --Nelder-Mead--> gain α, threshold ω_th
+
 Source: Farrelly & Wellstead 1996, as in Da Lio et al. 2023, Appendix A.
 """
 
@@ -32,14 +35,19 @@ def implicit_euler_observer(
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
+    The 2 × 2 system is solved in closed form; its determinant is at least 1 for α ≥ 0. Where |ω| is
+    below the threshold the state is not observable, and becomes v = 0, u = u_m.
+
     Parameters
     ----------
     measurements : FloatArray
         yaw_rate, vx, ay, ax, shape (T, 4).
-    gain, step : float
-        α, and the sampling time τ [s].
+    gain : float
+        α.
     threshold : float
         |yaw rate| below which the state is reset [rad/s].
+    step : float
+        Sampling time τ [s].
     v, u : float
         Lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
 
@@ -80,7 +88,20 @@ def observe(
     v: float = 0.0,
     u: float = math.nan,
 ) -> tuple[FloatArray, FloatArray]:
-    """Estimated vy and vx [m/s], each of shape (T,)."""
+    """Run the compiled observer over samples.
+
+    Parameters
+    ----------
+    measurements : array
+        yaw_rate [rad/s], vx [m/s], ay, ax [m/s²], (T, 4).
+    gain, threshold, step, v, u
+        See `implicit_euler_observer`.
+
+    Returns
+    -------
+    tuple
+        Estimated vy and vx [m/s], (T,) each.
+    """
     vy = np.empty(len(measurements))
     vx = np.empty(len(measurements))
     compiled_observer(
@@ -123,10 +144,19 @@ class Luenberger(Recursive):
         box=(0.0, 0.5),
         of_largest="yaw_rate",
     )
+    trace_note = "v is set to 0 where the yaw rate is below a threshold (reset of the method)"
     style = "#5b8c00", "solid", "s"
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """Lateral and forward velocity [m/s]."""
+        """Lateral and forward velocity [m/s].
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, 4).
+        state : tuple
+            v and u after the sample before [m/s].
+        """
         vy, vx = observe(samples, self.gain, self.threshold, 1.0 / self.rate_hz, *state)
         return {"vy": vy, "vx": vx}, (float(vy[-1]), float(vx[-1]))
 

@@ -1,6 +1,11 @@
 """Fitted estimators on disk.
 
 Weights as safetensors, settings as YAML; loading executes no code from the files.
+
+A model is a folder of two files. ``model.yaml`` (`Description`) names the family by its registry
+name, never by an import path, with settings and origin; ``model.safetensors`` has the weights.
+`load_model` checks both before anything is built: format, version, known settings, finite numbers,
+and that the settings do not ask for more memory than the file has weights.
 """
 
 from __future__ import annotations
@@ -48,7 +53,7 @@ class About:
 
     __pydantic_config__ = FURTHER_KEYS
     seed: int = 0
-    datasets: tuple[str, ...] = ()  # names of those that it learnt on
+    datasets: tuple[str, ...] = ()  # names of those that it was trained on
     trained_on: tuple[str, ...] = ()  # ranges
     validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
     n_parameters: int | None = None
@@ -113,6 +118,11 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
 
 def load_model(folder: Path) -> Estimator:
     """Read a fitted estimator back.
+
+    Returns
+    -------
+    Estimator
+        Fitted; its ``preparation`` and ``trust`` are left as they are by default.
 
     Raises
     ------
@@ -195,6 +205,9 @@ def _built(
     kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path
 ) -> Estimator:
     """Build an estimator, unless its settings need more parameters than there are weights.
+
+    A whole number among the settings that exceeds the number of weights and `MIN_CHECKED_SIZE` is
+    refused before anything of that size is allocated.
 
     Raises
     ------

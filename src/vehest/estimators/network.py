@@ -30,6 +30,9 @@ class Network(Estimator):
 
     A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its
     own `fit_members`.
+
+    Weights that were loaded stay as arrays until the network is first used, so that families with a
+    compiled `predict` can estimate without torch.
     """
 
     learns = True  # always
@@ -61,7 +64,17 @@ class Network(Estimator):
     def fit_member(
         self, data: FitData, training: Any, context: FitContext, index: int
     ) -> FitRecord:
-        """Train one estimator; ``index`` is its place among the members, see `fit_members`."""
+        """Train one estimator; ``index`` is its place among the members, see `fit_members`.
+
+        Parameters
+        ----------
+        data : FitData
+            Recordings at the estimator's rate.
+        training : any
+            Of ``training_type``.
+        context : FitContext
+            Checkpoints, progress, the wish to stop.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no method 'fit_member'")
 
     @classmethod

@@ -1,6 +1,12 @@
 """Unscented filter of a single track with a network's sideslip angle among its measurements.
 
 Base of such methods.
+
+    sample --network--> β_DD, its variance (and process noise) --`with_pseudo`--> measurement m + 1
+    recordings --pseudo_measurements--> (T,) each --`DugoffFilter.filtered`--> states
+
+A subclass says what the network returns (`pseudo_of`) and how it is trained (`fit_network`), given
+the filter that `DugoffUkf.identify` has fitted.
 """
 
 from __future__ import annotations
@@ -54,7 +60,13 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @abstractmethod
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Sideslip angle, variance and process noise by the network, of samples (T, C)."""
+        """Sideslip angle, variance and process noise by the network, of samples (T, C).
+
+        Parameters
+        ----------
+        inputs : array
+            Of ``network_inputs``, as measured (T, C).
+        """
 
     @abstractmethod
     def fit_network(
@@ -105,7 +117,22 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """Add the network's angle and its variance; its process noise is that of the next step."""
+        """Add the network's angle and its variance; its process noise is that of the next step.
+
+        Parameters
+        ----------
+        sample : array
+            Of ``channels``, (n,).
+        measurement, noise : array
+            Of the sensors, (4,) and (4, 4).
+        memory : dict
+            Its ``noise`` becomes the network's process noise (2, 2), where there is one.
+
+        Returns
+        -------
+        tuple
+            Measurement (5,) and covariance (5, 5), diagonal.
+        """
         added = self.pseudo_of(self.network_samples(sample[None]))
         if added.process is not None:
             memory["noise"] = np.diag(added.process[0])

@@ -62,7 +62,7 @@ from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.vehicle.tyre_track import TyreTrack
 
-# Levels where nothing is tuned: steer [rad √s], tyres [1/√s].
+# Levels where nothing is tuned: steer [rad/√s], tyres [1/√s].
 ASSUMED_LEVELS = {"steer": 0.02, "tyres": 0.003}
 NOISE_CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
 # Standard deviation of the logarithms of curves that are given, where no other is.
@@ -84,7 +84,7 @@ class TrackNoise(Group):
         None, "of the accelerometer, and of what the model misses", unit="m/s²", positive=True
     )
     steer: float | None = setting(
-        None, "of the steering angle, over a second's step", unit="rad √s", positive=True
+        None, "of the steering angle, over a second's step", unit="rad/√s", positive=True
     )
     tyres: float | None = setting(
         None,
@@ -436,7 +436,12 @@ class RationalFilter(RationalTrack):
 def _fit(
     estimator: RationalFilter, data: FitData, training: NoiseTuningSettings, context: FitContext
 ) -> FitRecord:
-    """Fit curves, then noise levels, each where it is not given."""
+    """Fit curves, then noise levels, each where it is not given.
+
+    ``best_train_loss`` and ``best_validation_loss`` are mean squared errors of sideslip [rad²]. Of
+    the levels that are not searched, the yaw rate's is calibrated by the innovations
+    (`LevelSearch`), or all are read off or assumed (``method=data``).
+    """
     started = time.monotonic()
     metrics: dict[str, float] = {"epochs": 0}
     history: dict[str, list[float]] = {}

@@ -1,4 +1,11 @@
-"""Base of observers and filters: fitting their numbers, estimating, running online, saving."""
+"""Base of observers and filters: fitting their numbers, estimating, running online, saving.
+
+    samples (T, C), state --run: `_scan` of a compiled ``step``, or a family's code--> (T, n), state
+    recordings --find_numbers: closed form, or Nelder-Mead on mean squared vy error--> numbers
+
+A state is a tuple of floats in the order of ``states``, the numbers a named tuple, so that numba
+compiles ``step`` once for each family.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +41,11 @@ _numbers_type: Any = cache(partial(namedtuple, "Numbers"))
 
 
 def compiled(step: Callable[..., Any]) -> Any:
-    """Decorator of a family's ``step``, which numba compiles when it is first used."""
+    """Decorator of a family's ``step``, which numba compiles when it is first used.
+
+    It is ``step(numbers, state, sample) -> state``, with the tuples of `Recursive.numbers` and
+    `Recursive.first_state` and a sample (C,), and becomes a static method.
+    """
     return staticmethod(numba.njit(error_model="numpy")(step))
 
 
@@ -56,6 +67,9 @@ class Recursive(Estimator):
     values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:
+        """Make each number that is declared by `fitted` an attribute that reads and writes
+        ``values``.
+        """
         super().__init_subclass__(**options)
         for name, declared in cls.settings_type.declarations().items():
             if declared.is_fitted:
@@ -83,7 +97,15 @@ class Recursive(Estimator):
         )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
-        """The quantities of ``states`` by the compiled ``step``; see `Estimator.run`."""
+        """The quantities of ``states`` by the compiled ``step``; see `Estimator.run`.
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, C).
+        state : tuple
+            Floats in the order of ``states``.
+        """
         estimates = np.empty((len(samples), len(self.states)))
         state = _scan(self.step, self.numbers(), state, np.ascontiguousarray(samples), estimates)
         return dict(zip(self.states, estimates.T.copy(), strict=True)), state
@@ -115,6 +137,20 @@ class Recursive(Estimator):
         In closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
+
+        Parameters
+        ----------
+        data : FitData
+            Its training recordings decide; the validation is only reported.
+        training : any
+            Of ``training_type``.
+        context : FitContext
+            Progress and the wish to stop.
+
+        Returns
+        -------
+        tuple
+            Numbers by name, and the record.
 
         Raises
         ------
@@ -247,7 +283,19 @@ def _fitted_number(name: str) -> property:
 
 @numba.njit(error_model="numpy")
 def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
-    """State after the last sample; writes those after all samples into ``estimates``, (T, n)."""
+    """State after the last sample; writes those after all samples into ``estimates``, (T, n).
+
+    Parameters
+    ----------
+    step : compiled function
+        Of numbers, a state and a sample.
+    numbers : namedtuple
+        See `Recursive.numbers`.
+    state : tuple
+        Before the first sample.
+    samples : array
+        (T, C).
+    """
     for k in range(len(samples)):
         state = step(numbers, state, samples[k])
         for i in range(len(state)):

@@ -103,6 +103,9 @@ def plugin_failure(name: str, failed: str, error: Exception) -> ConfigurationErr
 
 
 def _class_of_module(name: str) -> type[Estimator] | None:
+    """The class of a module of this package, or None where there is no such module or it has no
+    ``ESTIMATOR``.
+    """
     if name not in {module.name for module in pkgutil.iter_modules(package.__path__)}:
         return None
     loaded_class: type[Estimator] | None = getattr(

@@ -1,6 +1,15 @@
 """Self-calibrating filter: identifies rear axle, roll leakage and offsets of a car on the drive.
 
 It needs neither training nor a reference sensor.
+
+    sample --kernel.scan: bank of J filters, network, steady cornering--> vy, variance
+    whole drive --filtering.self_calibrating_smoother.smooth--> vy, variance (offline)
+
+States of each filter of the bank, (8,): v, u [m/s], offsets of ay and ax [m/s²], roll leakage κ
+[1], distance b [m] and compliance C [rad s²/m] of the rear axle, and the axle's error e [1]. The
+class turns settings into the numbers of the compiled recursion
+(`vehest.estimators.kernels.self_calibrating`) and scales times, speeds and the compliance with the
+wheelbase (`WHEELBASE_POWERS`).
 """
 
 from __future__ import annotations

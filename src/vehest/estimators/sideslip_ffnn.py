@@ -76,7 +76,13 @@ class SideslipFfnn(SampleNetworkEstimator):
         return self.fit_samples(data, training, squared_error, context, index, [self.fit_seed])
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
-        """v = u tan β, each sample by itself."""
+        """v = u tan β, each sample by itself.
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, C); there is no state.
+        """
         sideslip = self.sideslip(samples)
         return {"vy": samples[:, self.channels.index("vx")] * np.tan(sideslip)}, None
 

@@ -39,7 +39,11 @@ class StaticMap(Recursive):
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Least squares; raises `DataError`: the car hardly turns, or always at one speed."""
+        """Least squares; raises `DataError`: the car hardly turns, or always at one speed.
+
+        Columns r and -r u² are scaled to a mean square of 1 first; their condition number decides
+        whether both numbers can be identified. A number that is given is subtracted.
+        """
         yaw_rate, vx, vy = (
             np.concatenate([recording[name] for recording in recordings])
             for name in ("yaw_rate", "vx", "vy_ref")

@@ -36,7 +36,22 @@ class VelocityGruNetwork(VelocityNetwork):
         return (velocities.new_zeros(1, len(velocities), self.recurrent.hidden_size),)
 
     def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
-        """Run over the samples."""
+        """Run over the samples.
+
+        Parameters
+        ----------
+        inputs : Tensor
+            Standardised, (B, T, C).
+        state : State
+            Hidden state before the first sample, (1, B, H).
+        mask : Tensor | None
+            Dropout's factors of the hidden state before the read-out; None: no dropout.
+
+        Returns
+        -------
+        tuple
+            Standardised velocities (B, T, outputs), and the state after the last sample.
+        """
         hidden, last = self.recurrent(inputs, state[0])
         outputs = self.read_out(hidden if mask is None else hidden * mask)
         return functional.leaky_relu(outputs, self.negative_slope), (last,)
@@ -45,7 +60,7 @@ class VelocityGruNetwork(VelocityNetwork):
 class VelocityGru(RecurrentVelocityEstimator):
     """GRU of Srinivasan et al. 2020.
 
-    An ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it.
+    A known ``initial_state`` is ignored, since no part of the network's state is a velocity.
     """
 
     name = "velocity_gru"

@@ -41,7 +41,26 @@ class VelocityLstmNetwork(VelocityNetwork):
         return (zeros, zeros, (velocities - self.output_mean) / self.output_scale)
 
     def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
-        """Run over the samples."""
+        """Run over the samples.
+
+        The LSTM does not depend on the velocities, hence it runs over the whole sequence first;
+        only the dense layers, which do, are computed sample by sample.
+
+        Parameters
+        ----------
+        inputs : Tensor
+            Standardised, (B, T, C).
+        state : State
+            Hidden state and cell (1, B, H) before the first sample, and the velocities estimated
+            for the sample before, standardised (B, outputs).
+        mask : Tensor | None
+            Dropout's factors of the hidden state before the dense layer; None: no dropout.
+
+        Returns
+        -------
+        tuple
+            Standardised velocities (B, T, outputs), and the state after the last sample.
+        """
         hidden, (last, cell) = self.recurrent(inputs, (state[0], state[1]))
         n_states = self.recurrent.hidden_size
         driven = nn.functional.linear(

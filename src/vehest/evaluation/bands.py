@@ -1,4 +1,4 @@
-"""What calibrated bands are worth: how often they hold the error, how wide they are, and both in
+"""Scores of calibrated bands: how often they contain the error, how wide they are, and both in
 one score.
 
 A band is meant for v and β each: figures of β are in degrees, those of v have the suffix ``_vy``.
@@ -43,6 +43,19 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     it is scored.
 
     All levels are in proportion to that at 90 %.
+
+    Parameters
+    ----------
+    parts : sequence of Scored
+        Ranges or sequences of a test set, with the half widths of the bands at 90 % [m/s, rad].
+    bands : Bands
+        Their calibration, which has the half widths of the other levels.
+
+    Returns
+    -------
+    dict
+        ``vy`` and ``sideslip`` -> errors, (N,), half widths, (N, levels), and which samples of all
+        parts these are.
     """
     sideslip_error = np.concatenate(
         [
@@ -86,6 +99,13 @@ def band_figures(
     manoeuvres, which are the blocks that bands are calibrated by; ``error_icc`` intraclass
     correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres
     these are spread over. Nothing of a quantity that is scored at no sample.
+
+    Parameters
+    ----------
+    banded_errors : mapping
+        As `banded` makes it of ``parts``.
+    turns : sequence of FloatArray or None
+        Yaw rate of each part, one a scored sample.
     """
     manoeuvres = np.concatenate(
         manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0]
@@ -126,6 +146,12 @@ def coverage_intervals(
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`;
     nothing where there are too few.
+
+    Returns
+    -------
+    dict
+        Name of a coverage, such as ``coverage_90_vy`` -> lower and upper end of its interval, as
+        fractions.
     """
     all_segments = segments_of(parts, rate_hz)
     intervals = {}
@@ -198,7 +224,7 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
     CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to
     it. Of a Gaussian, at levels 50, 68, 90 and 95 %, that is 2.6 % too low on average, and within 2
-    σ off by up to 0.045 σ: the tails beyond 97.5 % are taken for their end.
+    σ off by up to 0.045 σ: the tails beyond 97.5 % count as their end.
 
     Parameters
     ----------
@@ -225,10 +251,10 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
 def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
     """95 % interval of a proportion that is known by blocks: the exact binomial one of as many
-    samples as the blocks are worth.
+    samples as the blocks are equivalent to.
 
     These would have the variance that the blocks show, and are fewer for what so few blocks know of
-    it; where all are inside, or none, each block is worth one.
+    it; where all are inside, or none, each block counts as one.
 
     Parameters
     ----------

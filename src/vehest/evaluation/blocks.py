@@ -126,6 +126,19 @@ def read_segments(path: Path) -> dict[str, Segments]:
 def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
     """Number of each segment's block, (K,), by ``losses`` (C, K): a range or sequence each, or
     stretches of the Politis-White length.
+
+    Parameters
+    ----------
+    segments : Segments
+        Segments of a test set, by which range or sequence they are of.
+    losses : FloatArray
+        Of each segment, a row for every loss; blocks are as long as the one that needs the longest.
+
+    Returns
+    -------
+    ndarray of int
+        From 0 on. From `MIN_PIECES_AS_BLOCKS` ranges or sequences on each is a block; no block
+        reaches across two of them.
     """
     pieces = np.unique(segments.piece)
     if len(pieces) >= MIN_PIECES_AS_BLOCKS:
@@ -210,6 +223,12 @@ def _window(covariances: FloatArray, n: int) -> int:
 
 
 def _length(covariances: FloatArray, window: int, n: int) -> float:
+    """Block length of lag weights that are flat up to M/2 and fall to 0 at M, at least 1 and
+    bounded.
+
+    The bound is the lesser of 3 √n and n/3; ``covariances`` are those from lag 0 on, ``window`` is
+    M.
+    """
     lags = np.arange(1, window + 1)
     weights = np.clip(2.0 * (1.0 - lags / window), 0.0, 1.0)
     spread = 2.0 * float(np.sum(weights * lags * covariances[1 : window + 1]))
@@ -222,7 +241,15 @@ def _length(covariances: FloatArray, window: int, n: int) -> float:
 
 
 def block_sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
-    """Sums of segments' values over blocks: (…, K) to (…, B)."""
+    """Sums of segments' values over blocks: (…, K) to (…, B).
+
+    Parameters
+    ----------
+    values : FloatArray
+        One row or several of them, a value a segment.
+    labels : ndarray of int
+        Number of each segment's block, shape (K,), every one from 0 to B - 1.
+    """
     rows = np.atleast_2d(values)
     summed: FloatArray = np.stack([np.bincount(labels, weights=row) for row in rows])
     return summed if values.ndim > 1 else np.asarray(summed[0])

@@ -154,7 +154,17 @@ def drives_of(
 
 
 def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
-    """One range or sequence of a recording, with the warm-up before it."""
+    """One range or sequence of a recording, with the warm-up before it.
+
+    Parameters
+    ----------
+    reference : Recording
+        The whole recording, at the evaluation rate.
+    span : Span
+        The range; samples of the warm-up are those before it, as far as there are any.
+    protocol : Protocol
+        Warm-up, first samples that are not scored, and lowest speed.
+    """
     begin = reference.index_range(span.start - protocol.warm_up_seconds, span.stop)[0]
     first, end = scored_range(reference, span, protocol)
     inputs = {name: filled(reference[name][begin:end]) for name in INPUTS if name in reference}
@@ -206,6 +216,17 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
 
     The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which
     nothing is known.
+
+    Parameters
+    ----------
+    drives : sequence of Drive
+        Of which the scored samples count; their third differences, less what measured lateral
+        acceleration and yaw rate explain, show the noise.
+
+    Returns
+    -------
+    Floor or None
+        Deviations of v [m/s] and of the sideslip [deg] at samples at which it is scored.
     """
     third = []
     explained = []
@@ -409,7 +430,21 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
-    """A process by its root mean square and the time in which its autocorrelation falls to 1/e."""
+    """A process by its root mean square and the time in which its autocorrelation falls to 1/e.
+
+    Parameters
+    ----------
+    series : sequence of FloatArray
+        Samples of uninterrupted stretches, any unit.
+    rate_hz : float
+        Their rate [Hz].
+
+    Returns
+    -------
+    Noise
+        Without a white part; its time constant is one interval at least, and at most the length of
+        the longest stretch [s].
+    """
     deviation = _rms(series)
     longest = max(len(samples) for samples in series)
     total = np.zeros(longest)
@@ -424,6 +459,9 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
+    """Levels of all drives together of what an estimator cannot know: of the reference, of the
+    sensors among ``inputs`` and, with ``car``, of the axles.
+    """
     parts = [drive.scored for drive in drives]
     rate = drives[0].rate_hz
     lateral = longitudinal = rear = front = None
@@ -483,6 +521,12 @@ def _unexplained(
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
+    """An axle's slip and arm by least squares over all drives, and the noise of what they leave
+    over.
+
+    The target is the lateral velocity at the centre of gravity [m/s], for the front axle less that
+    of the wheels' heading, δ u.
+    """
     columns = [
         _axle_columns(drive, inputs, front) for drive in parts
     ]  # slip and arm make up v, or v - δ u
@@ -603,10 +647,12 @@ def _in_steps(process: Noise, step: float) -> tuple[float, float]:
 
 
 def _middle(samples: FloatArray) -> FloatArray:
+    """Means of neighbouring samples, (T - 1,), as differences have their times."""
     return 0.5 * (samples[1:] + samples[:-1])
 
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+    """Lateral and forward velocity of the scored samples of all drives, (N,) each [m/s]."""
     parts = [drive.scored for drive in drives]
     return np.concatenate([drive.vy_ref for drive in parts]), np.concatenate(
         [drive.inputs["vx"] for drive in parts]
@@ -614,6 +660,7 @@ def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
 
 
 def _is_sideslip_scored(drives: Sequence[Drive]) -> BoolArray:
+    """Which of the scored samples of all drives count for the sideslip, (N,)."""
     return np.concatenate([drive.scored.is_sideslip_scored for drive in drives])
 
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vehest.data.recording import Recording
+from vehest.data.recording import DERIVED, Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
@@ -42,7 +42,7 @@ def lever_arm_figures(
     speeds = []
     for reference, span in pieces:
         turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
-        derived = reference.provenance.get("derived")  # from the data set's declaration
+        derived = reference.provenance.get(DERIVED)  # from the data set's declaration
         if (
             turning is None
             or not isinstance(derived, dict)

@@ -121,7 +121,7 @@ class Protocol:
     # whether estimates start at the reference state of the first sample
     initial_state: bool = False
     # test sets, with commas between them, of another car or tyre than the training's that the
-    # recordings do not tell apart by their
+    # recordings do not distinguish by their
     # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
     # speed of the car by its reference, from which on sideslip is scored [m/s]: on every data set,
@@ -273,7 +273,27 @@ def sequences(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Span]:
     """The stretches that estimates are made of: the ranges, or the sequences that they are cut
-    into; `DataError` if all are too short.
+    into.
+
+    Parameters
+    ----------
+    spans : sequence of Span
+        Ranges of a test set.
+    recording_of : callable
+        Range -> the recording that it lies in, at ``protocol.rate_hz``; not called where the
+        protocol has no sequences.
+    protocol : Protocol
+        With the length of a sequence.
+
+    Returns
+    -------
+    list of Span
+        In the order of the ranges; a rest that is shorter than a sequence is left out.
+
+    Raises
+    ------
+    DataError
+        All ranges are shorter than a sequence.
     """
     if protocol.sequence_seconds is None:
         return list(spans)
@@ -297,8 +317,17 @@ def sequences(
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol hands over at the first sample: ``vx``, ``vy`` [m/s], ``yaw_rate``
-    [rad/s]; `DataError` in a gap.
+    """The state that a protocol passes at the first sample of a range.
+
+    Returns
+    -------
+    dict
+        ``vx``, ``vy`` [m/s] and ``yaw_rate`` [rad/s], ISO 8855.
+
+    Raises
+    ------
+    DataError
+        The reference lacks one of them, or has a gap there.
     """
     first = reference.index_range(span.start, span.stop)[0]
     state = {}
@@ -319,8 +348,23 @@ def score_all(
     recording_of: Callable[[Span], Recording],
     protocol: Protocol,
 ) -> list[Scored]:
-    """Score a test set's estimates by place in its `sequences`; ``recording_of`` a range is at
-    ``protocol.rate_hz``; raises `DataError`.
+    """Score a test set's estimates.
+
+    Parameters
+    ----------
+    estimate_of : callable
+        Place in the test set's `sequences` -> its estimate.
+    spans : sequence of Span
+        Ranges of the test set.
+    recording_of : callable
+        Range -> the recording that it lies in, at ``protocol.rate_hz``.
+    protocol : Protocol
+        What is scored.
+
+    Raises
+    ------
+    DataError
+        All ranges are shorter than a sequence, or an estimate or reference is missing.
     """
     return [
         score(estimate_of(position), reference, piece, protocol)
@@ -332,7 +376,19 @@ def pieces_of(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> Iterator[tuple[Recording, Span]]:
     """Each range or sequence of a test set with the whole recording that it lies in, one in memory
-    at a time; raises `DataError`.
+    at a time.
+
+    Yields
+    ------
+    reference : Recording
+        At the rate of the protocol, made again only where the recording changes.
+    piece : Span
+        The range or sequence.
+
+    Raises
+    ------
+    DataError
+        As `sequences` does.
     """
     read = lru_cache(maxsize=1)(
         lambda dataset, recording: recording_of(Span(dataset, recording))
@@ -346,7 +402,17 @@ def pieces_of(
 
 
 def scored_range(reference: Recording, span: Span, protocol: Protocol) -> tuple[int, int]:
-    """First index and end index of the samples of a recording that are scored in a range."""
+    """First index and end index of the samples of a recording that are scored in a range.
+
+    Parameters
+    ----------
+    reference : Recording
+        The recording, at any rate.
+    span : Span
+        The range; samples of its first ``protocol.skip_seconds`` [s] are left out.
+    protocol : Protocol
+        What is scored.
+    """
     return reference.index_range(
         max(span.start, reference.start_time) + protocol.skip_seconds, span.stop
     )
@@ -569,8 +635,24 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Sizes of errors of vx, vy and yaw rate, such as `np.square`, times `WEIGHTS`, summed, (K,);
-    `DataError` where one is missing.
+    """Sizes of errors of vx, vy and yaw rate, times `WEIGHTS`, summed.
+
+    Parameters
+    ----------
+    part : Scored
+        Errors in SI units, shape (K,) each.
+    size : callable
+        Size of errors, element by element, such as `np.square`.
+
+    Returns
+    -------
+    FloatArray
+        Shape (K,).
+
+    Raises
+    ------
+    DataError
+        An estimate or a reference is missing.
     """
     errors = part.errors
     missing = [name for name in WEIGHTS if name not in errors]
@@ -586,6 +668,10 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
 
 
 def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
+    """Figures of the states beside the lateral velocity that all parts have estimates of.
+
+    The weighted ones are there only where all states of `WEIGHTS` are.
+    """
     common = set.intersection(*(set(part.errors) for part in parts))
     figures = {
         f"rmse_{name}": float(
@@ -607,6 +693,11 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
+    """Figures of the estimated covariances and innovations; each only where all parts have them.
+
+    ``nees`` and the coverages are over all states whose covariance is estimated, and of the lateral
+    velocity, respectively.
+    """
     figures = {}
     kinds = {part.covariance_of for part in parts}
     if len(kinds) == 1 and "vy" in (names := kinds.pop()):

@@ -64,7 +64,8 @@ class Ranking:
     pairs: Mapping[tuple[Name, Name], Comparison]
     n_blocks: int  # resampled blocks; no intervals and comparisons below `MIN_BLOCKS`
     block_seconds: float  # mean time in a block at which sideslip is scored [s]
-    effective_blocks: float  # how many equal blocks the best one's squared error is spread over
+    # Kish's effective number of blocks, by the squared error of the best estimator
+    effective_blocks: float
 
     @property
     def missing_baselines(self) -> list[str]:

@@ -470,6 +470,9 @@ def _degrees_of_freedom(
 
 
 def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
+    """A value's interval and p-value by Student's distribution, the standard error being the spread
+    of the values that were drawn.
+    """
     error = float(np.std(drawn))
     half = float(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0)) * error
     ratio = abs(value) / error if error > 0 else (np.inf if value else 0.0)

@@ -76,8 +76,8 @@ def errors_under_fault(
 def flags_under_fault(
     parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float
 ) -> dict[str, float]:
-    """Whether bands hold and faults are flagged while they last, over all parts together, at
-    ``rate_hz`` [Hz].
+    """Whether bands contain the error and faults are flagged while they last, over all parts
+    together, at ``rate_hz`` [Hz].
 
     Errors count where sideslip is scored, flags at all samples.
 
@@ -86,6 +86,15 @@ def flags_under_fault(
     which nothing is flagged before the fault's end, ``detection_delay`` mean time to the first flag
     of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures
     that there is something for.
+
+    Parameters
+    ----------
+    parts : sequence of Scored
+        Ranges or sequences that were scored.
+    flagged : sequence of Flags
+        Of each the half width of the band [rad], NaN without, and its health, 0 where it is valid.
+    windows : sequence of Window
+        Of each first and end time of the fault [s].
     """
     inside = []
     valid = []
@@ -122,6 +131,12 @@ def flags_under_fault(
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
+    """Errors over the samples that masks select of all parts: of the sideslip [deg] and of the
+    lateral velocity [m/s].
+
+    Sideslip is NaN where none of these samples counts for it; its error is turned into ±180°.
+    """
+
     def over_all(error_of: Callable[[Scored], FloatArray]) -> FloatArray:
         return np.concatenate(
             [error_of(part)[mask] for part, mask in zip(parts, masks, strict=True)]

@@ -1,4 +1,11 @@
-"""Writes an export: sources, vectors and README, completely or not at all."""
+"""Writes an export: sources, vectors and README, completely or not at all.
+
+    estimator, calibration --`GuardedStepper`--> sources (program.py), README
+    test drive --`replayed` in float64--> test_vectors.csv, expected.csv
+
+The C program reads the vectors and compares its outputs with the expected ones (`TOLERANCES`), so
+that every export can be checked on its own target.
+"""
 
 from __future__ import annotations
 
@@ -153,6 +160,11 @@ def refuse_unresolved(trust: Trust | None) -> None:
 
     A channel that was computed from the others does.
 
+    Parameters
+    ----------
+    trust : Trust or None
+        Calibration; without health nothing is refused.
+
     Raises
     ------
     ConfigurationError
@@ -180,7 +192,11 @@ def refuse_unresolved(trust: Trust | None) -> None:
 
 
 def _refuse_foreign(out: Path) -> None:
-    """Only an earlier export is replaced."""
+    """Raise `ConfigurationError` where a folder holds anything that is no part of an export.
+
+    Only an earlier export is replaced: a real folder that is empty, or
+    whose files are all in `FILES`, `EXPORT_MARKER` among them.
+    """
     if not out.exists() and not out.is_symlink():
         return
     if out.is_symlink() or not out.is_dir():

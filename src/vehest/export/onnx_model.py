@@ -122,7 +122,11 @@ class _Step(nn.Module):
 
 
 class _WindowStep(_Step):
-    """NaN while rows of the window are: those that it starts with."""
+    """Step of a windowed network: the window moves by one row, and the network runs over it.
+
+    The window starts with NaN, and its sum, times 0, is added to the result, so that the estimate
+    is NaN until every row has been measured.
+    """
 
     def __init__(self, estimator: WindowedEstimator) -> None:
         network = copy.deepcopy(estimator.network)
@@ -137,6 +141,7 @@ class _WindowStep(_Step):
         )
 
     def forward(self, sample: Tensor, window: Tensor) -> tuple[Tensor, ...]:
+        """Sample (C,) and window (N, C) to vy () and the next window."""
         window = torch.cat([window[1:], sample.unsqueeze(0)])
         return self.network(prepare(self.network, window)) + 0.0 * window.sum(), window
 
@@ -158,10 +163,13 @@ class _VelocityStep(_Step):
         ], *self.network.recurrent.parameters()
 
     def _velocities(self, standardised: Tensor) -> tuple[Tensor, ...]:
+        """Velocities in SI units from standardised ones (outputs,), one tensor each."""
         return (standardised * self.network.output_scale + self.network.output_mean).unbind()
 
 
 class _GruStep(_VelocityStep):
+    """Step of `VelocityGruNetwork`, with the hidden state ``h`` (H,)."""
+
     slope: Tensor
 
     def __init__(self, estimator: VelocityGru) -> None:
@@ -171,13 +179,19 @@ class _GruStep(_VelocityStep):
         )
 
     def forward(self, sample: Tensor, h: Tensor) -> tuple[Tensor, ...]:
+        """Sample (C,) and hidden state to velocities () and the next hidden state."""
         x, *weights = self._driven(sample)
         h = torch.gru_cell(x, h[None], *weights)[0]
         return *self._velocities(nn.functional.prelu(self.network.read_out(h), self.slope)), h
 
 
 class _LstmStep(_VelocityStep):
-    """Begins with the velocities that are measured, 0 for the lateral one."""
+    """Step of `VelocityLstmNetwork`.
+
+    States are ``h`` and ``c`` (H,), ``y``, the last standardised velocities (outputs,), and
+    ``started`` (1,), 0 before the first sample. The first step begins with the velocities that are
+    measured, 0 for the lateral one.
+    """
 
     is_measured: Tensor
 
@@ -194,6 +208,7 @@ class _LstmStep(_VelocityStep):
     def forward(
         self, sample: Tensor, h: Tensor, c: Tensor, y: Tensor, started: Tensor
     ) -> tuple[Tensor, ...]:
+        """Sample (C,) and states to velocities () and the next states."""
         first = (
             sample[self.measured] * self.is_measured - self.network.output_mean
         ) / self.network.output_scale
@@ -214,6 +229,7 @@ class _SampleStep(_Step):
         self.speed = estimator.channels.index("vx")
 
     def forward(self, sample: Tensor) -> tuple[Tensor, ...]:
+        """Sample (C,) to vy () [m/s] and sideslip () [rad]; there is no state."""
         w1, b1, w2, b2, w3, b3 = (parameter[0] for parameter in self.network.parameters())
         hidden = torch.relu(torch.relu(self.network.scaled(sample) @ w1 + b1) @ w2 + b2)
         sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-STEEPEST, STEEPEST)

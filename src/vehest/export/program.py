@@ -4,6 +4,10 @@ The method, the contract around it with explicit state, and a program.
 
 Numbers are read from a `GuardedStepper` itself, so that C and Python hold the same, to the last
 bit.
+
+    `GuardedStepper` --method_files--> vehest_method.h, .c
+                     --context_of--> vehest_types.h, vehest_health.*, vehest_estimator.*
+                     --> main.c, Makefile
 """
 
 from __future__ import annotations
@@ -76,6 +80,13 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
     """Header and source of a fitted estimator's method, by the family's template; name -> text.
 
     Raises `ConfigurationError`: the family has no C, or the estimator is not causal or not fitted.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        Fitted and causal; its ``c_values`` fill the template.
+    precision : Precision
+        Type of ``vehest_real``.
     """
     if not estimator.template:
         raise ConfigurationError(
@@ -160,7 +171,17 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
 
 
 def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
-    """Variables of the contract's templates."""
+    """Variables of the contract's templates.
+
+    Parameters
+    ----------
+    stepper : GuardedStepper
+        In its initial state; guard, front end, watch, health, bands and clock are read from it.
+    precision : Precision
+        By which limits become literals.
+    title : str
+        For the banners; characters beyond ASCII are replaced.
+    """
     estimator = stepper.estimator
     monitor = stepper.monitor
     rate = float(estimator.settings.rate_hz)
@@ -210,6 +231,8 @@ def guard_table(guard: Guard) -> dict[str, Any]:
     """Limits of each channel, longest runs, bridged samples, and samples that confirm a new level.
 
     A row of limits is low, high, jump, lower and upper stop.
+
+    Infinite runs become `NEVER`, and limits beyond `ENDLESS` infinity.
     """
     runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard.limits[:, 3]]
     limits = _endless(guard.limits[:, [0, 1, 2, 4, 5]]).tolist()
@@ -222,12 +245,16 @@ def guard_table(guard: Guard) -> dict[str, Any]:
 
 
 def _endless(values: FloatArray) -> FloatArray:
-    """The same with infinity for what stands for it."""
+    """The same with infinity instead of the numbers that represent it."""
     return np.where(np.abs(values) >= ENDLESS, np.copysign(np.inf, values), values)
 
 
 def front_end_table(front: FrontEnd) -> dict[str, Any]:
-    """Sections of the low-pass, and of how many samples how many rows are made."""
+    """Sections of the low-pass, and of how many samples how many rows are made.
+
+    The ratio of the rates is the nearest fraction with a denominator of at most
+    `MAX_RATIO_DENOMINATOR`: ``of`` rows are made of ``every`` samples.
+    """
     ratio = Fraction(front.ratio).limit_denominator(MAX_RATIO_DENOMINATOR)
     rate = front.ratio * front.guard.rate_hz
     return {
@@ -266,7 +293,7 @@ def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
 
 
 def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
-    """Tables of `vehest.trust.health_kernel` by name; None where no health was learnt."""
+    """Tables of `vehest.trust.health_kernel` by name; None where no health was calibrated."""
     if packed is None:
         return None
     layout = Layout(*map(int, views(Layout, packed, ())[0]))

@@ -127,7 +127,15 @@ def limit(value: float, precision: Precision) -> str:
 
 
 def braced(values: Any, write: Callable[[Any], str]) -> str:
-    """An array of any depth as the initialiser of a table, in lines that can be read."""
+    """An array of any depth as the initialiser of a table, in lines that can be read.
+
+    Parameters
+    ----------
+    values : any
+        Number, or array of any dimension; each dimension becomes a pair of braces.
+    write : callable
+        Literal of one number.
+    """
     array = np.asarray(values)
     if array.ndim == 0:
         return write(array.item())
@@ -167,6 +175,11 @@ def ascii_only(text: str) -> str:
 
 @cache
 def _environment(precision: Precision, beside: Path | None) -> Environment:
+    """Jinja environment of a precision, cached; undefined variables raise.
+
+    Its filters write numbers: ``real`` one, ``table`` an array, ``ascii`` text for comments,
+    ``unit`` the unit of a channel.
+    """
     from jinja2 import (
         ChoiceLoader,
         Environment,

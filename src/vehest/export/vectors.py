@@ -1,6 +1,12 @@
 """Test vectors of an export.
 
 A short drive with everything that goes wrong on a bus, and what Python makes of it.
+
+    limits of the guard, sizes in training --drive_for--> times, samples with faults
+    --replayed: `GuardedStepper.step` row by row--> expected outputs
+
+The drive depends on the model's limits and on no random number generator of a library, so that it
+is the same on every machine.
 """
 
 from __future__ import annotations
@@ -19,7 +25,7 @@ from vehest.trust.contract import GuardedStepper
 
 SECONDS = 12.0
 COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
-RADIUS = 0.3  # m, of a wheel where nothing was learnt
+RADIUS = 0.3  # m, of a wheel where nothing was fitted
 
 
 def replayed(
@@ -47,7 +53,10 @@ def replayed(
 
 
 def in_float64(estimator: Estimator) -> Estimator:
-    """The same estimator with weights in float64, also where it was trained in float32."""
+    """The same estimator with weights in float64, also where it was trained in float32.
+
+    The expected outputs are then as exact as C in double.
+    """
     twin = type(estimator)(estimator.settings)
     twin.preparation = estimator.preparation
     twin.load_weights(
@@ -123,7 +132,7 @@ def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
     """Largest and usual values of channels in training.
 
-    Round ones of a passenger car where nothing was learnt.
+    Round ones of a passenger car where nothing was fitted.
     """
     names = stepper.channels
     table = health_table(stepper.monitor.packed_health)
@@ -160,7 +169,15 @@ def _noise(n: int, seed: int) -> FloatArray:
 
 
 def table_text(columns: Sequence[str], rows: FloatArray) -> str:
-    """A table as CSV, every number so that it reads back to the same."""
+    """A table as CSV, every number so that it reads back to the same.
+
+    Parameters
+    ----------
+    columns : sequence of str
+        Header.
+    rows : array
+        (T, C); NaN becomes ``nan``.
+    """
     out = io.StringIO()
     np.savetxt(out, rows, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
     return out.getvalue()

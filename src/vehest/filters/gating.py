@@ -1,5 +1,9 @@
 """Gates: a measurement too far from what a filter expects is refused, unless it has been for so
 long that the filter must be wrong.
+
+Flow: a filter computes an innovation and its variance for each measurement, and `refuses` decides.
+The only state is one counter for each measurement, which the caller stores between samples, so that
+a filter that runs sample by sample decides as one over a whole recording.
 """
 
 from __future__ import annotations
@@ -28,14 +32,41 @@ class Gate(NamedTuple):
 
     @classmethod
     def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:
-        """A gate that opens again after 0.5 s; none: no gate."""
+        """A gate that opens again after 0.5 s; none: no gate.
+
+        Parameters
+        ----------
+        deviations : float | None
+            Standard deviations of the innovation beyond which a measurement is refused.
+        rate_hz : float
+            Rate of the filter [Hz], by which `PATIENCE` becomes a number of samples.
+        """
         return None if deviations is None else cls(deviations, max(1, round(PATIENCE * rate_hz)))
 
 
 @numba.njit(inline="always")
 def refuses(error, variance, limit, patience, refused, i):  # type: ignore[no-untyped-def]
-    """Whether measurement i is refused, given its innovation, its variance and ``limit``,
-    deviations²; counts in ``refused``, (m,).
+    """Decide whether measurement i is refused, and update its counter.
+
+    A contradiction counts up to twice the patience; an accepted measurement counts an open gate
+    down by one, and sets the counter of a closed one to 0. The gate is open while the counter is
+    above the patience.
+
+    Parameters
+    ----------
+    error : float
+        Innovation y_i - ŷ_i, in the measurement's unit.
+    variance : float
+        Variance of the innovation. A NaN in either counts as an agreement, since no comparison with
+        it is true.
+    limit : float
+        Squared deviations of the `Gate`.
+    patience : int
+        Samples of the `Gate`.
+    refused : array
+        Counters (m,), int64; entry i is changed.
+    i : int
+        Index of the measurement.
     """
     if not error * error > limit * variance:
         refused[i] = refused[i] - 1 if refused[i] > patience else 0

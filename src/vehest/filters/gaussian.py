@@ -1,4 +1,4 @@
-"""What all filters hand around: Gaussian states, and what filtering a sequence leaves behind."""
+"""Data types of all filters: Gaussian states, and the result of filtering a sequence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Gaussian(NamedTuple, Generic[Array]):
 
 
 class Filtered(NamedTuple, Generic[Array]):
-    """What a filter knows after a sequence of T samples."""
+    """Result of a filter over a sequence of T samples."""
 
     # state at each sample before its measurement; mean (..., T, n); the first is the initial state
     predicted: Gaussian[Array]

@@ -32,6 +32,10 @@ class LinearModel(NamedTuple, Generic[Array]):
 def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray]) -> FloatArray:
     """Mean states given all measurements, earlier and later ones, (T, n).
 
+        x̂_k = x_k + G_k (x̂_{k+1} - x⁻_{k+1}),   G_k = P_k A_kᵀ (P⁻_{k+1})⁻¹,   x̂_{T-1} = x_{T-1}
+
+    with filtered x_k, P_k and predicted x⁻, P⁻. Smoothed covariances are not computed.
+
     Parameters
     ----------
     model : LinearModel[FloatArray]

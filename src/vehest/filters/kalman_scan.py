@@ -45,8 +45,8 @@ def kalman_scan(
     gate : Gate | None, default None
         Which measurements are refused; none: all are taken.
     refused : NDArray[np.int64] | None, default None
-        How often on end each measurement was before the first sample, (m,); after the last one on
-        return. None: never.
+        How often in a row each measurement was refused before the first sample, (m,); after the
+        last one on return. None: never.
 
     Raises
     ------
@@ -97,6 +97,11 @@ def kalman_scan(
 def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names
     it.
+
+    Raises
+    ------
+    ValueError
+        The shape does not broadcast; the message names the array.
     """
     if values.shape == shape and values.dtype == np.float64:
         return np.ascontiguousarray(values)
@@ -124,10 +129,35 @@ def _scan(  # type: ignore[no-untyped-def]
     patience,
     refused,
 ):
-    """Write states and innovations; return the sample at which an innovation variance is not
-    positive, or -1.
+    """Run the filter (see the module) and write states and innovations.
 
-    With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
+    For each sample k: prediction from k - 1 (x⁻, P⁻); innovations and S of all measurements
+    together, for the caller; then one scalar update for each measurement, from the last to the
+    first, each with the state that the one before it left:
+
+        e = y_c - d_c - C_c x,  s = C_c P C_cᵀ + R_c,  g = P C_cᵀ/s
+        x += g e,  P = (I - g C_c) P (I - g C_c)ᵀ + R_c g gᵀ
+
+    Parameters
+    ----------
+    A, b, Q, C, d, R : array
+        See `LinearModel`, each with a dimension for time.
+    y : array
+        (T, m); with a finite ``limit`` what the gate refuses becomes NaN in it.
+    start : tuple
+        Mean (n,) and covariance (n, n) at the first sample before its measurement.
+    predicted, filtered : tuple
+        Mean (T, n) and covariance (T, n, n), which are written.
+    innovation, innovation_cov : array
+        (T, m) and (T, m, m), which are written.
+    limit, patience, refused
+        See `refuses`; an infinite limit is no gate.
+
+    Returns
+    -------
+    int
+        Sample at which the variance of an innovation is not positive or a state is not a number,
+        from which on nothing is written; -1 where there is none.
     """
     (prior_mean, prior_cov) = predicted
     (post_mean, post_cov) = filtered

@@ -17,7 +17,7 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
     together.
 
     A linear-phase FIR filter (Kaiser window) passes from 1.25 times the cut-off on and is 60 dB
-    down below 0.75 times of it. Only samples count where the filter sees measured samples alone:
+    down below 0.75 times of it. Only samples count where the filter reads measured samples alone:
     none at the ends, none around gaps (NaN).
 
     Parameters

@@ -1,5 +1,10 @@
 """Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled
 for use; a floor for their entropy.
+
+All covariances are products L Lᵀ of a lower triangular factor whose n (n + 1)/2 entries are stored
+row by row. `ConstantNoise` and `StateDependentNoise` are modules for training, called with states
+(..., k) and inputs; `compiled_noise` copies their present values into a `CompiledNoise`, which a
+compiled filter calls at every sample.
 """
 
 from __future__ import annotations
@@ -50,8 +55,20 @@ class ConstantNoise(nn.Module):
         self.register_buffer("learnt", (rows == columns) | correlated, persistent=False)
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor | None = None) -> None:
-        """Start from a covariance, (n, n), and learn in units of ``pace`` times its deviations, so
-        that all entries learn alike.
+        """Start from a covariance, and learn in units of ``pace`` times its deviations.
+
+        All entries of a row of the factor then have one unit, so that one step of an optimiser
+        changes all states alike, whatever their units.
+
+        Parameters
+        ----------
+        covariance : Tensor
+            (n, n), positive definite. Entries off the diagonal are ignored where they are not
+            learnt.
+        pace : float
+            Unit of an entry, in standard deviations of its state.
+        state_unit : Tensor | None, default None
+            Not used here; accepted so that both noise models are called alike.
         """
         with torch.no_grad():
             if not self.learnt.all():
@@ -98,9 +115,17 @@ class StateDependentNoise(nn.Module):
         self.reset()
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
-        """Start from a covariance, (n, n), see `ConstantNoise.begin`.
+        """Start the constant part from a covariance, see `ConstantNoise.begin`.
 
-        The network receives states in ``state_unit``, (k,).
+        Parameters
+        ----------
+        covariance : Tensor
+            (n, n), of the constant part.
+        pace : float
+            Unit of an entry, in standard deviations of its state; the part that depends on the
+            state has the same unit over √`SCALE`.
+        state_unit : Tensor
+            (k,); states are divided by it before the linear layer.
         """
         self.constant.begin(covariance, pace)
         with torch.no_grad():
@@ -108,13 +133,33 @@ class StateDependentNoise(nn.Module):
             self.state_unit.copy_(state_unit)
 
     def reset(self, generator: torch.Generator | None = None) -> None:
-        """Draw the weights anew."""
+        """Draw the weights anew, normal with the deviation `DEVIATION`; the offsets stay.
+
+        Parameters
+        ----------
+        generator : torch.Generator | None, default None
+            Source of random numbers; torch's global one if None. Weights of entries that are not
+            learnt become 0, and random numbers are drawn for them too.
+        """
         with torch.no_grad():
             drawn = DEVIATION * torch.randn(self.weight.shape, generator=generator)
             self.weight.copy_(torch.where(self.constant.learnt.unsqueeze(-1), drawn, 0.0))
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """The covariance of each state, (..., n, n)."""
+        """Covariance of each state: Q + `SCALE` · L(x) L(x)ᵀ.
+
+        Parameters
+        ----------
+        state : Tensor
+            (..., k), in the state's own units.
+        inputs : Tensor
+            Not used.
+
+        Returns
+        -------
+        Tensor
+            (..., n, n), symmetric.
+        """
         factor = (
             nn.functional.linear(state / self.state_unit, self.weight, self.offset)
             * self.unit[_lower(self.constant.n)[0]]
@@ -124,14 +169,33 @@ class StateDependentNoise(nn.Module):
 
 
 def entropy(covariance: Tensor) -> Tensor:
-    """Differential entropy of a normal distribution [nat], (..., n, n) -> (...)."""
+    """Differential entropy of a normal distribution, ½ (n ln 2πe + ln |det P|).
+
+    Parameters
+    ----------
+    covariance : Tensor
+        (..., n, n).
+
+    Returns
+    -------
+    Tensor
+        (...) [nat]; it depends on the units of the states.
+    """
     n = covariance.shape[-1]
     return 0.5 * (n * math.log(2.0 * math.pi * math.e) + torch.linalg.slogdet(covariance).logabsdet)
 
 
 def with_entropy(covariance: Tensor, min_entropy: float) -> Tensor:
-    """The covariance, scaled up where its entropy lies below ``min_entropy`` [nat]; the shape of
-    its ellipsoid stays.
+    """Scale covariances up where their entropy is too low; the shape of the ellipsoid stays.
+
+    P is multiplied by exp(2 Δ/n), with Δ the missing entropy, which adds Δ to ½ ln det P.
+
+    Parameters
+    ----------
+    covariance : Tensor
+        (..., n, n), positive definite.
+    min_entropy : float
+        Lower bound of the entropy [nat]. Below it the gradient passes through the entropy too.
     """
     short = (min_entropy - entropy(covariance)).clamp(min=0.0)
     return torch.exp(2.0 / covariance.shape[-1] * short)[..., None, None] * covariance
@@ -146,6 +210,7 @@ def _product(factor: Tensor, n: int, floor: float) -> Tensor:
 
 
 def _lower(n: int) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the lower triangle of an n × n matrix, row by row."""
     rows, columns = torch.tril_indices(n, n)
     return rows, columns
 
@@ -157,7 +222,7 @@ def compiled_noise(noise: StateDependentNoise, min_entropy: float = -math.inf) -
     Parameters
     ----------
     noise : StateDependentNoise
-        As it is now; later changes of its parameters are not seen.
+        As it is now; later changes of its parameters have no effect.
     min_entropy : float, default -math.inf
         See `with_entropy` [nat]; none: entropy as it is.
     """
@@ -176,7 +241,23 @@ def compiled_noise(noise: StateDependentNoise, min_entropy: float = -math.inf) -
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyped-def]
-    """Write Q + s L(x) L(x)ᵀ, scaled to at least ``min_entropy``, at states (k, B): (n, n, B)."""
+    """Write Q + s L(x) L(x)ᵀ at states, scaled to at least an entropy.
+
+    Sums run over states k in order for an entry of L, and over columns of L for an entry of the
+    product. The log-determinant for the entropy is that of a Cholesky factor.
+
+    Parameters
+    ----------
+    states : array
+        (k, B), of the noise's precision.
+    inputs : array
+        Not used.
+    car : tuple
+        Constant part (n, n), weight (n (n + 1)/2, k), offset (n (n + 1)/2,), scale s, and
+        ``min_entropy``, -∞ for none.
+    out : array
+        (n, n, B), written for the sequences from ``first`` to ``end``.
+    """
     constant, weight, offset, scale, min_entropy = car
     n = constant.shape[0]
     lower = np.zeros_like(constant)

@@ -1,4 +1,4 @@
-"""Rules by which an unscented filter stands for a normal distribution with a few points."""
+"""Rules by which an unscented filter represents a normal distribution by a few points."""
 
 from __future__ import annotations
 
@@ -22,6 +22,19 @@ def symmetric_rule(n: int, kappa: float) -> SigmaRule:
     n + κ is positive. With κ < 0 the mean has a negative weight, and covariances may lose their
     definiteness; κ = 0 is the cubature rule of Arasaratnam & Haykin 2009, with no point at the
     mean.
+
+    Parameters
+    ----------
+    n : int
+        Number of states.
+    kappa : float
+        κ, above -n.
+
+    Returns
+    -------
+    SigmaRule
+        Spread √(n + κ), κ/(n + κ) for the mean point and 1/(2(n + κ)) for each other one. All
+        weights together are 1.
     """
     total = n + kappa
     return SigmaRule(math.sqrt(total), kappa / total, kappa / total, 0.5 / total)

@@ -69,7 +69,15 @@ class Tape(NamedTuple):
 
 
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
-    """A tape for n states and m measurements."""
+    """A tape of T = ``steps`` samples and B = ``sequences`` for n states and m measurements.
+
+    ``dtype`` is the precision of all arrays but the flags.
+
+    Returns
+    -------
+    Tape
+        Values are not filled; the flags are False.
+    """
     points = 2 * n + 1
     shapes: list[tuple[int, ...]] = [
         (n,),
@@ -93,6 +101,12 @@ def forward_scratch(tape: Tape) -> tuple[Any, ...]:
     """Scratch memory of one call of `forward`.
 
     Each call has its own, so that no two threads write to one cache line at every step.
+
+    Returns
+    -------
+    tuple
+        Drawn points, factors and covariances; flags (B,) of lost definiteness; process noise (n, n,
+        B) and measurement noise (m, m, B) where these are functions of the state.
     """
     points = tape.moved[0]
     covariance = tape.prior_covariance[0]
@@ -136,11 +150,19 @@ def by_address(function: Any, *arguments: Any) -> CompileResultWAP:
     """A compiled function for arguments of these types, to be called by address.
 
     A loop that receives it compiles no copy of it.
+
+    Parameters
+    ----------
+    function : Any
+        numba dispatcher; it is compiled for these types if it is not yet.
+    *arguments : Any
+        Examples of the arguments, of which only the types count.
     """
     return _of_types(function, tuple(typeof(argument) for argument in arguments))
 
 
 def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
+    """Compile a function for argument types and return it as a value that is called by address."""
     function.compile(kinds)
     return CompileResultWAP(function.overloads[kinds])
 
@@ -164,6 +186,8 @@ Backward = namedtuple(
 def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultWAP, ...]:
     """The steps of a loop, `FORWARD` or `BACKWARD`, for arrays of a precision, as it takes them
     where it is compiled.
+
+    It compiles each step once for each precision; later calls return the same objects.
     """
     return tuple(_of_types(step, types_of(step, dtype)) for step in steps)
 
@@ -191,6 +215,31 @@ def forward(
     ``noise`` = (process, measurement) covariances, (T, k, k, B) each. Where there is a function
     ``at_state`` or ``at_prior``, covariances are what it writes: ``at(states, inputs, car, out,
     first, end)``. What the gate refuses becomes NaN in ``y`` and is counted in ``refused``, (B, m).
+
+    For k from 0: even half-steps compute points_of -> transition -> moments_of, with inputs and
+    noise of sample k - 1; odd ones compute points_of -> observation -> gate -> update_of, with
+    those of k. The first half-step of a sequence is 1, since the initial state is that of sample 0.
+
+    Parameters
+    ----------
+    calls : Forward
+        Steps and model.
+    at_state, car_at
+        Process noise as a function of the state before the step, and its parameters, or None.
+    at_prior, car_of
+        Measurement noise as a function of the predicted state, and its parameters, or None.
+    setting : Setting
+        Rules and gate.
+    tape : Tape
+        Written at the samples of ``halves``.
+    y, u : array
+        Measurements (T, m, B) and inputs (T, p, B).
+    scratch : tuple
+        See `forward_scratch`.
+    halves : tuple[int, int]
+        First half-step, and the one after the last.
+    first, end : int
+        Range of sequences.
     """
     car = calls.car
     rules = setting.rules
@@ -269,17 +318,34 @@ def forward(
 
 @compiled
 def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):
-    """The adjoint of `forward` over all samples.
+    """The adjoint of `forward` over all samples, from the last to the first.
+
+        x̄⁺_k, P̄⁺_k += gradient of the loss by the filtered state of sample k
+        x̄_k, P̄_k, X̄, h̄ = update_adjoint;  X̄ += observation adjoint of h̄;  points_adjoint of X̄
+        V̄, Q̄ = moments_adjoint of x̄_k, P̄_k;  X̄ = transition adjoint of V̄
+        x̄⁺_{k-1}, P̄⁺_{k-1} = points_adjoint of X̄
+
+    Points are drawn again from the tape's states, which costs less than storing them.
 
     Parameters
     ----------
-    bars
+    calls : Backward
+        Steps and the model's adjoints.
+    setting : Setting
+        As in the forward loop.
+    tape : Tape
+        As the forward loop left it.
+    y, u : array
+        Measurements (T, m, B), with NaN where the gate refused one, and inputs (T, p, B).
+    bars : tuple
         Gradients of process noise, observation noise and measurements, which are written, and of
         filtered means and covariances.
-    scratch
+    scratch : tuple
         See `backward_scratch`.
     gradients
-        Those of the model's parameters are added.
+        Those of the model's parameters, to which is added.
+    first, end : int
+        Range of sequences.
     """
     process_bar, spread_bar, y_bar, mean_up, covariance_up = bars
     (
@@ -354,6 +420,9 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):
 
 @compiled
 def _add(total, values, first, end):
+    """Add values to an array of the same shape (..., B), for the sequences from ``first`` to
+    ``end``.
+    """
     rows = total.reshape(-1, total.shape[total.ndim - 1])
     added = values.reshape(-1, total.shape[total.ndim - 1])
     for row in range(rows.shape[0]):
@@ -363,6 +432,7 @@ def _add(total, values, first, end):
 
 @compiled
 def _clear(values, first, end):
+    """Set an array (..., B) to zero, for the sequences from ``first`` to ``end``."""
     rows = values.reshape(-1, values.shape[values.ndim - 1])
     for row in range(rows.shape[0]):
         for b in range(first, end):

@@ -59,7 +59,7 @@ Share = Callable[[Callable[[int, int], None], int], None]
 
 
 class NonlinearFiltered(NamedTuple):
-    """What a nonlinear filter knows after a sequence."""
+    """Result of a nonlinear filter over a sequence."""
 
     steps: Filtered[Tensor]
     # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in
@@ -108,7 +108,7 @@ class TorchModel(PointModel):
     observation : Function
         h of the same, (..., m).
     parameters : Sequence[Tensor], default ()
-        Leaves that both may use and gradients are wanted for.
+        Leaves that both may use; those that require a gradient receive one.
     lower : Sequence[float] | None, default None
         See `PointModel`.
     """
@@ -132,6 +132,9 @@ class TorchModel(PointModel):
     def _value(
         function: Function, points: Array, inputs: Array, car: Any, out: Array, first: int, end: int
     ) -> None:
+        """Write f or h of the points of some sequences; ``function`` is bound by the
+        constructor.
+        """
         with torch.no_grad():
             value = function(*_of_torch(points, inputs, first, end))
         out[..., first:end] = value.movedim(0, -1).numpy()
@@ -147,6 +150,11 @@ class TorchModel(PointModel):
         gradients: Sequence[Array],
         *ends: int,
     ) -> None:
+        """Write the gradient of the points, and add to those of the parameters.
+
+        ``up`` is the gradient of what ``function`` returned, (S, ..., B). The function is evaluated
+        again, since nothing of the forward pass was stored.
+        """
         with torch.enable_grad():
             state, input_tensor = _of_torch(points, inputs, *ends)
             upstream = torch.from_numpy(_sequences_first(up, *ends))
@@ -163,6 +171,9 @@ class TorchModel(PointModel):
 
 
 def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tensor, Tensor]:
+    """Points (B, S, n) and inputs (B, 1, p) of some sequences as tensors, which share no memory
+    with the arrays.
+    """
     return torch.from_numpy(_sequences_first(points, first, end)), torch.from_numpy(
         _sequences_first(inputs, first, end)
     ).unsqueeze(-2)
@@ -185,6 +196,9 @@ StepNoise = Array | CompiledNoise
 def _setting(
     model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None
 ) -> Setting:
+    """Rules of `unscented_steps` for a model and a precision; without a gate its limit is 0 and
+    not used.
+    """
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
     return Setting(
@@ -240,6 +254,12 @@ def unscented_scan(
         How sequences are shared out over threads; none: one thread.
     gate : Gate | None, default None
         Which measurements are refused; none: all are taken. The decision itself has no gradient.
+
+    Returns
+    -------
+    NonlinearFiltered
+        Predicted and filtered states (B, T, n), innovations (B, T, m), which measurements were
+        used, and where a covariance was repaired, in the precision of the measurements.
 
     Raises
     ------
@@ -314,6 +334,8 @@ def unscented_scan(
 
 class UnscentedStepper:
     """The same filter of one sequence, one sample at a time.
+
+    Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
 
     Parameters
     ----------
@@ -394,14 +416,37 @@ class UnscentedStepper:
         return self.state.mean
 
     def predict(self, inputs: Array, process_noise: StepNoise) -> None:
-        """Move the state to the next sample by inputs of this one."""
+        """Move the state to the next sample by inputs of this one.
+
+        Parameters
+        ----------
+        inputs : Array
+            (p,), held from this sample to the next.
+        process_noise : StepNoise
+            Q, (1, n, n), or at the state.
+        """
         self._run(0, self.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: StepNoise) -> None:
-        """Take in the measurement."""
+        """Take in the measurement.
+
+        Parameters
+        ----------
+        measurement : Array
+            (m,); NaN where nothing was measured.
+        inputs : Array
+            (p,), of this sample.
+        observation_noise : StepNoise
+            R, (1, m, m), or at the predicted state.
+        """
         self._run(1, measurement, inputs, observation_noise)
 
     def _run(self, half: int, measurement: Array, inputs: Array, noise: StepNoise) -> None:
+        """Run half-step 0 (prediction) or 1 (update) on the tape of one sample.
+
+        The prediction writes the prior from the state after the last measurement: with one sample
+        on the tape, sample k - 1 is sample k itself.
+        """
         noise_covariance, at = (
             (noise[0], None)
             if isinstance(noise, np.ndarray)
@@ -428,8 +473,19 @@ class UnscentedStepper:
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
-    """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's
-    parameters alone.
+    """States one step later, without noise.
+
+    Parameters
+    ----------
+    model : PointModel
+        Whose transition is used.
+    states, inputs : Tensor
+        (B, n) and (B, p).
+
+    Returns
+    -------
+    Tensor
+        (B, n), differentiable in the model's parameters alone.
     """
     apply: Any = _Moved.apply
     moved_states: Tensor = apply(model, states, inputs, *model.parameters)
@@ -437,10 +493,13 @@ def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
 
 
 class _Moved(torch.autograd.Function):
+    """Autograd function of `moved`: the model's transition, and its adjoint for the parameters."""
+
     @staticmethod
     def forward(
         ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor
     ) -> Tensor:
+        """Run the transition on states as the only sigma point of each sequence."""
         points, inputs_by_time = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
         ctx.forward_values = (model, points, inputs_by_time[0])
         out = room(points.shape, points.dtype)
@@ -450,6 +509,7 @@ class _Moved(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of the parameters; states and inputs have none."""
         model, points, inputs = ctx.forward_values
         gradients = [
             np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters
@@ -465,6 +525,14 @@ class _Moved(torch.autograd.Function):
 
 
 class _Scan(torch.autograd.Function):
+    """Autograd function of `unscented_scan`.
+
+    Forward copies tensors to arrays by time, runs `forward` of `unscented_loops` for each share of
+    the sequences, and returns filtered means and covariances. Backward runs `backward` over the
+    same tape. Gradients of parameters are added up over the shares in the order of their first
+    sequence.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -481,6 +549,11 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
+        """Fill the tape from half-step 1 on, and return filtered means (B, T, n) and covariances.
+
+        Inputs have further rows for what the model saves for its adjoints where gradients are
+        needed.
+        """
         ctx.set_materialize_grads(False)
         scratch_rows = model.scratch_rows * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
         y = _by_time(measurements)
@@ -511,6 +584,11 @@ class _Scan(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of measurements, initial state, noise and parameters, in this order of
+        arguments.
+
+        Raises `RuntimeError` where noise is a function of the estimate, which has no adjoint.
+        """
         model, setting, share, tape, functions, y, u = ctx.forward_values
         if any(function is not None for function in functions):
             raise RuntimeError(
@@ -537,6 +615,9 @@ class _Scan(torch.autograd.Function):
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
+            """Run the adjoint over sequences ``first`` to ``end`` with gradients of parameters
+            of their own.
+            """
             gradients[first] = [
                 np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters
             ]
@@ -646,4 +727,5 @@ def _by_sequence(values: Array) -> Tensor:
 
 
 def _alone(work: Callable[[int, int], None], sequences: int) -> None:
+    """Do all work in the calling thread."""
     work(0, sequences)

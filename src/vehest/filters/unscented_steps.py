@@ -72,14 +72,33 @@ piece = numba.njit(
 
 
 def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
-    """An array that vectors may be read beyond, not filled or as ``make`` fills it."""
+    """An array that vectors may be read beyond, not filled or as ``make`` fills it.
+
+    Parameters
+    ----------
+    shape : tuple[int, ...]
+        Of the array, C order.
+    dtype : Any
+        Element type.
+    make : Any, default np.empty
+        Function of a length and a type that allocates, such as ``np.zeros``.
+    """
     count = math.prod(shape)
     size = np.dtype(dtype).itemsize
     return make(count + BYTES // size, dtype)[:count].reshape(shape)
 
 
 def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
-    """Types of a step's arguments for arrays of a precision, by their names in `ARGUMENTS`."""
+    """numba types of a step's arguments for arrays of a precision.
+
+    Parameters
+    ----------
+    step : Any
+        Compiled function; its argument names are looked up in `ARGUMENTS`, and those that are not
+        listed have three dimensions.
+    dtype : Any
+        ``np.float32`` or ``np.float64``.
+    """
     number = numba.from_dtype(np.dtype(dtype))
 
     def kind(of: Any) -> Any:
@@ -148,6 +167,21 @@ def points_of(mean, state_covariance, rules, drawn, repaired, first, end):
 
     A covariance that is not positive definite is repaired first (`_repaired`); ``repaired`` (B,)
     says where.
+
+    For each sequence L Lᵀ = P, and X_0 = x, X_{1+j} = x + γ L_j, X_{1+n+j} = x - γ L_j, each
+    component at least the smallest possible value of its state. A sequence without a factor gets
+    NaN points.
+
+    Parameters
+    ----------
+    mean : array
+        x, (n, B).
+    state_covariance : array
+        P, (n, n, B).
+    rules, drawn
+        See the module.
+    repaired : array
+        Flags (B,), written from ``first`` to ``end``.
     """
     (rule, lower, margin, repair) = rules
     (points, factor, covariance) = drawn
@@ -192,6 +226,15 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
 
     x̄ += Σ X̄_s,  L̄_j = γ (X̄_{1+j} - X̄_{1+n+j}),  P̄ += adjoint of the Cholesky factor
     (`_cholesky_adjoint`). A state at its lower bound passes no gradient.
+
+    Parameters
+    ----------
+    mean, factor : array
+        x (n, B) and L (n, n, B) that `points_of` received and wrote.
+    points_bar : array
+        X̄, (2n + 1, n, B).
+    mean_bar, covariance_bar : array
+        x̄ (n, B) and P̄ (n, n, B), to which is added.
     """
     n = mean.shape[0]
     (rule, lower, _, _) = rules
@@ -224,8 +267,21 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
 
 @piece
 def _deviations(values, b, m, rule, deviation, i):
-    """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into
-    scratch (S · m, W).
+    """Write deviations of values from their weighted mean, and return the mean.
+
+    Parameters
+    ----------
+    values : array
+        (S, m, B); component i of all S points is used, for the sequences from b on.
+    deviation : array
+        Scratch (S · m, W), of which the rows of component i are written.
+    i : int
+        Component.
+
+    Returns
+    -------
+    vector
+        Σ w_s V_s,i. The outer points are summed in order first; the mean point is added last.
     """
     count = values.shape[0]
     around = at_row(values, 0, b) * 0
@@ -254,7 +310,20 @@ def _weighted(first_deviation, i, n, second_deviation, j, m, rule, centre):
 
 @compiled
 def moments_of(values, noise, rules, mean, covariance, first, end):
-    """Weighted mean x = Σ w_s V_s and covariance P = Σ v_s (V_s - x)(V_s - x)ᵀ + (Q + Qᵀ)/2."""
+    """Weighted mean x = Σ w_s V_s and covariance P = Σ v_s (V_s - x)(V_s - x)ᵀ + (Q + Qᵀ)/2.
+
+    Each component of the mean is at least the smallest possible value of its state; deviations are
+    from the mean before that bound.
+
+    Parameters
+    ----------
+    values : array
+        V, moved points, (2n + 1, n, B).
+    noise : array
+        Q, (n, n, B); only its symmetric part counts.
+    mean, covariance : array
+        (n, B) and (n, n, B), which are written.
+    """
     (count, n) = values.shape[:2]
     (rule, lower, _, _) = rules
     half = rule.dtype.type(0.5)
@@ -279,6 +348,17 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``.
 
     Q̄ = (P̄ + P̄ᵀ)/2,  D̄_s = 2 v_s Q̄ D_s with D_s = V_s - x,  V̄_s = D̄_s + w_s (x̄ - Σ_r D̄_r).
+
+    A mean at its lower bound passes no gradient. Sums over r run over all points in order.
+
+    Parameters
+    ----------
+    values : array
+        V, (2n + 1, n, B), as `moments_of` received them.
+    mean_bar, covariance_bar : array
+        x̄ (n, B) and P̄ (n, n, B).
+    values_bar, noise_bar : array
+        V̄ (2n + 1, n, B) and Q̄ (n, n, B), which are written.
     """
     (count, n) = values.shape[:2]
     (rule, lower, _, _) = rules
@@ -332,6 +412,15 @@ def gate_of(expected, noise, rules, limit, patience, y, refused, is_gated_out, f
     ``refused`` (B, m) counts how long each has been refused; see `Gate`.
 
     A negative weight of the mean point cannot make a variance smaller than that of the noise.
+
+    Parameters
+    ----------
+    expected : array
+        Measurements at the points, (2n + 1, m, B).
+    noise : array
+        R, (m, m, B), of which the diagonal counts.
+    limit, patience
+        See `refuses`.
     """
     count, m = expected.shape[:2]
     _, centre_mean, centre_covariance, outer_weight = rules[0]
@@ -372,6 +461,23 @@ def update_of(mean, drawn, expected, y, noise, rules, post, update_results, repa
     covariance S (m, m, B), gain K (n, m, B), and the weight of the mean point in covariances (B,),
     which is 0 where a negative weight took the definiteness of P⁺. ``repaired`` is set where S is
     repaired.
+
+    At most three attempts are made for a vector of sequences: with the rule's weights; with a
+    weight of 0 for the mean point in those sequences in which a negative one took the definiteness
+    of P⁺; with S lifted to be positive definite (`_repaired`).
+
+    Parameters
+    ----------
+    mean : array
+        x, (n, B), before the measurement.
+    drawn : tuple
+        Points (2n + 1, n, B), factors, and P (n, n, B), as `points_of` wrote them.
+    expected : array
+        h(X_s), (2n + 1, m, B).
+    y : array
+        Measurements, (m, B).
+    noise : array
+        R, (m, m, B); only its symmetric part counts.
     """
     (rule, lower, margin, repair) = rules
     (points, _, covariance) = drawn
@@ -468,6 +574,9 @@ def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, innovation_co
     """Write C = Σ v_s d_s e_sᵀ, S = Σ v_s e_s e_sᵀ + R and the factor of S.
 
     Returns 1 in lanes in which S is positive definite, else 0.
+
+    Rows and columns of S that belong to a measurement that is NaN are those of the identity, and
+    its columns of C are 0, so that it changes nothing.
     """
     m = y.shape[0]
     half = rule.dtype.type(0.5)
@@ -511,7 +620,11 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):
 
 @piece
 def _solve(factor, right_sides, at, m, solved):
-    """Solve S x = b by the factor of S, for b the m rows of ``right_sides`` from ``at`` on."""
+    """Solve S x = b by the factor of S, for b the m rows of ``right_sides`` from ``at`` on.
+
+    Forward substitution with L, then backward substitution with Lᵀ; columns in order of their
+    index.
+    """
     for j in range(m):
         remainder = _scratch_row(right_sides, at + j)
         for c in range(j):
@@ -666,6 +779,9 @@ def _cholesky(A, L, n):
     """Write lower factors L of matrices A = L Lᵀ, (n · n, W).
 
     Returns 1 in lanes in which the matrix is positive definite, else 0.
+
+    Column by column, with sums over earlier columns in order. Where a matrix is not positive
+    definite, its factor is incomplete and usually NaN; the upper triangle becomes 0, or NaN.
     """
     nothing = _scratch_row(A, 0) * 0
     definite = choose(nothing == 0, nothing + 1, 0.0)
@@ -719,8 +835,19 @@ def _repaired(A, L, lane, n, margin, repair):
 
 @compiled
 def _cholesky_single(A, L):
-    """Write the lower factor of one matrix into L, which is zero; return whether A is positive
-    definite.
+    """Write the lower factor of one matrix.
+
+    Parameters
+    ----------
+    A : array
+        (n, n), of which the lower triangle is read.
+    L : array
+        (n, n), zero on entry.
+
+    Returns
+    -------
+    bool
+        Whether A is positive definite and its factor finite; L is incomplete otherwise.
     """
     n = A.shape[0]
     for j in range(n):
@@ -743,6 +870,15 @@ def _cholesky_single(A, L):
 def _cholesky_adjoint(L, L_bar, inner, A_bar, n):
     """A_bar += sym(L⁻ᵀ Φ(Lᵀ L_bar) L⁻¹), Φ the lower triangle with half the diagonal (Murray 2016,
     Eq. 10).
+
+    Parameters
+    ----------
+    L, L_bar : array
+        Scratch (n · n, W); only the lower triangle of ``L_bar`` counts.
+    inner : array
+        Scratch of the same size, which is overwritten.
+    A_bar : array
+        (n · n, W), symmetric, to which is added.
     """
     half = L.dtype.type(0.5)
     for i in range(n):

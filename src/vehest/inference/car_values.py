@@ -1,6 +1,10 @@
 """Values of a car as settings of a model, and a car's record.
 
 `vehest identify` identifies the record's values on drives and writes them as YAML.
+
+    drives --`vehest identify`--> `CarRecord` as YAML --read_car--> `CarRecord`
+    model, command line, record, data set --adapted--> model with the values of the car
+    configuration of a training, data set --with_car_values--> configuration
 """
 
 from __future__ import annotations
@@ -52,7 +56,10 @@ class Number:
 
 @dataclass(frozen=True)
 class CarRecord:
-    """Numbers of a car; raises `DataError` where one is not of a car."""
+    """Numbers of a car; raises `DataError` where one is not of a car.
+
+    Lengths are measured along the car from the rear axle, forwards positive.
+    """
 
     wheelbase: Annotated[float, Field(ge=0.05, le=20.0)]  # [m]
     cg_to_rear_axle: Positive | None  # as given [m]
@@ -66,6 +73,9 @@ class CarRecord:
     offsets: Mapping[str, Mapping[str, Number]]
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a number beyond `LIMITS`, or a centre of gravity beyond the
+        wheelbase.
+        """
         for name, (low, high) in LIMITS.items():
             if not low < getattr(self, name).value < high:
                 raise DataError(
@@ -183,6 +193,13 @@ def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[s
 
     They replace settings of null and the default wheelbase of the self-calibrating filter. Other
     settings stay, as do all where the cars have no wheelbase or different ones.
+
+    Parameters
+    ----------
+    config : dict
+        Composed, with ``estimator``; it is not changed.
+    cars : iterable of CarValues
+        Of the training's data sets.
     """
     settings = config["estimator"]
     unstated: set[float | None] = {None}
@@ -237,6 +254,16 @@ def calibrated(
 
     Compliance and grip are found anew: tyres and road change them, and estimates that started from
     them were worse.
+
+    Parameters
+    ----------
+    model : Estimator
+        The self-calibrating filter.
+    record : CarRecord
+        Of the car.
+    widening : float
+        Factor of the record's standard deviations. That of the leakage is never larger than the
+        model's.
     """
     changed: dict[str, Any] = {"wheelbase": record.wheelbase}
     if record.cg_to_rear_axle is not None:

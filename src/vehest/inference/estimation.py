@@ -29,6 +29,23 @@ def estimate_recording(
     """Bring a recording to the model's rate and run the model on it, guarded as online.
 
     See `vehest.trust.contract`; raises `DataError`.
+
+    Parameters
+    ----------
+    model : Estimator
+        Fitted.
+    recording : Recording
+        With the model's channels, at any rate.
+    trust : Trust or None
+        Calibration of the model; None: limits of any car, no bands.
+    same_vehicle : bool or None
+        Whether the recording is of a calibrated car; None: by its vehicle and car, see
+        `is_other_vehicle`.
+
+    Returns
+    -------
+    Estimate
+        At the model's rate, with bands and health where they are calibrated.
     """
     prepared = prepared_recording(model, recording)
     elsewhere = is_other_vehicle(trust, recording.vehicle, same_vehicle, recording.car)
@@ -37,7 +54,15 @@ def estimate_recording(
 
 
 def estimate_parts(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate]:
-    """Estimate parts, each in a thread while the next one is read, checked and resampled."""
+    """Estimate parts, each in a thread while the next one is read, checked and resampled.
+
+    Parameters
+    ----------
+    run : GuardedRun
+        Whose state passes from part to part; a single thread keeps their order.
+    parts : iterable of Recording
+        Parts of one recording that follow one another, at the model's rate; at least one.
+    """
     with ThreadPoolExecutor(1) as thread:
         going: list[Future[Estimate]] = []
         for part in parts:
@@ -53,6 +78,8 @@ def prepared_recording(
     """The channels that a model reads, at its rate or another one [Hz].
 
     Raises as `estimate_recording` does.
+
+    Resampling and transforms are those of the model's training data (``model.preparation``).
     """
     return resampled(
         recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation

@@ -55,6 +55,15 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
 
     Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is
     none.
+
+    Parameters
+    ----------
+    name : str
+        Folder, start of a name in ``output/train``, or one of `WITH_VEHEST`.
+    output : Path
+        Output root.
+    say : callable
+        Receives remarks for the user.
     """
     path = Path(name)
     if path.is_dir():
@@ -90,6 +99,13 @@ def open_model(
     """Find a model as `find_model` does and open it.
 
     Returns its folder, the model with the preparation of its training data, and its calibration.
+
+    Raises
+    ------
+    MissingError
+        There is no model of this name.
+    DataError
+        A file is damaged or was changed, or the calibration is not of this model.
     """
     folder = find_model(name, output, say)
     if (folder / MANIFEST).is_file():

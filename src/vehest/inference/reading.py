@@ -71,6 +71,7 @@ def without_references(dataset: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _names_reference(name: Any) -> bool:
+    """Whether a channel comes from a reference sensor, by its suffix."""
     return str(name).endswith(REFERENCE_SUFFIX)
 
 

@@ -33,6 +33,14 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") 
 
     Units are those of `COLUMN_UNITS`. CSV has six significant digits, times to a microsecond.
     ``band`` says what calibrated the bands, in the metadata of Parquet.
+
+    Parameters
+    ----------
+    parts : iterable of Estimate
+        Of one recording, at least one; each is written before the next is read, so that hours need
+        little memory.
+    path : Path
+        Ends in .parquet or .csv; it is replaced in one step.
     """
     check_table_name(path)
     if path.suffix.lower() == ".parquet":
@@ -48,7 +56,10 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") 
 
 
 def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
-    """Cells of a table of text, with the reasons of health in words."""
+    """Cells of a table of text, with the reasons of health in words.
+
+    Angles are listed in degrees, too, behind the other columns.
+    """
     cells: dict[str, list[Any]] = {"time": [time_cell(time) for time in columns["time"].tolist()]}
     quantities = [name for name in columns if name in QUANTITIES]
     cells |= {name: [number_cell(value) for value in columns[name].tolist()] for name in quantities}

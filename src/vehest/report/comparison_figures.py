@@ -61,6 +61,11 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
     """RMSE(β) with its interval, one row an estimator, the first on top.
 
     Logarithmic where the errors differ much.
+
+    Parameters
+    ----------
+    rows : sequence of ForestRow
+        At least one; RMSE in degrees.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -112,6 +117,7 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
 
 
 def _size_with_interval(row: ForestRow, decimals: int) -> str:
+    """An RMSE with its interval in brackets, if it has one."""
     size = fixed(row.rmse, decimals)
     if not math.isfinite(row.low):
         return size
@@ -133,6 +139,11 @@ def clouds_figure(
 ) -> MatplotlibFigure:
     """Panels side by side, each of clouds, label of x, label of y, and whether both axes have one
     scale.
+
+    Parameters
+    ----------
+    panels : sequence of tuple
+        At least one; the first cloud of each is drawn larger, below the others.
     """
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -153,6 +164,13 @@ def clouds_figure(
 def agreement_figure(reference: FloatArray, estimates: Sequence[Cloud]) -> MatplotlibFigure:
     """Estimated over measured sideslip, (K,) [deg], one panel an estimator, with the line on which
     both are equal.
+
+    Parameters
+    ----------
+    reference : FloatArray
+        Its largest magnitude is the range of both axes.
+    estimates : sequence of Cloud
+        Cloud of each, x the measured and y the estimated sideslip [deg].
     """
     columns = min(len(estimates), AGREEMENT_COLUMNS)
     n_rows = math.ceil(len(estimates) / columns)

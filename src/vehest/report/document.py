@@ -144,6 +144,10 @@ def write_documents(
 
     Parameters
     ----------
+    documents : mapping
+        Name of the file, without ending -> document.
+    folder : Path
+        Existing folder; ``tables`` and ``figures`` are made in it.
     on_page : Sequence[str or Table]
         Text and tables that the page of ``report`` alone ends with, and no other file contains.
 
@@ -179,6 +183,12 @@ def write_document(
 
     Parameters
     ----------
+    document : Document
+        The report.
+    folder : Path
+        Existing folder.
+    page : bool
+        Whether to write the HTML page too.
     name : str
         Of both files, without ending.
     on_page : Sequence[str or Table]
@@ -212,7 +222,12 @@ def write_document(
 def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> bytes:
     """The self-contained HTML page of a document.
 
-    ``images``: its figures as SVG by name, if they are drawn already.
+    ``images``: its figures as SVG by name; drawn here if None.
+
+    Returns
+    -------
+    bytes
+        UTF-8; it loads nothing from elsewhere, and shows figures in the reader's colour scheme.
     """
     drawn = images or {
         block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
@@ -221,8 +236,8 @@ def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> by
 
 
 def as_text(name: str) -> str:
-    """A name or title from a file as Markdown that shows it as it is, on one line: nothing in it is
-    a link, markup or HTML.
+    """A name or title of unknown origin as Markdown that shows it as it is, on one line: nothing in
+    it is a link, markup or HTML.
     """
     line = printable(" ".join(name.split()))
     line = re.sub(r"[\\`*\[\]]", r"\\\g<0>", line)
@@ -238,7 +253,18 @@ def as_code(text: str) -> str:
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
-    """Headers of a table, rows of cells, and for each column whether it contains numbers."""
+    """Headers of a table, rows of cells, and for each column whether it contains numbers.
+
+    Parameters
+    ----------
+    table : Table
+        Decimals of a column follow from its typical value, unless its `Column` states them.
+
+    Returns
+    -------
+    tuple
+        Cells are text; missing values are `MISSING`.
+    """
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
     visible = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
@@ -261,6 +287,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
 
 
 def _number_cells(values: list[Any], column: Column) -> list[str]:
+    """Numbers of a column as text, whole numbers without decimals."""
     if all(isinstance(value, int) for value in values):
         return [fixed(value, 0) for value in values]
     numbers = [
@@ -288,7 +315,10 @@ def _numbers(document: Document) -> dict[int, str]:
 
 
 def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
-    """A figure as pixels, in as few colours as look the same: a third of the size."""
+    """A figure as pixels, in as few colours as look the same: a third of the size.
+
+    The same figure gives the same bytes.
+    """
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -347,6 +377,7 @@ def _for_both_schemes(svg: bytes) -> bytes:
 
 
 def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
+    """Write a table as tables/NAME.csv with all digits, lines ending in LF."""
     (folder / "tables").mkdir(exist_ok=True)
     frame.to_csv(
         folder / "tables" / f"{name}.csv",
@@ -358,6 +389,7 @@ def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
 
 
 def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
+    """The report as Markdown, tables in pipes, figures as links to PNG and SVG."""
     parts = [f"# {as_text(document.title)}"]
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -384,6 +416,7 @@ def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
 
 
 def _in_pipes(cell: str) -> str:
+    """A cell on one line that cannot end the table's column, or be HTML or a link."""
     line = printable(" ".join(cell.split()))
     return (
         line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
@@ -417,6 +450,7 @@ def _spoken(caption: str) -> str:
 
 
 def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
+    """The HTML page from its template, with style, script, figures and data inside."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markdown_it import MarkdownIt
     from markupsafe import Markup
@@ -494,6 +528,9 @@ def _no_formula(cell: Any) -> Any:
 
 
 def _page_table(table: Table) -> dict[str, Any]:
+    """A table as the page's template reads it: cells with bars, links to models, and the CSV as
+    data.
+    """
     headers, rows, numeric = formatted(table)
     csv = (
         table.frame.map(_no_formula)
@@ -525,6 +562,17 @@ def bars_of(
 
     The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
     beyond; what is longer is ``cut``.
+
+    Parameters
+    ----------
+    values, lows, highs : sequence of float
+        Of one length; NaN for an end that is not known.
+
+    Returns
+    -------
+    list
+        ``value``, places ``at``, ``low`` and ``high`` [%], and ``cut``, of each; None for a missing
+        one.
     """
     finite = [value for value in values if math.isfinite(value)]
     ends = [
@@ -554,10 +602,12 @@ def bars_of(
 
 
 def _packaged(name: str) -> str:
+    """Text of a file of the page's templates."""
     from importlib.resources import files
 
     return (files("vehest.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _data_uri(content: bytes, media_type: str) -> str:
+    """Content as a URI that contains it, base64."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"

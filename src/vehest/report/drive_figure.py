@@ -105,7 +105,7 @@ def drive_figure(
     start: float | None = None,
     stop: float | None = None,
 ) -> Figure:
-    """Draw a drive on one page for print, in colours that colour-blind readers tell apart.
+    """Draw a drive on one page for print, in colours that colour-blind readers distinguish.
 
     Sideslip with the 90 % band and the health of the first estimate; lateral velocity; the measured
     channels; the course, integrated from u, v and yaw rate, in colours of β; estimate over
@@ -120,6 +120,11 @@ def drive_figure(
         Of this recording.
     start, stop : float, optional
         Range that is drawn [s]; by default all of it.
+
+    Returns
+    -------
+    Figure
+        As wide as both columns of a journal; a notebook shows it by itself.
 
     Raises
     ------
@@ -160,6 +165,9 @@ def _drive_of(
     start: float | None,
     stop: float | None,
 ) -> Drive:
+    """Signals of a drive on the clock of the recording, or of the first estimate without one;
+    raises `DataError` where the range has no samples.
+    """
     clock: TimeSeries = recording if recording is not None else estimates[0]
     first = -math.inf if start is None else start
     end = math.inf if stop is None else stop
@@ -258,6 +266,7 @@ def _time_panels(drive: Drive) -> list[tuple[str, Draw]]:
 
 
 def _draw_motion(drive: Drive, quantity: Literal["sideslip", "vy"], axes: Axes) -> None:
+    """Panel of β or v: reference, estimates and band; beside β, how long health was not valid."""
     if quantity == "sideslip" and drive.health is not None:
         for status, (name, colour) in reversed(HEALTH.items()):
             share = float(np.mean(drive.health == status))
@@ -269,6 +278,9 @@ def _draw_motion(drive: Drive, quantity: Literal["sideslip", "vy"], axes: Axes) 
 
 
 def _draw_health(time: FloatArray, health: FloatArray, axes: Axes) -> None:
+    """Narrow panel that shows over time whether the first estimate is valid, degraded or
+    invalid.
+    """
     step = float(time[1] - time[0]) if len(time) > 1 else 1.0
     axes.set_facecolor(VALID_COLOUR)
     for status, (_, colour) in HEALTH.items():
@@ -282,6 +294,7 @@ def _draw_health(time: FloatArray, health: FloatArray, axes: Axes) -> None:
 
 
 def _draw_channel(drive: Drive, name: str, axes: Axes) -> None:
+    """Panel of a measured channel in its display unit."""
     assert drive.recording is not None
     values, unit = in_display_unit(name, drive.recording[name])
     axes.plot(*decimated(drive.time, values, MAX_POINTS), color=CHANNEL_COLOUR, linewidth=0.8)
@@ -306,6 +319,7 @@ def _panels_below(drive: Drive, estimates: Sequence[Estimate]) -> list[Draw]:
 
 
 def _draw_course(recording: Recording, motion: Traces, axes: Axes) -> None:
+    """Panel of the course in the plane, coloured by β [deg], with its start."""
     step = 1.0 / recording.rate_hz
     x, y = reckoned_course(recording["vx"], motion.vy, recording["yaw_rate"], step)
     stride = max(len(x) // MAX_POINTS, 1)
@@ -336,6 +350,7 @@ def _draw_course(recording: Recording, motion: Traces, axes: Axes) -> None:
 
 
 def _draw_errors(estimates: Sequence[Traces], scored: Sequence[Scored], axes: Axes) -> None:
+    """Panel of estimated over reference β [deg], with the RMSE of each estimate in the legend."""
     for traces, part in zip(reversed(estimates), reversed(scored), strict=True):
         chosen = part.is_sideslip_drawn
         draw_cloud(

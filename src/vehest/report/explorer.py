@@ -26,13 +26,17 @@ GAP = 65_535  # code of a value that is not there
 
 
 def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray | None]) -> str:
-    """What the page reads of ``columns``, (K,) each or None, and of how they are called and drawn;
-    it cannot end a script element.
+    """What the page reads of the signals of a test set, as JSON that cannot end a script element.
 
-    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; ``scored``: 1
-    where sideslip is scored, else 0; of each
-    candidate ``vy0`` [m/s], half widths of its 90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg],
-    ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
+    Parameters
+    ----------
+    content : mapping
+        How columns are called and drawn, plain finite values.
+    columns : mapping
+        Name -> (K,), or None where it is not there: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²],
+        ``input0``… as measured; ``scored``: 1 where sideslip is scored, else 0; of each candidate
+        ``vy0`` [m/s], half widths of its 90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg],
+        ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
     """
     described, data = packed(
         {name: values for name, values in columns.items() if values is not None}
@@ -43,6 +47,11 @@ def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray |
 
 def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:
     """Columns in 16 bits.
+
+    Parameters
+    ----------
+    columns : dict
+        Name -> (K,); the error of a value is at most half a step, a 65,534th of the column's range.
 
     Returns
     -------
@@ -100,6 +109,7 @@ def reckoned_course(
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:
+    """Integral by the trapezoidal rule from zero, (K,)."""
     steps = 0.5 * step * (values[1:] + values[:-1])
     integral: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
     return integral

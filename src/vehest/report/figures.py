@@ -58,6 +58,19 @@ def traces_figure(
 ) -> MatplotlibFigure:
     """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator:
     lateral velocity left, sideslip right, with its RMSE [deg].
+
+    Parameters
+    ----------
+    time : FloatArray
+        (K,) [s].
+    reference : Traces
+        Drawn in every row.
+    estimates : sequence of Traces
+        One a row.
+    rmse_sideslip : sequence of float
+        Of each estimate [deg].
+    time_label : str
+        Of the time axis.
     """
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
@@ -106,6 +119,21 @@ def zoom_figure(
 ) -> MatplotlibFigure:
     """Reference and estimates over a short time, (K,) [s]: sideslip with a band, its error, v and,
     if given, ``ay`` (K,) [m/s²].
+
+    Parameters
+    ----------
+    time : FloatArray
+        (K,) [s].
+    ay : FloatArray or None
+        Measured; None: no panel.
+    reference : Traces
+        The reference, to which errors are taken.
+    estimates : sequence of Traces
+        The first one is drawn on top.
+    time_label : str
+        Of the time axis.
+    band : Band or None
+        Of one of the estimates.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -133,6 +161,7 @@ def zoom_figure(
 
 
 def _looks(line: Line) -> dict[str, Any]:
+    """Colour, dash and width of an estimate's line, as matplotlib's arguments."""
     return {"color": line.colour, "linestyle": line.dash, "linewidth": 1.0}
 
 
@@ -169,6 +198,11 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     """Density of the sideslip error of each estimator on common bins.
 
     Those beyond the axis count in the outermost bins.
+
+    Parameters
+    ----------
+    estimates : sequence of Errors
+        The axis ends at the largest 99.5 % quantile of their magnitudes.
     """
     with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.add_subplot()
@@ -204,6 +238,13 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
     contains.
 
     Bins of fewer than 20 show none.
+
+    Parameters
+    ----------
+    ay : FloatArray
+        Measured, at the samples of the errors.
+    estimates : sequence of Errors
+        All at the same samples.
     """
     n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
     edges = np.arange(n_bins + 1)
@@ -285,6 +326,13 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
     """Coverage over nominal level, one line an estimator with its name at the end.
 
     On the diagonal, coverage is as stated.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        (L,), nominal coverages, ascending.
+    rows : sequence of Reliability
+        One an estimator.
     """
     nominal = np.array(levels)
     aside = SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
@@ -351,6 +399,12 @@ def _spread_heights(heights: Sequence[float], step: float, top: float) -> list[f
 def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
     """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each
     segment, in their order.
+
+    Returns
+    -------
+    tuple of FloatArray
+        About ``n_points`` points, in the order of time; a NaN of each segment with gaps stays, so
+        that lines break there.
     """
     if len(values) <= n_points:
         return time, values
@@ -407,5 +461,8 @@ def _legend_width(labels: Sequence[str], columns: int) -> float:
 
 
 def root_mean_square(values: FloatArray) -> float:
-    """Root mean square, gaps left out."""
+    """Root mean square, gaps left out.
+
+    NaN, with a warning of NumPy, where all values are gaps.
+    """
     return float(np.sqrt(np.nanmean(np.square(values))))

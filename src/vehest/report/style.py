@@ -83,6 +83,11 @@ REFERENCE = Line(REFERENCE_COLOUR)
 def line_of(estimator: str, variant: str = "") -> Line:
     """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour
     that depends on the name only.
+
+    Parameters
+    ----------
+    estimator, variant : str
+        Names; another tool's estimator has no family.
     """
     drawn = (
         estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
@@ -123,6 +128,11 @@ def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
 def on_dark(colour: str) -> str:
     """The colour that replaces ``colour`` on a dark page: greys change places with their opposites,
     hues get lighter.
+
+    Parameters
+    ----------
+    colour : str
+        ``#rrggbb``.
     """
     red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
     if max(red, green, blue) - min(red, green, blue) <= 12:
@@ -146,6 +156,11 @@ def paper_style() -> Iterator[None]:
 def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
     """An empty figure of a width and height [in] without global state, drawn inside the ``with``
     block in `paper_style`.
+
+    Yields
+    ------
+    Figure
+        With constrained layout.
     """
     from matplotlib.figure import Figure
 
@@ -170,6 +185,19 @@ def significant(value: float, digits: int = 3) -> str:
 def decimals_for(values: Sequence[float], digits: int = 3) -> int:
     """Decimals that show the typical of some numbers with so many significant digits, so that a
     column lines up.
+
+    Parameters
+    ----------
+    values : sequence of float
+        Zeros and values that are not finite do not count; the typical one is the lower median of
+        the magnitudes.
+    digits : int
+        Significant digits of the typical value.
+
+    Returns
+    -------
+    int
+        From 0 to 6.
     """
     sizes = sorted(abs(value) for value in values if math.isfinite(value) and value != 0)
     if not sizes:
@@ -187,5 +215,6 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def _grouped(value: float, decimals: int) -> str:
+    """A number with decimals, a narrow space between thousands from 10,000 on, and a minus sign."""
     text = f"{value:,.{decimals}f}" if abs(value) >= 1e4 else f"{value:.{decimals}f}"
     return text.replace(",", "\N{NARROW NO-BREAK SPACE}").replace("-", "\N{MINUS SIGN}")

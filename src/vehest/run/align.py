@@ -33,6 +33,22 @@ def align_recording(
 ) -> Alignment:
     """Estimate quantities from one recording.
 
+    Parameters
+    ----------
+    source : str
+        Name of a data set in conf/dataset, or path of a file.
+    overrides : sequence of str
+        Of conf/ingest.yaml for a data set, of conf/estimate.yaml for a file.
+    recording_id : str or None
+        Which recording; needed where a data set has several.
+    settings : AlignmentSettings
+        Without a wheelbase, that of the data set's car is used.
+
+    Returns
+    -------
+    Alignment
+        Nothing is applied or written.
+
     Raises
     ------
     VehestError
@@ -49,7 +65,13 @@ def align_recording(
 
 
 def in_words(alignment: Alignment, out: Path | None) -> Lines:
-    """An alignment for a terminal; ``out`` is where it was written."""
+    """An alignment for a terminal; ``out`` is where it was written.
+
+    Returns
+    -------
+    Lines
+        Lines and tables as `vehest.run.printing.emit` prints them; angles in degrees, delays in ms.
+    """
     drive = alignment.recording
     first = (
         f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; no "
@@ -86,7 +108,14 @@ def override_of(alignment: Alignment) -> str:
 
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
-    """All figures as plain values, SI units throughout."""
+    """All figures as plain values, SI units throughout.
+
+    Returns
+    -------
+    dict
+        Also correlation, transforms and the override that applies them; NaN where a residual was
+        not computed.
+    """
     drive = alignment.recording
     correlation = alignment.correlation
     return {
@@ -118,7 +147,19 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
 def write_alignment(alignment: Alignment, folder: Path) -> None:
     """Write report, table and transforms into a folder of its own, all or nothing.
 
-    Raises `ConfigurationError`, `MissingError`.
+    Parameters
+    ----------
+    alignment : Alignment
+        What was estimated.
+    folder : Path
+        New, or one that holds an earlier alignment alone (`FILES`).
+
+    Raises
+    ------
+    ConfigurationError
+        The folder is a file or a link, or holds something else.
+    MissingError
+        The folder cannot be written to, or the disk is full.
     """
     import pandas as pd
 
@@ -149,6 +190,9 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
 
 def _recording_of(source: str, config: Config, recording_id: str | None) -> Recording:
+    """The recording of a data set by its id, or the only one; or that of a file, whose id must
+    agree.
+    """
     if source in choices("dataset"):
         origin = open_source(config["dataset"])
         ids = origin.ids()
@@ -186,6 +230,9 @@ def _parameters(alignment: Alignment) -> TerminalTable:
 
 
 def _report(alignment: Alignment) -> str:
+    """The alignment as Markdown: parameters, residuals, notes, and the transforms as YAML and
+    override.
+    """
     from vehest.report.document import as_text
 
     printed = in_words(alignment, None)[:-1]  # without the override, which stands below
@@ -203,6 +250,7 @@ def _report(alignment: Alignment) -> str:
 
 
 def _markdown(table: TerminalTable) -> str:
+    """A table in Markdown, numbers to the right."""
     lines = [table.header, [":--", *("--:" for _ in table.header[1:-1]), ":--"], *table.rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
@@ -217,6 +265,7 @@ def _transforms(alignment: Alignment) -> str:
 
 
 def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
+    """A parameter's values and contributions to its uncertainty, as names of columns."""
     plain = {
         key: getattr(parameter, key)
         for key in ("name", "value", "uncertainty", "low", "high", "unit")

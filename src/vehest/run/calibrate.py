@@ -37,10 +37,26 @@ def plan_calibrate(
     output: Path,
     cars: Mapping[str, CarValues],
 ) -> tuple[StagePlan, Callable[[Path], None]] | None:
-    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it; none where a split
-    has no validation range.
+    """The calibration of a model, as `vehest.artefacts.artefact.make` takes it.
 
-    ``cars`` are values of the cars of data sets.
+    Parameters
+    ----------
+    model : Artefact
+        A finished training.
+    split : Split
+        Its training and validation ranges are estimated.
+    data : mapping
+        Data set -> recordings at the estimator's rate.
+    output : Path
+        Output root.
+    cars : mapping
+        Data set -> values of its car; they enter the key where any is known.
+
+    Returns
+    -------
+    tuple or None
+        Plan, and the function that writes the artefact into a folder; None where the split has no
+        validation range.
     """
     if not split.validation:
         return None
@@ -97,7 +113,18 @@ def _write(
 
 
 def calibration_figures(folder: Path) -> dict[str, float]:
-    """Figures of a calibration for tracking; none where there are no bands."""
+    """Figures of a calibration for tracking; none where there are no bands.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a calibration, with trust.yaml.
+
+    Returns
+    -------
+    dict
+        Numbers of blocks, and seconds of validation.
+    """
     bands = read_trust(folder).bands
     if bands is None:
         return {}

@@ -78,6 +78,12 @@ def compare_files(
     columns, shift : sequence of str, str
         Of the tables of other tools, as `parse_columns` and `parse_shift` read them.
 
+    Returns
+    -------
+    tuple
+        Figures as `compare_estimates` returns them, with ``findings`` of the recording; and lines
+        and tables.
+
     Raises
     ------
     VehestError
@@ -196,6 +202,17 @@ def compare_estimates(
     verdict. Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, ``start``
     and ``stop`` [s] and ``rate_hz`` of what is scored, ``min_sideslip_speed`` [m/s] and
     ``share_below_min_speed``. Where the car is slower throughout, RMSE(v) gives the order.
+
+    Parameters
+    ----------
+    drive : Recording
+        With ``vx`` and ``vy_ref``; it is resampled to RATE_HZ at most.
+    estimates : mapping
+        Name of a row -> its estimate, on the clock of ``drive``.
+    wheelbase : float or None
+        Of the car [m]; None: not known.
+    trained_here : collection of str
+        Rows of models that were trained on this recording.
 
     Raises
     ------
@@ -333,7 +350,15 @@ def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Est
 def _cross_validated_map(reference: Recording, start: float, stop: float) -> FloatArray:
     """Lateral velocity of a static map of the other half of the range [m/s].
 
-    Raises `DataError` where the car turns too little.
+    Returns
+    -------
+    FloatArray
+        (T,); each half of the range is estimated by a map that was fitted to the other half.
+
+    Raises
+    ------
+    DataError
+        The car turns too little.
     """
     middle = 0.5 * (start + stop)
     vy = np.zeros(len(reference))

@@ -95,6 +95,16 @@ class Comparison:
         """Fit jobs to the recordings of their split, find those that lack something, and plan
         groups of trainings; makes data on the way.
 
+        Parameters
+        ----------
+        runner : Runner
+            Makes recordings at the rates that are needed, and prints.
+
+        Returns
+        -------
+        sequence of Group
+            As `Runner.run` takes them; jobs that cannot be done have their ``failure`` set.
+
         Raises
         ------
         ConfigurationError
@@ -196,7 +206,15 @@ class Comparison:
         ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
-        """Take what became of the trainings: key of each -> its member, or why it failed."""
+        """Take what became of the trainings: key of each -> its member, or why it failed.
+
+        Parameters
+        ----------
+        members : mapping
+            Key of a training -> its member; those without an evaluation count as unfinished.
+        failed : mapping
+            Key of a training -> why it failed.
+        """
         self.finished = {
             key: member for key, member in members.items() if member.evaluation is not None
         }
@@ -205,6 +223,9 @@ class Comparison:
                 job.failure = failed.get(job.training.plan.key)
 
     def _print_failures(self, jobs: Sequence[Job], runner: Runner) -> None:
+        """Print a line for each failure, unless the comparison has a single job, whose error is
+        raised.
+        """
         for name, failure in named_failures(jobs) if len(self.jobs) > 1 else ():
             runner.messages.line("fail", "train", name, failure.message)
 
@@ -226,7 +247,13 @@ def _fit_to_recordings(
 
 
 def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSummary:
-    """The recording with the lowest rate of all data sets."""
+    """The recording with the lowest rate of all data sets.
+
+    Parameters
+    ----------
+    contents : mapping
+        Data set -> its recordings.
+    """
     return min(
         (recording for recordings in contents.values() for recording in recordings),
         key=lambda recording: recording.rate_hz,
@@ -236,7 +263,27 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
     """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was.
 
-    Raises `DataError`, `ConfigurationError`.
+    Parameters
+    ----------
+    config : Config
+        Of a job; it stays unchanged.
+    group : str
+        ``estimator`` or ``evaluation``; a configuration without it is returned as it is.
+    limit : RecordingSummary
+        The recording with the lowest rate.
+
+    Returns
+    -------
+    tuple
+        Configuration and notes, for people. A note on an estimator names settings in samples whose
+        duration changes.
+
+    Raises
+    ------
+    DataError
+        The rate was given by an override, or the estimator cannot run at the lower one.
+    ConfigurationError
+        A setting of the group is wrong.
     """
     if group not in config:
         return config, []
@@ -301,6 +348,15 @@ def plan_training(
     its inputs; see `plan_train`.
 
     Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
+
+    Parameters
+    ----------
+    config : mapping
+        As composed for ``train``; ``training.start_from`` is a model or None.
+    split : Split
+        Ranges of training and validation.
+    data : mapping
+        Data set -> recordings at the estimator's rate.
     """
     job = plan_train(config, split, data)
     start = config["training"].get("start_from")
@@ -336,7 +392,9 @@ def label_of(training: TrainJob) -> str:
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
-    """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
+    """Failures of one comparison by name; jobs that differ in their seed alone and failed alike
+    have one name.
+    """
     jobs_of_failure: dict[Failure, list[Job]] = {}
     for job in jobs:
         if job.failure is not None:
@@ -362,7 +420,13 @@ def _names(jobs: Iterable[Job]) -> list[str]:
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:
-    """How recordings came to the rates that estimators work at."""
+    """How recordings came to the rates that estimators work at.
+
+    Parameters
+    ----------
+    configs : sequence of Config
+        Of all jobs; they share the options of ``downsample``.
+    """
     rates = sorted(
         {estimator_rate(config) for config in configs}
         | {protocol_from_config(configs[0]["evaluation"]).rate_hz}
@@ -385,7 +449,10 @@ def resampling_fact(configs: Sequence[Config]) -> str:
 
 
 def training_facts(configs: Sequence[Config]) -> list[str]:
-    """The budget of each training scheme, a line each."""
+    """The budget of each training scheme, a line each.
+
+    Options that move no number are left out; estimators with equal options share a line.
+    """
     schemes: dict[str, set[str]] = {}
     for config in configs:
         schemes.setdefault(json.dumps(config["training"], default=str), set()).add(

@@ -77,7 +77,17 @@ class Messages:
         self.line(WARNING, "", "", text)
 
     def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
-        """Print the status of one artefact, or a warning."""
+        """Print the status of one artefact, or a warning.
+
+        Parameters
+        ----------
+        status : str
+            One of `MARKS`; REUSED is collected and printed by `print_reused`.
+        stage, label : str
+            What it is about; empty for a warning.
+        detail : str
+            Remark behind it, or the text of a warning, which may have several lines.
+        """
         self.printed.append((status, stage, label, detail))
         if status == REUSED:
             self._reused.append((stage, label))
@@ -90,7 +100,10 @@ class Messages:
         self._print(text, always=status == WARNING)
 
     def begin(self, stage: str, label: str) -> None:
-        """Print that a stage is running if it has not ended after `MAX_SILENT_SECONDS`."""
+        """Print that a stage is running if it has not ended after `MAX_SILENT_SECONDS`.
+
+        The line comes from a timer, a daemon thread, so that a long stage needs no polling.
+        """
         line = _status_line(RUNNING, stage, label)
         timer = threading.Timer(MAX_SILENT_SECONDS, self._print, [line])
         timer.daemon = True
@@ -141,7 +154,13 @@ class Messages:
                 self.console.print(text)
 
     def bars(self) -> AbstractContextManager[Bars]:
-        """Progress bars that vanish at the end; nothing is drawn without a terminal."""
+        """Progress bars that vanish at the end; nothing is drawn without a terminal.
+
+        Returns
+        -------
+        context manager of Bars
+            Bars may be moved in it in any case; without a terminal they are not drawn.
+        """
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -156,6 +175,7 @@ class Messages:
 
 
 def _status_line(status: str, stage: str, label: str, detail: str = "") -> Text:
+    """A status, stage, label and detail as one line with colours."""
     word, colour = MARKS[status]
     suffix = (f" {printable(detail)}" if detail else "", "dim")
     return Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)
@@ -169,7 +189,17 @@ class Bars(Progress):
         super().__init__(*columns, **options)
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
-        """Move a bar, which appears when it is first moved."""
+        """Move a bar, which appears when it is first moved.
+
+        Parameters
+        ----------
+        name : str
+            Of the bar; beyond `MAX_BARS` no more bars appear.
+        done, total : int
+            In any unit.
+        note : str
+            Behind the bar.
+        """
         if name not in self._named and len(self._named) < MAX_BARS:
             self._named[name] = self.add_task(printable(name), total=total, note="")
         if name in self._named:

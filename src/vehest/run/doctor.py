@@ -37,7 +37,14 @@ class Item:
 
 
 def examine() -> Iterator[Item]:
-    """Check everything that vehest relies on."""
+    """Check everything that vehest relies on.
+
+    Yields
+    ------
+    Item
+        Python and libraries, configuration, compiled recursions, extras, raw files, output root and
+        disk. Nothing is written; the first call may compile for some seconds.
+    """
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
     yield Item(
@@ -78,6 +85,7 @@ def examine() -> Iterator[Item]:
 
 
 def _kernels() -> Item:
+    """Whether numba compiles and runs a recursion on this machine."""
     try:
         import numpy as np
 

@@ -19,6 +19,22 @@ def plan_downsample(
 ) -> StagePlan:
     """The artefact of a downsampling.
 
+    Parameters
+    ----------
+    ingested : Artefact
+        Recordings at their native rate.
+    rate_hz : float
+        Rate of an estimator, or of the evaluation [Hz].
+    options : mapping
+        ``method`` (``polyphase`` or ``decimate``) and ``transforms``.
+    output : Path
+        Output root.
+
+    Returns
+    -------
+    StagePlan
+        Its inputs are the digests of the recordings.
+
     Raises
     ------
     ConfigurationError
@@ -41,7 +57,14 @@ def plan_downsample(
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:
-    """Transform and resample every recording into ``folder``."""
+    """Transform and resample every ingested recording into ``folder``, as the plan's ``config``
+    says.
+
+    Raises
+    ------
+    DataError
+        A recording lacks a channel that a transform reads, or is too slow or too short.
+    """
     for name in ingested.outputs:
         write_recording(
             resampled(read_recording(ingested.folder / name), config["rate_hz"], config),

@@ -73,6 +73,12 @@ def estimate_file(
     car : Path or None
         Record of `vehest identify` to start from.
 
+    Returns
+    -------
+    dict
+        Figures of `_Report.summary`, with file, model, point of the car, band, verdict and
+        findings. The table appears complete or not at all.
+
     Raises
     ------
     VehestError
@@ -179,12 +185,26 @@ def model_for_car(
 ) -> tuple[Path, Estimator, Trust | None, bool]:
     """A model as `open_model` finds it, for the car of a data set, without a recording.
 
+    Parameters
+    ----------
+    name : str
+        Of a model that comes with vehest, a folder, or the start of a folder's name.
+    options : EstimateOptions
+        With the data set and settings of the car.
+    say : callable
+        Takes remarks, one line each.
+
     Returns
     -------
     tuple
         Folder, model, calibration, and whether bands are for another car: by the answer
             ``same_vehicle``,
         by values of the car, and by its name where a data set is named.
+
+    Raises
+    ------
+    VehestError
+        The model is not there, is damaged, or does not take the settings.
     """
     folder, model, trust = open_model(name, options.output, say)
     car = car_of(options.dataset)
@@ -207,6 +227,22 @@ def findings_of(
     of_all_channels: Sequence[Finding] | None = None,
 ) -> list[Finding]:
     """Findings in the channels that a model reads, given those of all channels, if they are known.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording, or a part of it.
+    model : Estimator
+        Its channels are checked, and its wheelbase, where it has one.
+    accepted : sequence of str
+        Checks whose contradictions are accepted.
+    of_all_channels : sequence of Finding or None
+        Findings of a check of all channels, which saves a second one.
+
+    Returns
+    -------
+    list of Finding
+        Without notes.
 
     Raises
     ------
@@ -236,6 +272,18 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
     wheelbase [m].
 
     None: not known.
+
+    Parameters
+    ----------
+    recording : Recording
+        Without ``vx`` or ``yaw_rate`` there is nothing to compare.
+    wheelbase : float or None
+        [m].
+
+    Returns
+    -------
+    list of Finding
+        One warning at most; thresholds are MAX_WHEELBASE_OVER_RADIUS and MAX_FROUDE_NUMBER.
     """
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
@@ -306,6 +354,11 @@ class _Report:
         """The parts, once they are checked.
 
         Raises `DataError` as `findings_of` does, and where it is strict.
+
+        Parameters
+        ----------
+        parts : iterable of (Recording, list of Finding)
+            Parts of the drive in order, with findings in all of their channels.
         """
         for part, of_all_channels in parts:
             findings = findings_of(part, self.model, self.accepted, of_all_channels)
@@ -320,7 +373,13 @@ class _Report:
             yield part
 
     def counted(self, parts: Iterable[Estimate]) -> Iterator[Estimate]:
-        """The parts of the estimate, once they count; raises `DataError` where all are empty."""
+        """The parts of the estimate, once they count; raises `DataError` where all are empty.
+
+        Parameters
+        ----------
+        parts : iterable of Estimate
+            Parts of the estimate in order, each yielded again unchanged.
+        """
         for part in parts:
             self.last = part
             is_estimated = ~np.isnan(part["vy"])
@@ -348,7 +407,13 @@ class _Report:
             raise too_short_error(self.model, self.last.recording_id, self.seconds)
 
     def summary(self) -> dict[str, Any]:
-        """Figures of the estimate, for people and scripts."""
+        """Figures of the estimate, for people and scripts.
+
+        Returns
+        -------
+        dict
+            Angles in degrees; the range of β is None where the car was too slow throughout.
+        """
         last = self.last
         figures: dict[str, Any] = {
             "recording": last.recording_id,

@@ -24,6 +24,13 @@ HEALTH = ("valid", "degraded", "invalid")
 def check_log_name(log: Path, out: Path) -> None:
     """Raises `ConfigurationError` where a log cannot be written in the format that a name asks
     for.
+
+    Parameters
+    ----------
+    log : Path
+        The recording.
+    out : Path
+        What is to be written; .mf4 needs a log in MDF.
     """
     if out.suffix.lower() == ".mf4" != log.suffix.lower():
         raise ConfigurationError(

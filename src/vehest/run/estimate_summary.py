@@ -78,7 +78,13 @@ def has_unknown_reference_point(dataset: str) -> bool:
 
 
 def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
-    """Lines for a terminal from the outcome of `vehest.run.estimate.estimate_file`."""
+    """Lines for a terminal from the outcome of `vehest.run.estimate.estimate_file`.
+
+    Parameters
+    ----------
+    outcome : mapping
+        Figures, verdict and findings; entries that are missing have no line.
+    """
     rows = {
         "estimate": f"{outcome['recording']} by {outcome['model']}: {outcome['seconds']:.4g} s, "
         f"{outcome['estimated']} of {outcome['samples']} samples at {outcome['rate_hz']:g} Hz",
@@ -105,7 +111,14 @@ def _valid(outcome: Mapping[str, Any]) -> str:
 
 
 def describe_use(outcome: Mapping[str, Any]) -> str:
-    """Which samples may be used, how far off they may be, and what limits the others."""
+    """Which samples may be used, how far off they may be, and what limits the others.
+
+    Returns
+    -------
+    str
+        ``only the samples with health 0 (97 %); …``: which samples, how large their errors are, and
+        why others are left out.
+    """
     if not outcome["has_calibration"]:
         return (
             "not before a comparison with a reference: the model has no calibration, so that "

@@ -59,6 +59,11 @@ AUTO = "auto"
 def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
     """Columns from ``QUANTITY=COLUMN`` words.
 
+    Parameters
+    ----------
+    words : sequence of str
+        Such as ``sideslip=Beta:deg`` or ``vy=-V``, where ``:UNIT`` and the sign are optional.
+
     Raises
     ------
     ConfigurationError
@@ -83,6 +88,11 @@ def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
 
 def parse_shift(text: str) -> float | None:
     """Seconds of ``--shift``, None for ``auto``.
+
+    Parameters
+    ----------
+    text : str
+        A number, or ``auto``.
 
     Raises
     ------
@@ -121,6 +131,11 @@ def read_estimate_table(
         Take precedence over columns that are found by name; those that the table lacks are ignored.
     shift : float or None
         Seconds that are added to the times; None: by correlation with the reference.
+
+    Returns
+    -------
+    Estimate
+        ``vy`` [m/s] and ``sideslip`` [rad] on an even clock, shifted to that of the recording.
 
     Raises
     ------
@@ -230,6 +245,22 @@ def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
 
 def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
     """The unit that is stated or in a column's name, or the default.
+
+    Parameters
+    ----------
+    quantity : str
+        ``time``, ``vy_ref`` or ``sideslip_ref``.
+    name : str
+        Of the column, as the file has it.
+    file : Path
+        Named in errors.
+    stated : str
+        Unit that the user gave; it takes precedence.
+
+    Returns
+    -------
+    str
+        As vehest spells it.
 
     Raises
     ------

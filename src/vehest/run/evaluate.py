@@ -4,7 +4,7 @@ model, calibration, recordings -> estimates of each test set -> scored at the ev
 metrics.csv, timings.csv, blocks.csv
 
 Every fault adds rows under a condition of its own; without faults, key and files are those of an
-evaluation that knows none.
+evaluation that has none.
 """
 
 from __future__ import annotations
@@ -77,6 +77,16 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     """How estimates are scored.
 
+    Parameters
+    ----------
+    config : mapping
+        ``evaluation`` of a configuration.
+
+    Returns
+    -------
+    Protocol
+        Without the wheelbases of cars, which `Protocol.with_wheelbases` adds.
+
     Raises
     ------
     ConfigurationError
@@ -120,9 +130,10 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
 
 
 def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> dict[str, Any]:
-    """Options of an evaluation that enter its key: those that differ from their defaults.
+    """Options of an evaluation that enter its key: those of its protocol and faults that differ
+    from their defaults.
 
-    Without faults none of theirs.
+    Without faults, no option of faults is among them.
     """
     options: dict[str, Any] = {"protocol": changed_options(protocol)}
     return options | ({"faults": [changed_options(fault) for fault in faults]} if faults else {})
@@ -145,6 +156,19 @@ class Evaluation:
         self, model: Artefact, calibration: Artefact | None
     ) -> tuple[StagePlan, Callable[[Path], None]]:
         """The evaluation of a model, as `artefacts.make` takes it.
+
+        Parameters
+        ----------
+        model : Artefact
+            A finished training, or a model that was saved from Python.
+        calibration : Artefact or None
+            With the bands and the health that estimates get.
+
+        Returns
+        -------
+        tuple
+            Plan, whose key holds model, calibration, recordings, references, protocol and faults;
+            and the function that writes the artefact into a folder.
 
         Raises
         ------
@@ -198,11 +222,24 @@ class Evaluation:
         return plan, partial(_write, self, model, calibration)
 
     def reference(self, span: Span) -> Recording:
-        """The recording of a range at the evaluation rate, references included."""
+        """The recording of a range at the evaluation rate, references included.
+
+        Raises
+        ------
+        DataError
+            The data set lacks the recording, or its file is damaged.
+        """
         return read_recording(stored_recording(self.references, span))
 
     def measured(self, span: Span) -> Recording:
-        """A range as the estimator sees it: no references, and a warm-up before it."""
+        """A range as the estimator receives it: no references, and a warm-up before it.
+
+        Returns
+        -------
+        Recording
+            At the estimator's rate, from ``warm_up_seconds`` before the range (as far as the
+            recording goes), with values of its car.
+        """
         recording = read_recording(stored_recording(self.data, span))
         recording = replace(recording, car=self.cars.get(span.dataset, UNKNOWN_CAR))
         return recording.cut(
@@ -336,6 +373,9 @@ def _rows_under_faults(
     nominal: Sequence[Scored],
     trust: Trust | None,
 ) -> list[dict[str, Any]]:
+    """Rows of each fault, under a condition of its own, over all samples and over those while it
+    lasts.
+    """
     if not evaluation.faults:
         return []
     rows: list[dict[str, Any]] = []
@@ -357,6 +397,7 @@ def _rows_under_faults(
 def _head(
     evaluation: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]
 ) -> dict[str, Any]:
+    """Columns that all rows of a test set share: estimator, data, kinds, rate, mode and seed."""
     about = read_description(model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
     kinds = dict.fromkeys(evaluation.kinds[name] for name in datasets)
@@ -456,6 +497,20 @@ def training_rows(
     """Errors on the training ranges.
 
     None where the reference has gaps there or nothing was learnt.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+        Scores the ranges as it does tests.
+    model : Artefact
+        Names the ranges that it was trained on.
+    estimator : Estimator
+        The model, loaded.
+
+    Returns
+    -------
+    list of dict
+        Rows of `COLUMNS` for TRAINING_METRICS, test set TRAINING.
     """
     spans = [span for span in learnt_spans(model, "train") if span.dataset in evaluation.data]
     if not spans:
@@ -477,7 +532,7 @@ def training_rows(
 
 
 def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
-    """Metrics of an evaluation, or its times, with `COLUMNS`.
+    """Metrics (METRICS) or times (TIMINGS) in the folder of an evaluation, with `COLUMNS`.
 
     Raises
     ------
@@ -490,6 +545,11 @@ def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
 def test_figures(folder: Path) -> dict[str, float]:
     """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` ->
     value.
+
+    Returns
+    -------
+    dict
+        Such as ``rmse_sideslip.test``; without validation, training and faults.
     """
     tables = [read_metrics(folder, file) for file in (METRICS, TIMINGS)]
     table = nominal_rows(pd.concat([part for part in tables if len(part)], ignore_index=True))

@@ -65,6 +65,20 @@ class FaultSettings:
         [s] long.
 
         Each draws anew.
+
+        Parameters
+        ----------
+        start : float
+            Of the scored range in its recording, after the warm-up [s].
+        length : float
+            Of the range [s].
+        position : int
+            Of the range in its test set; with ``seed`` it determines the draws.
+
+        Returns
+        -------
+        Fault
+            With onset [s] from the first sample, duration and a seed of its own.
         """
         drawn = np.random.default_rng([self.seed, position])
         delay = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
@@ -79,6 +93,21 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
     ``fault``.
 
     Raises as `union_of_faults` does.
+
+    Parameters
+    ----------
+    config : Config
+        As composed for ``eval``.
+
+    Returns
+    -------
+    tuple of FaultSettings
+        Each once.
+
+    Raises
+    ------
+    ConfigurationError
+        An entry is no fault, or two different ones have one name.
     """
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
@@ -112,6 +141,9 @@ def chosen_fault(config: Config) -> FaultSettings | None:
 
 
 def _settings(content: Mapping[str, Any]) -> FaultSettings:
+    """Settings of one fault from a mapping; raises `ConfigurationError` for wrong keys and
+    values.
+    """
     return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")
 
 
@@ -140,6 +172,15 @@ def check_channels(
     """Raise `ConfigurationError` where a scored recording lacks a faulty channel.
 
     No samples are read.
+
+    Parameters
+    ----------
+    faults : sequence of FaultSettings
+        Without any, nothing is looked at.
+    split : Split
+        Validation and tests count.
+    data : mapping
+        Data set -> recordings at the estimator's rate.
     """
     spans = (*split.validation, *split.test_spans) if faults else ()
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
@@ -169,6 +210,25 @@ def errors_under(
 
     A piece is a range or sequence, its samples with a warm-up before it, and the state to start
     from, if any.
+
+    Parameters
+    ----------
+    settings : FaultSettings
+        The fault; each piece draws its onset anew.
+    estimator : Estimator
+        The model.
+    pieces : sequence of tuple
+        As above.
+    trust : Trust or None
+        Bands and health of the model.
+    nominal : sequence of Scored
+        The same pieces without the fault.
+    score : callable
+        Estimates -> scored pieces.
+    rate_hz : float
+        Of the evaluation [Hz].
+    other_vehicle : bool
+        Whether bands are widened, as on a vehicle without calibration.
 
     Returns
     -------

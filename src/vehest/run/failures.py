@@ -20,7 +20,14 @@ class Failure:
 
 
 def failure_of(error: Exception) -> Failure:
-    """The failure behind an exception; a defect unless the user or the machine can change it."""
+    """The failure behind an exception that a job or command raised; a defect unless the user or the
+    machine can change it.
+
+    Returns
+    -------
+    Failure
+        One line for what the user or the machine can change; with the traceback for a defect.
+    """
     expected = error if isinstance(error, VehestError) else _of_machine(error)
     if expected is not None:
         return Failure(str(expected), exit_code=expected.exit_code)

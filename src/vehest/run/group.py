@@ -77,6 +77,18 @@ class Group:
 
         On one thread, that of matrix products included: recursions over small states gain nothing
         from more, and groups run side by side.
+
+        Parameters
+        ----------
+        should_stop : callable
+            Asked between batches and stages.
+        on_progress : callable
+            Takes the progress of trainings, and what the group waits for.
+
+        Returns
+        -------
+        list of Member
+            One a job, in their order; a member that was stopped lacks what was not made.
         """
 
         def artefact_of(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
@@ -120,13 +132,21 @@ class Group:
     ) -> Artefact | None:
         """The artefact of a plan, if it is there and not to be made anew.
 
-        ``warn`` is told of a damaged one.
+        ``warn`` receives a line about a damaged one.
         """
         return None if plan.stage in self.force else find(plan, warn)
 
 
 def existing(group: Group, warn: Callable[[str], None] = lambda text: None) -> list[Member]:
-    """The members of a group with the artefacts that are there already."""
+    """The members of a group with the artefacts that are there already.
+
+    Parameters
+    ----------
+    group : Group
+        Jobs, and what is to be done with them.
+    warn : callable
+        Takes one line on a damaged artefact.
+    """
     return [
         _member(
             group, job, group.existing(job.plan, warn), lambda plan, _: group.existing(plan, warn)
@@ -166,6 +186,8 @@ def _member(
 def compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
     """While kernels of calibration and evaluation are not in the compile cache, one process
     compiles them, and others wait for it.
+
+    The lock lies in the output root; ``should_stop`` is called while waiting.
     """
     missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
     return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
@@ -197,6 +219,9 @@ def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
 def _train(
     jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Report
 ) -> list[Artefact]:
+    """Train jobs together and write a model for each; those without a finished epoch are left out,
+    and their checkpoints stay.
+    """
     folders = [job.plan.checkpoint_folder for job in jobs]
     context = FitContext(
         checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress
@@ -204,7 +229,7 @@ def _train(
     artefacts = []
     for job, (estimator, record) in zip(jobs, fit_jobs(jobs, context), strict=True):
         if record.interrupted and not record.metrics.get("best_epoch", 1):
-            continue  # nothing learnt yet; the checkpoint knows where to go on
+            continue  # nothing trained yet; the checkpoint states where to go on
 
         def write(
             folder: Path,

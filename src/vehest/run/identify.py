@@ -72,11 +72,21 @@ class Normal(NamedTuple):
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
-    """Run the filter that comes with vehest over drives of one car, and write the car's record,
-    YAML; raises `VehestError`.
+    """Run the filter that comes with vehest over drives of one car; write the car's record and
+    return it.
 
-    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter,
-    ``estimator.KEY=VALUE``.
+    Parameters
+    ----------
+    words : sequence of str
+        Recordings, then overrides of conf/estimate.yaml and settings of the filter,
+        ``estimator.KEY=VALUE``.
+    out : Path
+        YAML file; an earlier record is replaced, nothing else.
+
+    Raises
+    ------
+    VehestError
+        No recording is named, two have one id, one cannot be used, or ``out`` is no record.
     """
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
@@ -116,7 +126,11 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
 
 
 def in_words(record: CarRecord) -> TerminalTable:
-    """A record for a terminal."""
+    """A record for a terminal.
+
+    A row a number: value, deviation, unit, how much the drives excited it, on which drives it was
+    identified, and what it means.
+    """
     numbers = {name: getattr(record, name) for name in LIMITS}
     numbers |= {
         f"offset of {channel}, {drive}": number
@@ -152,6 +166,19 @@ def _excitation(deviation: float, at_start: float) -> str:
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
     """Numbers after a drive, grip by its logarithm, and mean offsets.
+
+    Parameters
+    ----------
+    model : SelfCalibrating
+        With the settings of the car.
+    recording : Recording
+        One drive without gaps in the model's channels; it is brought to the model's rate.
+
+    Returns
+    -------
+    dict
+        Name -> mean and deviation at the end (offsets: mean over the drive), with half of the
+        difference that a yaw rate early or late by YAW_RATE_LATENESS_SECONDS makes.
 
     Raises
     ------
@@ -196,7 +223,9 @@ def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple
 
 
 def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
-    """The same before any drive."""
+    """The numbers of `posterior_of` before any drive: the priors of a model with the settings of
+    the car.
+    """
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights
     numbers = {
@@ -221,6 +250,18 @@ def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float
 
 def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
     """The record of a car from `posterior_of` its drives.
+
+    Parameters
+    ----------
+    model : SelfCalibrating
+        Gives the prior, wheelbase and centre of gravity.
+    drives : mapping
+        Recording -> its numbers.
+
+    Returns
+    -------
+    CarRecord
+        Grip in m/s², no longer by its logarithm; offsets for each drive.
 
     Raises
     ------
@@ -249,6 +290,20 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
 
     The deviation grows where drives contradict each other, and where they do so beyond
     `AGREEMENT_QUANTILE` none of them identifies the number.
+
+    Parameters
+    ----------
+    prior : Normal
+        Before any drive.
+    drives : mapping
+        Drive -> mean and deviation after it, the prior included. A drive whose deviation is not
+        below the prior's adds nothing.
+
+    Returns
+    -------
+    Number
+        With the drives that identify it: those that leave less than IDENTIFIED_SHARE of the prior's
+        variance.
     """
     mean, deviation, of_lateness = (
         np.array([normal for normal in drives.values() if normal.deviation < prior.deviation])
@@ -281,6 +336,8 @@ def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
 def without_prior(prior: Normal, posterior: Normal) -> tuple[Any, Any]:
     """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation
     is below the prior's.
+
+    Information is the inverse of the variance; that of the prior is subtracted.
     """
     information = 1.0 / posterior.deviation**2 - 1.0 / prior.deviation**2
     return prior.mean + (

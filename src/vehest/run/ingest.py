@@ -48,6 +48,17 @@ PROSE = frozenset(
 def plan_ingest(config: Config) -> StagePlan:
     """The artefact of an ingest.
 
+    Parameters
+    ----------
+    config : Config
+        As composed for ``ingest``.
+
+    Returns
+    -------
+    StagePlan
+        Its key holds the configuration but for `PROSE`, digests of raw files and the source's
+        version.
+
     Raises
     ------
     VehestError
@@ -85,6 +96,28 @@ def write_ingest(
 
     Recordings of slow sources are made side by side and kept beside the artefacts until all are
     done: an interrupted run goes on.
+
+    Parameters
+    ----------
+    config : Config
+        As composed for ``ingest``.
+    plan : StagePlan
+        Of the artefact; names the folder of parts.
+    folder : Path
+        Of the artefact, while it is made.
+    jobs : int
+        Processes of a slow source.
+    stop : StopSignals
+        Asked between recordings.
+    report : callable
+        Takes the progress.
+
+    Raises
+    ------
+    DataError
+        A recording cannot be read, or a check finds an error that is not accepted.
+    Stopped
+        A signal came.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
@@ -150,6 +183,7 @@ def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataErro
 
 
 def _make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
+    """Make one recording in a worker; the source is opened once a process."""
     _make(_opened(description), recording_id, parts)
 
 
@@ -179,7 +213,7 @@ def parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store, by its id.
+    """File name ``ID.parquet`` of a recording in the store, by its id.
 
     Raises
     ------
@@ -203,7 +237,12 @@ def recording_file(recording_id: str) -> str:
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     """Configuration of a simulated data set's ingest.
 
-    Override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`.
+    Override ``seed=1`` is short for ``dataset.seed=1``.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such data set, it is not simulated, or an override is wrong.
     """
     spelt_out = [
         f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override
@@ -219,10 +258,15 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
 
 
 def outcome_of(ingested: Artefact) -> dict[str, Any]:
-    """Number and hours of drives, and names of those that span, left the road or ended before their
-    manoeuvre did.
+    """Number and hours of drives of a simulated data set, and names of those that span, left the
+    road or ended before their manoeuvre did.
 
     Raises `DataError`.
+
+    Returns
+    -------
+    dict
+        ``drives``, ``hours``, and names under ``spun``, ``left_road`` and ``not_completed``.
     """
     drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
     flags = {drive.id: drive.provenance["flags"] for drive in drives}
@@ -252,6 +296,20 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
     """Fetch a data set's missing files and record or compare the others' checksums.
 
     Raises as `Download.fetch`, or `ConfigurationError`.
+
+    Parameters
+    ----------
+    config : Config
+        As composed for ``ingest``.
+    messages : Messages
+        Prints a line a file.
+    dry_run : bool
+        Only print what would be fetched.
+
+    Raises
+    ------
+    DryRunStop
+        In a dry run with missing files.
     """
     from vehest.sources.download import download_of
 

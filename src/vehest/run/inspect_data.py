@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.alignment.findings import Finding
 from vehest.artefacts.artefact import find
 from vehest.configuration.composition import Config, compose_config
 from vehest.configuration.files import choices
@@ -30,10 +29,10 @@ from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, stored_summary, summary_of
 from vehest.data.store import read_recording
 from vehest.run.ingest import plan_ingest, recording_file
+from vehest.run.named_files import require_dataset_or_file
 from vehest.run.printing import TerminalTable
 from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
-from vehest.sources.signals import MISSING
 from vehest.sources.tabular import unused_columns
 
 # Time stamps between these count from 1970.
@@ -46,9 +45,14 @@ Lines = list[str | TerminalTable]
 
 
 def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
-    """Data sets with their files' presence, licences and citations: for JSON and for a terminal.
+    """Data sets with their files' presence, licences and citations, for JSON and for a terminal,
+    and why others cannot be listed.
 
-    Why others cannot be listed.
+    Returns
+    -------
+    tuple
+        Rows with ``dataset``, ``kind``, ``source``, ``here``, ``title``, ``licence`` and
+        ``citation``; lines and tables; errors, a line each.
     """
     rows = []
     errors = []
@@ -85,6 +89,13 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
     """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal.
 
     Raises `VehestError`.
+
+    Parameters
+    ----------
+    source : str
+        Name of a data set, or path of a file.
+    overrides : sequence of str
+        Of conf/ingest.yaml or conf/estimate.yaml.
     """
     with reading(source, overrides) as config:
         recordings = [_described(read()) for _, read in _readers(source, config)]
@@ -111,6 +122,11 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
     """Findings of the checks, for JSON and for a terminal.
 
     A recording that cannot be read is an error too.
+
+    Returns
+    -------
+    tuple
+        Rows with ``level``, ``recording``, ``check``, ``channel`` and ``message``, and lines.
     """
     rows: list[dict[str, str]] = []
     with reading(source, overrides) as config:
@@ -128,7 +144,7 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
                     }
                 )
             else:
-                findings = [*_missing_samples(recording), *checks_of_recording(recording)]
+                findings = checks_of_recording(recording)
                 rows += [{"recording": recording.id, **asdict(finding)} for finding in findings]
     lines: Lines = []
     for row in rows:
@@ -137,18 +153,17 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
     return rows, lines or ["no findings"]
 
 
-def _missing_samples(recording: Recording) -> Iterator[Finding]:
-    """Samples that the source interpolated, or at which it ended the recording."""
-    for name, texts in (recording.provenance.get(MISSING) or {}).items():
-        for text in texts:
-            yield Finding("warning", "missing", name, text)
-
-
 def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
     """Estimators that a data set or file can be used with, and missing channels: for JSON and for a
     terminal.
 
     Raises `VehestError`.
+
+    Returns
+    -------
+    tuple
+        Missing channels, unused columns and a row an estimator (`Usability.as_plain`); and lines
+        and tables.
     """
     with reading(source, overrides) as config:
         recordings = _contents(source, config)
@@ -185,19 +200,21 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
 def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
     """The configuration that reads a data set or a file, while its limits hold.
 
+    Yields
+    ------
+    Config
+        As composed for ``ingest`` or, of a file, for ``estimate``.
+
     Raises
     ------
-    ConfigurationError
-        It is neither.
+    VehestError
+        It is neither (`require_dataset_or_file`).
     """
+    require_dataset_or_file(source)
     if source in choices("dataset"):
         config = compose_config("ingest", [f"dataset={source}", *overrides])
-    elif os.path.lexists(source):  # also of a name that is too long or holds a null character
-        config = compose_config("estimate", overrides)
     else:
-        raise ConfigurationError(
-            f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file"
-        )
+        config = compose_config("estimate", overrides)
     with use_limits(limits_from_config(config["limits"])):
         yield config
 
@@ -234,6 +251,9 @@ def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Re
 
 
 def _described(recording: Recording) -> dict[str, Any]:
+    """Rate, range, channels with their spread, provenance and origin of a recording, as plain
+    values.
+    """
     return {
         "id": recording.id,
         "vehicle": recording.vehicle,
@@ -271,6 +291,9 @@ def _stretch(start: float, end: float) -> str:
 
 
 def _is_here(dataset: dict[str, Any]) -> str:
+    """``yes``, ``no``, or ``no root`` where VEHEST_DATA is not set; simulated data are always
+    here.
+    """
     if dataset.get("source") == "simulated":
         return "yes"
     if not os.environ.get("VEHEST_DATA"):

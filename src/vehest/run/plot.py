@@ -23,6 +23,7 @@ from vehest.run.estimate_tables import read_estimate_table
 
 
 def _page(figure: MatplotlibFigure) -> bytes:
+    """A figure as a page of HTML of its own."""
     title = as_text(figure.axes[0].get_title(loc="left"))
     caption = "Sideslip angle with band and health, lateral velocity, measured channels, course."
     return page_of(Document(title, [Figure("drive", caption, figure)]))
@@ -59,7 +60,17 @@ def check_plot_of_estimate(out: Path, picture: Path) -> None:
 
 
 def plot_estimate(words: Sequence[str], out: Path, picture: Path) -> None:
-    """Draw an estimate that `vehest.run.estimate.estimate_file` wrote from the same words."""
+    """Draw an estimate that `vehest.run.estimate.estimate_file` wrote from the same words.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Of the command: model (may be left out), recording, overrides.
+    out : Path
+        The estimate, as .parquet.
+    picture : Path
+        What is drawn; see `plot_files`.
+    """
     has_model = len(words) > 1 and is_file_name(words[1])
     recording, *overrides = words[1:] if has_model else words
     plot_files([recording, str(out), *overrides], picture)
@@ -79,6 +90,11 @@ def plot_files(
         ``.png``, ``.pdf``, ``.svg`` or ``.html``; appears complete or not at all.
     start, stop : float, optional
         Range that is drawn [s]; by default all of it.
+
+    Returns
+    -------
+    dict
+        File, recording, its length [s], estimates, and whether it has a reference.
 
     Raises
     ------

@@ -79,6 +79,22 @@ def emit(as_json: bool, outcome: Any, lines: Iterable[str | TerminalTable] | Non
     """Print the outcome of a command, as one JSON object or in lines and tables.
 
     By default a line for each key; raises `MissingError`.
+
+    Parameters
+    ----------
+    as_json : bool
+        Print one JSON object instead of lines.
+    outcome : Any
+        Plain values.
+    lines : iterable of str or TerminalTable, optional
+        What people read.
+
+    Raises
+    ------
+    OutputClosed
+        The reader of standard output has gone.
+    MissingError
+        Standard output cannot be written to.
     """
     if as_json:
         echo(as_json_text(outcome), keep="\n")
@@ -189,7 +205,19 @@ def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> 
 def summary_of_leaderboard(
     title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]
 ) -> TerminalSummary:
-    """The leaderboard of a study, a table a test set, with the study's verdict."""
+    """The leaderboard of a study, a table a test set, with the study's verdict.
+
+    Parameters
+    ----------
+    title : str
+        Of the study.
+    board : pd.DataFrame
+        As the study's module makes it.
+    left_out : mapping
+        Name of a training -> why it is missing.
+    verdict : sequence of str
+        Lines of plain text; empty for none.
+    """
     header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
     tables = []
     notes = []
@@ -231,6 +259,7 @@ def _summary(
     figures: dict[str, Any],
     left_out: Mapping[str, str],
 ) -> TerminalSummary:
+    """Tables with notes, reasons for what is left out and the verdict below them."""
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
     note = "\n".join([*notes, *missing, *figures.get("verdict", [])])
     return TerminalSummary(
@@ -289,6 +318,7 @@ def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _cell(value: Any) -> str:
+    """A value as a cell: numbers with four significant digits, a dash for what is not finite."""
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "–"
     return str(value)

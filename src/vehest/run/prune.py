@@ -39,6 +39,11 @@ LEFT_OVER = "left by a process that was killed"
 def unused_artefacts(output: Path) -> list[dict[str, Any]]:
     """List everything in an output root that no current configuration can reuse, stage by stage.
 
+    Parameters
+    ----------
+    output : Path
+        Output root; nothing in it is changed.
+
     Returns
     -------
     list[dict[str, Any]]
@@ -76,7 +81,19 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
     """Remove files and folders, each renamed first so that no half is found.
 
-    ``on_removed`` is called after each; raises `MissingError`.
+    ``on_removed`` is called after each.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        As `unused_artefacts` lists them; those that another process removed are passed over.
+    on_removed : callable
+        Takes a path.
+
+    Raises
+    ------
+    MissingError
+        A path cannot be removed.
     """
     for path in paths:
         aside = aside_of(path)
@@ -135,6 +152,7 @@ def _entries(place: Path) -> list[Path]:
 
 
 def _size_and_age(path: Path) -> dict[str, int]:
+    """Size of all files [bytes], and time since the last of them was written [s]."""
     about = [entry.lstat() for entry in (path, *path.rglob("*"))]
     size = sum(entry.st_size for entry in about if not stat.S_ISDIR(entry.st_mode))
     return {

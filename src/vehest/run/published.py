@@ -58,7 +58,27 @@ def keys_of_study(
     stages: Stages,
     inputs: Mapping[str, Mapping[str, str]],
 ) -> Keys:
-    """Keys of everything that determines the results of a study."""
+    """Keys of everything that determines the results of a study.
+
+    Parameters
+    ----------
+    study : Study
+        The pipeline.
+    jobs : mapping
+        Part -> its jobs, before rates are lowered.
+    absent : collection of str
+        Parts or data sets that the study goes on without.
+    stages : Stages
+        Composes configurations of data sets.
+    inputs : mapping
+        Data set -> digests of its raw files; those that are not here have no DATA.
+
+    Returns
+    -------
+    Keys
+        ``ingest DATASET``, ``[PART: ]STAGE [ESTIMATOR]`` and ``report``, each -> CODE,
+        CONFIGURATION and DATA as far as they apply.
+    """
     ingests = _ingests(study, jobs, absent, stages)
     keys: Keys = {}
     for name, config in ingests.items():
@@ -80,6 +100,7 @@ def keys_of_study(
 def _ingests(
     study: Study, jobs: Jobs, absent: Collection[str], stages: Stages
 ) -> dict[str, Config]:
+    """Data set -> configuration of its ingest, of all parts that are not absent."""
     configs = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
         return configs
@@ -133,6 +154,7 @@ def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, d
 
 
 def _hash(content: Any) -> str:
+    """Sixteen hexadecimal digits of a plain value."""
     return hash_of(content)[:16]
 
 
@@ -160,6 +182,15 @@ def check_published(
     Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each
     with ``what`` (``train ksnn``) and one of `CAUSES`, and a ``note`` on what was not compared, or
     why the state is not known.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Pipelines or published studies; none for all that are published.
+    overrides : sequence of str
+        Of where raw files come from and results go alone.
+    messages : Messages or None
+        By default nothing is printed.
 
     Raises
     ------
@@ -202,6 +233,13 @@ def check_listed(
     Returns the same, each with ``failure``, empty for a study as it should be. A listed study with
     keys of other stages than today's, or without keys, is stale without a look at its
     configuration, which takes a minute for all.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        As of `check_published`.
+    messages : Messages or None
+        As of `check_published`.
     """
     reasons = _stale_list()
     verdicts = []
@@ -274,6 +312,9 @@ def _pipeline_of(study: str) -> Study | None:
 
 
 def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
+    """State, changes and note of one study: of its tables where a command outside pipelines made
+    them, else of its pipeline.
+    """
     published = published_in(RESULTS / study)
     state = "not known"
     changes = [("pipeline", CONFIGURATION)]
@@ -313,6 +354,7 @@ def _outcome(
     note: str = "",
     n_not_trained: int = 0,
 ) -> dict[str, Any]:
+    """A verdict as plain values."""
     return {
         "study": study,
         "state": state,

@@ -66,7 +66,7 @@ class Published:
 
 
 def published_in(folder: Path) -> Published | None:
-    """Read the record of a published study; none where nothing is published.
+    """Read the record of a published study, in results/STUDY; None where nothing is published.
 
     Raises
     ------
@@ -92,6 +92,15 @@ def publish_study(
     A published report stays that shows data which this run could not read, or more trainings with
     the same keys. Where keys and all other files are the same, the provenance stays that of the
     first run with these results.
+
+    Parameters
+    ----------
+    publication : Publication or None
+        None: the study is not published.
+    report : Artefact
+        The drawn report.
+    messages : Messages
+        Prints why a study is not published, or where.
 
     Raises
     ------
@@ -131,6 +140,11 @@ def publish_study(
 def uncommitted_changes() -> str:
     """Files that determine results and differ from the last commit, in words; empty where there are
     none, or no git checkout.
+
+    Returns
+    -------
+    str
+        Of `SOURCES_OF_RESULTS`; also where git has not answered within 60 s.
     """
     command = ["git", "status", "--porcelain", "--untracked-files=all", "--", *SOURCES_OF_RESULTS]
     try:
@@ -193,6 +207,7 @@ def _is_published(report: Artefact, folder: Path, publication: Publication) -> b
 
 
 def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
+    """Replace the folder in one step by the report's files, with keys in its provenance."""
     contents = _contents(report)
     with written_aside(folder, replace_folder=True) as aside:
         for name, content in contents.items():
@@ -205,8 +220,8 @@ def _publish(report: Artefact, folder: Path, publication: Publication) -> None:
 
 
 def published_content(file: Path) -> bytes:
-    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits,
-    which other machines reproduce.
+    """Content of a report's file as it is published: numbers of a CSV file with `DIGITS`
+    significant digits, which other machines reproduce; other files as they are.
     """
     if file.suffix != ".csv":
         return file.read_bytes()

@@ -21,6 +21,11 @@ That a reference departs from the kinematics is for `vehest data check` to say.
 def reference_findings(recording: Recording) -> Iterator[Finding]:
     """Findings that a reference of a recording has another sign or unit, is stuck or impossible,
     accepted errors included.
+
+    Parameters
+    ----------
+    recording : Recording
+        Without a reference there is nothing to check.
     """
     if any(name.endswith(REFERENCE_SUFFIX) for name in recording.channels):
         for finding in checks_of_recording(recording):

@@ -54,6 +54,39 @@ def replay_log(
     """Replay a log and let a model estimate.
 
     Returns its figures. The options are those of ``vehest replay``; raises `VehestError`.
+
+    Parameters
+    ----------
+    log : Path
+        Log of a CAN bus.
+    overrides : sequence of str
+        Of conf/estimate.yaml.
+    stopped : callable
+        Asked while frames are sent; true ends the replay.
+    say : callable
+        Takes remarks, one line each.
+    model : str
+        As `open_model` finds it.
+    dbc : Path or None
+        Describes the bus, unless a data set does.
+    dataset : str or None
+        Name of a data set in conf/dataset.
+    signals : str
+        ``CHANNEL=MESSAGE.SIGNAL`` pairs, separated by commas, where names do not decide.
+    speed : str
+        Factor of the log's time, or ``max`` on the virtual bus.
+    bus_rate : float or None
+        Rate of samples [Hz]; None: that of the fastest channel, rounded to a plain rate.
+    interface, channel : str
+        Of python-can.
+    identifier : str
+        Of the first frame of estimates, decimal or hexadecimal.
+    out : Path or None
+        Where estimates go.
+    write_dbc : Path or None
+        Where a DBC of the frames of estimates goes.
+    quiet : bool
+        Draw nothing while it runs.
     """
     bus = Bus(interface, channel, _speed(speed))
     estimates = EstimateFrames(_identifier(identifier))
@@ -125,6 +158,7 @@ def _signals(
 
 
 def _speed(text: str) -> float | None:
+    """Factor of the log's time, None for ``max``; raises `ConfigurationError` otherwise."""
     with suppress(ValueError):
         if text == "max" or 0 < float(text) < math.inf:
             return None if text == "max" else float(text)
@@ -132,6 +166,7 @@ def _speed(text: str) -> float | None:
 
 
 def _identifier(text: str) -> int:
+    """A CAN identifier from decimal or hexadecimal text; raises `ConfigurationError` otherwise."""
     with suppress(ValueError):
         if int(text, 0) > 0:
             return int(text, 0)

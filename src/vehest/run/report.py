@@ -88,6 +88,31 @@ def draw_report(
     Trials of searches are in no part, so that a report is the same whether they were trained here
     or published before. The weights of an incomplete study include all that were published before,
     so that no training is lost.
+
+    Parameters
+    ----------
+    study : Study
+        The pipeline.
+    comparisons : mapping
+        Part -> its comparison, trained and evaluated; trials of searches among them.
+    datasets : sequence
+        Of a study of recordings alone.
+    runner : Runner
+        Makes the artefact.
+    trials : sequence of Trial
+        Of finished searches.
+    search_remarks : sequence of str
+        Of parts that do not use what a search chose.
+
+    Returns
+    -------
+    tuple
+        The report's artefact, and tables and figures for the terminal.
+
+    Raises
+    ------
+    ConfigurationError
+        The study's module makes no table for the terminal.
     """
     is_complete = not any(part.unfinished for part in comparisons.values())
     comparisons = {name: part for name, part in comparisons.items() if name not in study.trials}
@@ -170,7 +195,7 @@ def draw_report(
             if not is_complete and runner.weights is not None and runner.weights.path.is_file():
                 shutil.copyfile(runner.weights.path, folder / PUBLISHED_WEIGHTS)
             try:
-                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models)
+                PublishedWeights(folder / PUBLISHED_WEIGHTS).add(models, runner.origins)
             except WeightsTooLargeError as error:
                 runner.messages.warn(f"the report is published without weights: {error}")
 
@@ -259,6 +284,7 @@ def _recordings(
 
 
 def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
+    """What a study's module may look at of one part: models, metrics, references and facts."""
     models = []
     tables = []
     for member in part.members:
@@ -307,8 +333,8 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
 
 
 def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedModel]:
-    """Models in which estimators that share a title have their variant behind it, so that tables,
-    legends and verdicts distinguish them.
+    """The models of one part; estimators that share a title have their variant behind it, so that
+    tables, legends and verdicts distinguish them.
     """
     names: dict[str, set[tuple[str, str]]] = {}
     for model in models:
@@ -343,13 +369,14 @@ def _timings_of(part: PartArtefacts) -> pd.DataFrame:
 
 
 def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
+    """Tables of models as one, with METRIC_COLUMNS."""
     return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
 
 
 def draw_sweep(
     study: Study, comparison: Comparison, runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a sweep, unless its report is there, and sum it up for the terminal.
+    """Draw a sweep of `sweep_of`, unless its report is there, and sum it up for the terminal.
 
     A failed job has a row with its reason.
     """
@@ -405,6 +432,7 @@ def draw_sweep(
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:
+    """The column layout of `SweepArtefacts.jobs`, a row a job."""
     split = comparison.evaluation.split
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []

@@ -113,6 +113,12 @@ class RunCache:
     def load(self) -> tuple[Record, list[Artefact]] | None:
         """The finished study and its artefacts, if nothing has changed since and all of it is
         there.
+
+        Returns
+        -------
+        tuple or None
+            Record, and the artefacts in the order in which they were made, the report last.
+            Manifests are compared, files are not hashed again.
         """
         if self.file is None or not self.file.is_file():
             return None
@@ -138,6 +144,11 @@ class RunCache:
         """The finished study, notes printed first, published as a run in full would.
 
         None without a valid record, or under force.
+
+        Parameters
+        ----------
+        options : RunOptions
+            Under ``dry_run`` nothing is published.
         """
         finished = None if options.force else self.load()
         if finished is None:
@@ -167,6 +178,19 @@ class RunCache:
         """Record a finished study, unless runs are left to track or files changed meanwhile.
 
         ``raw``: stamps from before reading.
+
+        Parameters
+        ----------
+        runner : Runner
+            With all artefacts of the run.
+        report : Artefact
+            Of the study.
+        summary : TerminalSummary
+            What was printed.
+        raw : dict
+            Folder of raw files -> stamp.
+        publication : Publication or None
+            If the study is published.
         """
         tracker = runner.tracker
         output = runner.output
@@ -210,6 +234,9 @@ class RunCache:
             runner.messages.warn(f"{error}; the next run looks at everything again")
 
     def _inputs(self) -> str:
+        """Hash of everything that determines keys but raw files; empty where something else may
+        determine them, such as a resolver other than ``oc.env``.
+        """
         try:
             texts = {
                 str(file): regular_file(file).read_bytes().decode("utf-8", "replace")

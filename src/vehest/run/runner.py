@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
+from vehest.artefacts.keys import hash_of
 from vehest.artefacts.locks import Waiting
 from vehest.configuration.composition import Config, compose_config, missing_keys, quoted
 from vehest.data.car import CarValues
@@ -32,13 +33,14 @@ from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
+from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.printing import finding_in_words
 from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
-from vehest.run.train import DIVERGED, read_fit_metrics
+from vehest.run.train import DIVERGED, TrainJob, read_fit_metrics
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.weights import PublishedWeights, publish_weights
 from vehest.sources.base import SIMULATED, car_of, kind_of, open_source
@@ -84,7 +86,10 @@ class Stages:
         )
 
     def ingest(self, config: Config) -> Artefact:
-        """The recordings of a data set at their native rate."""
+        """The recordings of a data set at their native rate.
+
+        ``config`` is composed for ``ingest``. Raises as `ensure`, `plan_ingest` and `write_ingest`.
+        """
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
@@ -98,7 +103,9 @@ class Stages:
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
     ) -> Artefact:
-        """The recordings of a data set at another rate."""
+        """The ingested recordings of a data set at another rate [Hz]; ``options`` are
+        ``downsample`` of a configuration.
+        """
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
 
@@ -123,20 +130,20 @@ class Stages:
         ]
 
     def look_for_files(self, config: Config) -> None:
-        """Make sure that the raw files of every data set of a split are here.
-
-        Read nothing.
-
-        Raises
-        ------
-        MissingError
-            Some are not.
+        """Raise `MissingError` where raw files of a data set of a split are not here; nothing is
+        read.
         """
-        for dataset in self.datasets_of(config):
+
+        def look(name: str) -> None:
+            dataset = self.dataset_config(name, config)["dataset"]
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()
 
+        for name in dataset_names(config["split"]):
+            self._once("files", name, partial(look, name))
+
     def _ingested(self, name: str, config: Config) -> Artefact:
+        """The ingested recordings of a data set, looked for once a run."""
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
@@ -157,10 +164,8 @@ class Stages:
         )
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
-        """Channels and rates of the recordings of every data set of a split, which are ingested for
-        it.
-
-        No samples are read.
+        """Data set of a split -> channels and rates of its recordings, which are ingested for it;
+        no samples are read.
         """
 
         def read(name: str) -> tuple[RecordingSummary, ...]:
@@ -189,6 +194,7 @@ class Stages:
                 )
 
     def _warn_of_reference(self, dataset: str, recording: str, config: Config) -> None:
+        """Warn of findings in the references of one stored recording."""
         ingested = self._ingested(dataset, config)
         file = recording_file(recording)
         if file not in ingested.outputs:
@@ -200,7 +206,7 @@ class Stages:
             )
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
-        """Every data set of a split at a rate."""
+        """Data set of a split -> its recordings at a rate [Hz], by ``downsample`` of ``config``."""
         return {
             name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"])
             for name in split.datasets
@@ -208,7 +214,11 @@ class Stages:
 
     def cars(self, config: Config, datasets: Iterable[str]) -> dict[str, CarValues]:
         """Values of the cars of data sets."""
-        return {name: car_of(self.dataset_config(name, config)["dataset"]) for name in datasets}
+
+        def car(name: str) -> CarValues:
+            return car_of(self.dataset_config(name, config)["dataset"])
+
+        return {name: self._once("car", name, partial(car, name)) for name in datasets}
 
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
         """How estimates are scored, with the lowest speed of sideslip on each data set, by its
@@ -222,8 +232,9 @@ class Stages:
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
-        """How a configuration is evaluated: against references that are resampled like everything,
-        but never filtered further.
+        """How a configuration is evaluated, also under ``faults``: against references that are
+        resampled like everything, but never filtered further. ``data`` are the recordings of each
+        data set at the estimator's rate.
         """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
@@ -247,7 +258,20 @@ class Stages:
         )
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-        """Make an artefact unless it is there."""
+        """Make the artefact of a plan by ``write``, which receives a folder, unless it is there.
+
+        Returns
+        -------
+        Artefact
+            Found, made, or made by another process for which this one waited.
+
+        Raises
+        ------
+        DryRunStop
+            In a dry run, where it is not there.
+        Stopped
+            A signal came while it was made.
+        """
 
         def print_waiting(waiting: Waiting) -> None:
             self.messages.end(plan.stage, plan.label)
@@ -288,6 +312,7 @@ class Runner(Stages):
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
     weights: PublishedWeights | None = None  # published ones, used instead of training
     publishes_to: PublishedWeights | None = None  # to which finished trainings are added
+    origins: dict[str, str] = field(default_factory=dict)  # key of a training -> its origin
     train_first: str = ""  # command to run first where a training is missing; empty to train here
     evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
 
@@ -298,14 +323,21 @@ class Runner(Stages):
         Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
         at a signal; finished artefacts stay.
 
+        Parameters
+        ----------
+        groups : sequence of Group
+            As `Comparison.plan` makes them.
+
         Returns
         -------
         tuple[dict[str, Member], dict[str, Failure]]
             Key of a training -> its member, and key of a training -> why it failed. Where the time
             is up, members lack what was not made, and trainings that were not begun are in neither.
         """
+        jobs = [job for group in groups for job in group.jobs]
+        self.origins |= {job.plan.key: self.origin(job) for job in jobs}
         if self.weights is not None and TRAIN not in self.force:
-            self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
+            self._take_published([job.plan for job in jobs], self.weights)
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
@@ -360,24 +392,54 @@ class Runner(Stages):
         return [group for group in reduced if group.jobs]
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
-        """Take models that are published under the key of a training and are not there."""
-        published = [plan for plan in plans if plan.key in weights and find(plan) is None]
-        for plan in published if not self.dry_run else ():
+        """Take models that are published under the key of a training, or under its origin, and are
+        not there.
+        """
+        published = [
+            (plan, key)
+            for plan in plans
+            if (key := weights.published_key(plan.key, self.origins[plan.key])) is not None
+            and find(plan) is None
+        ]
+        for plan, key in published if not self.dry_run else ():
             ensured(
-                plan,
-                partial(weights.write, plan.key),
-                False,
-                self.stop.requested,
-                self.print_waiting,
+                plan, partial(weights.write, key), False, self.stop.requested, self.print_waiting
             )
             self.stop.raise_if_requested()
         if published:
+            n_other = sum(key != plan.key for plan, key in published)
+            other = (
+                f" ({n_other} of them were trained on these recordings as another processor makes "
+                "them: their last bits differ)"
+                if n_other
+                else ""
+            )
             self.messages.line(
                 "note",
                 TRAIN,
                 f"{len(published)} of {len(plans)}",
-                f"taken from {weights.path}; --retrain trains them",
+                f"taken from {weights.path}{other}; --retrain trains them",
             )
+
+    def origin(self, job: TrainJob) -> str:
+        """The key of a training with the origins of its recordings in place of their digests: the
+        keys of their ingests, and how they were downsampled.
+        """
+        ingests = {
+            artefact.label: artefact.key
+            for artefact in self.artefacts.values()
+            if artefact.stage == INGEST
+        }
+        origins = {
+            name: [ingests[name], dict(data.config), data.code]
+            for name, data in job.data.items()
+            if name in ingests
+        }
+        inputs = {
+            name: origins.get(name.partition("/")[0], digest)
+            for name, digest in job.plan.inputs.items()
+        }
+        return hash_of({**job.plan.keyed_content, "inputs": inputs})
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
         """Print what groups are going to do; a dry run ends here."""
@@ -443,7 +505,9 @@ class Runner(Stages):
         if (
             self.publishes_to is not None
             and not self.dry_run
-            and not publish_weights(self.publishes_to, models, self.output, self.messages)
+            and not publish_weights(
+                self.publishes_to, models, self.origins, self.output, self.messages
+            )
         ):
             self.publishes_to = None
 
@@ -468,7 +532,7 @@ class Runner(Stages):
 
 
 def _in_words(artefact: Artefact) -> tuple[str, str]:
-    """How a model, a calibration or an evaluation ended, and what came out."""
+    """How a model, a calibration or an evaluation ended, and its result."""
     if artefact.skipped:
         return REUSED, "up to date"
     if artefact.status == "interrupted":

@@ -3,14 +3,14 @@
 planned trials -> `published_values` of results/STUDY/searches.csv, else their evaluations ->
 `trials_of` -> `remarks_on` parts -> report
 
-A search is finished where the file has all of its trials with today's keys: then none of them is
-trained, wherever the study runs.
+A search is finished where the file has all of its trials with today's origins (`run.weights`): then
+none of them is trained, wherever the study runs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from vehest.run.comparison import Comparison
 from vehest.run.evaluate import evaluation_options, read_metrics
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.study import Job, Study
-from vehest.run.train import training_options
+from vehest.run.train import TrainJob, training_options
 from vehest.run.versions import code_of
 from vehest.studies.artefacts import Trial, nominal_rows, write_frame
 
@@ -40,34 +40,53 @@ TRIAL_COLUMNS = (
     "seed",
     "metric",
     "validation",
-    "key",
+    "origin",
     "evaluation",
     "chosen",
 )
+OriginOf = Callable[[TrainJob], str]
+"""A training -> its origin: `vehest.run.runner.Runner.origin`."""
 DIGITS = 6  # significant ones of a validation value, as in published CSV files
 
 
 def published_values(
-    study: Study, comparisons: Mapping[str, Comparison], path: Path
+    study: Study, comparisons: Mapping[str, Comparison], origin_of: OriginOf, path: Path
 ) -> dict[str, float]:
     """Validation value of each trial of those searches that a published file has in full, with
-    today's keys.
+    today's origins.
 
-    Raises `DataError`.
+    Parameters
+    ----------
+    study : Study
+        With its searches.
+    comparisons : mapping
+        Part -> its planned jobs.
+    path : Path
+        searches.csv of the published study.
+
+    Returns
+    -------
+    dict
+        Trial -> value; empty where the file is not there.
+
+    Raises
+    ------
+    DataError
+        The file is damaged.
     """
     if not path.is_file():
         return {}
     values = {
-        (row["key"], row["evaluation"], row["metric"]): number_in(row, "validation", path)
+        (row["origin"], row["evaluation"], row["metric"]): number_in(row, "validation", path)
         for row in read_rows(path, TRIAL_COLUMNS)
     }
     finished: dict[str, float] = {}
     for trials in study.searches.values():
-        planned = [_planned_trial(study, name, comparisons) for name in trials]
+        planned = [_planned_trial(study, name, comparisons, origin_of) for name in trials]
         published_trials = {
-            trial.name: values[trial.key, trial.evaluation, trial.metric]
+            trial.name: values[trial.origin, trial.evaluation, trial.metric]
             for trial in planned
-            if trial is not None and (trial.key, trial.evaluation, trial.metric) in values
+            if trial is not None and (trial.origin, trial.evaluation, trial.metric) in values
         }
         if len(published_trials) == len(trials):
             finished |= published_trials
@@ -75,16 +94,35 @@ def published_values(
 
 
 def trials_of(
-    study: Study, comparisons: Mapping[str, Comparison], published: Mapping[str, float]
+    study: Study,
+    comparisons: Mapping[str, Comparison],
+    origin_of: OriginOf,
+    published: Mapping[str, float],
 ) -> list[Trial]:
     """The trials of every search of which all have a value: a published one, or that of their
     evaluation.
+
+    Parameters
+    ----------
+    study : Study
+        With its searches.
+    comparisons : mapping
+        Part -> its comparison.
+    origin_of : callable
+        Origin of a training.
+    published : mapping
+        Trial -> published value.
+
+    Returns
+    -------
+    list of Trial
+        The one with the lowest value of its search is chosen, the first of equals.
     """
     finished: list[Trial] = []
     for names in study.searches.values():
         trials = []
         for name in names:
-            trial = _planned_trial(study, name, comparisons)
+            trial = _planned_trial(study, name, comparisons, origin_of)
             if trial is None or not (name in published or comparisons[name].members):
                 break
             value = published.get(name)
@@ -131,18 +169,21 @@ def remarks_on(
 
 
 def write_trials(trials: Sequence[Trial], path: Path) -> None:
-    """Write the trials of searches, a row each, with their keys."""
+    """Write the trials of searches, a row each, with their origins."""
     rows = [{column: getattr(trial, column) for column in TRIAL_COLUMNS} for trial in trials]
     write_frame(pd.DataFrame(rows, columns=list(TRIAL_COLUMNS)), path)
 
 
 def _options(study: Study, name: str) -> tuple[str, ...]:
+    """The overrides that a trial tries."""
     search = study.parts[name].search
     assert search is not None
     return search.candidates[0]
 
 
-def _planned_trial(study: Study, name: str, comparisons: Mapping[str, Comparison]) -> Trial | None:
+def _planned_trial(
+    study: Study, name: str, comparisons: Mapping[str, Comparison], origin_of: OriginOf
+) -> Trial | None:
     """A trial before it has a value.
 
     None where its recordings are not here or it cannot be trained.
@@ -170,7 +211,7 @@ def _planned_trial(study: Study, name: str, comparisons: Mapping[str, Comparison
         training=dict(job.config["training"]),
         metric=search.metric,
         validation=math.nan,
-        key=job.training.plan.key,
+        origin=origin_of(job.training),
         evaluation=f"{code} {hash_of(options)[:16]}",
     )
 
@@ -192,7 +233,7 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
 def settings_to_compare(
     config: Config, tried: set[str] | frozenset[str] = frozenset()
 ) -> dict[str, Any]:
-    """What determines a training, without its seed and the options that are tried."""
+    """What determines a training, without its seed and the dotted keys that are tried."""
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}
     for key in tried:

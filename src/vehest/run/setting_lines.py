@@ -38,7 +38,8 @@ class SettingLine:
 
 
 def setting_lines(settings: Any, skipped: Collection[str] = ()) -> dict[str, SettingLine]:
-    """Name -> line of each field of a dataclass of settings but those skipped; groups come last.
+    """Name -> line with the value of each field of a dataclass of settings, but of ``skipped``
+    names; groups come last.
 
     Numbers that a fit determines are listed inside groups alone.
     """
@@ -83,6 +84,7 @@ def config_as_commented_yaml(config: Config) -> str:
 def _config_lines(
     config: Config, comments: Mapping[str, SettingLine], indent: str
 ) -> Iterator[str]:
+    """Lines of a configuration, with comments where a key is a declared setting."""
     for key, value in config.items():
         line = comments.get(key)
         if line is not None and line.group is not None and isinstance(value, dict) and value:
@@ -99,6 +101,7 @@ def _config_lines(
 
 
 def _line(key: str, comment: str) -> str:
+    """A line of YAML with its comment from COMMENT_COLUMN on."""
     return f"{key:<{COMMENT_COLUMN - 1}} # {comment}\n" if comment else f"{key}\n"
 
 
@@ -145,6 +148,7 @@ def _comment_of(described: type, name: str) -> str:
 
 
 def _unit(declared: Declaration) -> str:
+    """A unit in brackets, after a blank; empty without one."""
     return f" [{declared.unit}]" if declared.unit else ""
 
 

@@ -52,6 +52,11 @@ class StopSignals:
 
         Raises `Stopped` in place of an exception after a signal: compiled modules turn one into
         another, and what a signal ends may fail.
+
+        Raises
+        ------
+        Stopped
+            A signal came; also in place of what it made fail.
         """
         former = {
             number: signal.signal(number, self._handle)
@@ -76,6 +81,7 @@ class StopSignals:
             self._deferred = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        """Record a signal, and raise `Stopped` unless it is the first one and deferred."""
         first = self.number is None
         self.number = self.number or number
         if not (self._deferred and first):
@@ -101,9 +107,8 @@ def blocked_signals() -> Iterator[None]:
 
 
 class TimeLimit:
-    """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s].
-
-    None for no limit.
+    """Stops on a signal, and once ``time.monotonic`` [s] has reached ``until``; None: no time
+    limit.
     """
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:

@@ -6,7 +6,6 @@ sweep's overrides -> `sweep_of` -> both
 
 from __future__ import annotations
 
-import difflib
 import json
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,8 +29,7 @@ from vehest.configuration.composition import (
     parsed,
     value_of,
 )
-from vehest.configuration.files import choices, find_pipeline, pipeline_names
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.folds import FoldsFile
 from vehest.data.limits import use_limits
 from vehest.data.schema import settings_from_config, validated
@@ -41,7 +39,7 @@ from vehest.estimators.registry import new_estimator
 from vehest.evaluation.metrics import UNITS
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
-from vehest.run.next_commands import command_line, location_overrides
+from vehest.run.named_files import require_pipeline
 from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, override_text, short_names
@@ -161,9 +159,26 @@ def failure_messages(jobs: Iterable[Job]) -> str:
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
     """Read a pipeline by path or name.
 
-    ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`.
+    Parameters
+    ----------
+    name : str
+        Path of a file, or name of one in ./pipelines or of those that come with vehest.
+    overrides : sequence of str
+        Of the command; they enter ``command`` and ``words`` of the study.
+
+    Returns
+    -------
+    Study
+        Folds of a cross-validated split, and candidates of searches, are parts of it.
+
+    Raises
+    ------
+    MissingError
+        There is no such pipeline.
+    ConfigurationError
+        The file is no pipeline, or does not fit the module that draws its report.
     """
-    file, content = _content_of(name, location_overrides(overrides))
+    file, content = _content_of(name, overrides)
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     datasets = [*read.datasets, *read.optional_datasets]
     forms = {"split": read.split or read.sweeps, "parts": read.parts, "datasets": datasets}
@@ -271,22 +286,13 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
 
 
 def _content_of(
-    name: str, location: Sequence[str] = (), *, as_base: bool = False
+    name: str, overrides: Sequence[str] = (), *, as_base: bool = False
 ) -> tuple[Path, dict[str, Any]]:
     """A pipeline's file and its content, on top of that of the one it is based on.
 
-    ``location``: overrides of the command that a command in an error's text needs too.
+    ``overrides``: those of the command, for the text of an error.
     """
-    file = find_pipeline(name)
-    if file is None:
-        close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
-        hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
-        if name in choices("dataset"):
-            usable = command_line("data usable", [name, *location])
-            hint = f", only a data set: '{usable}' says what its recordings suffice for"
-        raise MissingError(
-            f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})"
-        )
+    file = require_pipeline(name, overrides)
     try:
         content = read_yaml(file)
     except DataError as error:
@@ -351,8 +357,23 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
     """Every job of a pipeline.
 
-    Further overrides apply to the sweeps, or data sets, that have their key; raises
-    `ConfigurationError`.
+    Parameters
+    ----------
+    study : Study
+        The pipeline.
+    overrides : sequence of str
+        Each applies to the sweeps, or data sets, that have its key.
+
+    Returns
+    -------
+    Jobs
+        Part -> its jobs, each configuration once.
+
+    Raises
+    ------
+    ConfigurationError
+        An override matches nothing or belongs to the study; sweeps of a part disagree in what they
+        share; there are more jobs than the limit.
     """
     unit, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
@@ -419,6 +440,10 @@ def _part_jobs(
     suiting: Callable[[Config], list[str]],
     compose: Callable[[tuple[str, ...]], Config],
 ) -> list[Job]:
+    """Jobs of one part: all combinations of its sweeps, each once, with the overrides that they
+    have keys for; raises `ConfigurationError` where they disagree in `SHARED_KEYS`.
+    """
+
     def config_of(job: Sequence[str]) -> Config:
         """Composed without its split, which other jobs share, as other parts share the rest."""
         of_split = tuple(override for override in job if key_of(override).split(".")[0] == "split")
@@ -452,7 +477,7 @@ def _part_jobs(
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change what comes out: not where data come from, where results go, or
+    """Those overrides that change the results: not where data come from, where results go, or
     tracking.
     """
     return [
@@ -464,10 +489,27 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
     """A study with one sweep: all combinations of overrides over their seeds, in the order of the
-    command; raises `ConfigurationError`.
+    command.
 
-    A combination that its estimator refuses stays in the list with the reason. By default the study
-    is named after estimators and split.
+    A combination that its estimator refuses stays in the list with the reason.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        With several values for the keys that are swept.
+    name : str or None
+        Of the study; by default estimators and split.
+
+    Returns
+    -------
+    tuple
+        The study, and its jobs under the part ``""``.
+
+    Raises
+    ------
+    ConfigurationError
+        A key is named twice or takes one value only, all combinations are refused, or there are
+        more jobs than the limit.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")
@@ -530,6 +572,9 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
+    """The job of one combination, with the values that are swept; refused ones have a failure and
+    no configuration.
+    """
     values: dict[str, Value] = {}
     for override in overrides:
         if key_of(override) in swept:

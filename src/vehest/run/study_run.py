@@ -91,6 +91,24 @@ def open_runner(
 ) -> Iterator[Runner]:
     """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs
     under a study, if there is one.
+
+    Parameters
+    ----------
+    config : Config
+        For output root, limits and tracking.
+    options : RunOptions
+        Of the command.
+    stages : collection of str
+        Stages that ``force`` is about.
+    study : str
+        Name of the study; empty for a single training or evaluation.
+    messages : Messages or None
+        By default new ones.
+
+    Yields
+    ------
+    Runner
+        Its launcher is closed, and signal handlers are restored, at the end.
     """
     messages = messages or Messages(quiet=options.quiet)
     stop = StopSignals()
@@ -141,6 +159,8 @@ def run_study(
         estimators and the split.
     overrides : Sequence[str]
         For all jobs that have their key; of a sweep, with several values.
+    options : RunOptions
+        Of the command.
     cache : RunCache
         Keeps the finished study.
     messages : Messages
@@ -149,6 +169,11 @@ def run_study(
         Whether the overrides make a sweep.
     only_report : bool
         Train and evaluate nothing.
+
+    Returns
+    -------
+    Ran
+        Summary for the terminal, folder of the report, and the error to end with where jobs failed.
 
     Raises
     ------
@@ -208,7 +233,9 @@ def run_study(
         messages.end(PLAN, name or SWEEP)
         values = {}
         if study.publish and not (options.retrain or TRAIN in runner.force):
-            values = published_values(study, planned, RESULTS / study.study / SEARCHES)
+            values = published_values(
+                study, planned, runner.origin, RESULTS / study.study / SEARCHES
+            )
         if values:
             runner.messages.line(
                 "note",
@@ -232,7 +259,7 @@ def run_study(
         if sweep:
             report, summary = draw_sweep(study, comparisons[""], runner)
         else:
-            trials = trials_of(study, planned, values)
+            trials = trials_of(study, planned, runner.origin, values)
             remarks = remarks_on(study, planned, trials)
             for remark in remarks:
                 runner.messages.warn(remark)
@@ -308,21 +335,23 @@ def _note_missing(comparisons: Mapping[str, Comparison], runner: Runner) -> None
     """
     if runner.weights is None or not runner.weights.path.is_file() or runner.train_first:
         return
-    plans = {
-        job.plan.key: job.plan
+    jobs = {
+        job.plan.key: job
         for comparison in comparisons.values()
         for group in comparison.groups
         for job in group.jobs
         if not job.is_learnt_at_once
     }
     missing = [
-        plan for key, plan in plans.items() if key not in runner.weights and find(plan) is None
+        job
+        for key, job in jobs.items()
+        if runner.weights.published_key(key, runner.origin(job)) is None and find(job.plan) is None
     ]
     if missing:
         runner.messages.line(
             "note",
             TRAIN,
-            f"{len(missing)} of {len(plans)}",
+            f"{len(missing)} of {len(jobs)}",
             "are neither here nor published, and are trained; --no-train-missing leaves them out",
         )
 
@@ -340,6 +369,7 @@ def _until(minutes: float | None, begun: float) -> float | None:
 
 
 def _first(jobs: Sequence[Job]) -> Config:
+    """Configuration of the first job that was not refused."""
     return next(job.config for job in jobs if job.failure is None)
 
 
@@ -464,9 +494,18 @@ def _error_of(
 
 
 def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator.
+    """Train and calibrate one estimator, by overrides of conf/train.yaml.
 
-    Empty where it was stopped before its first epoch was over; raises `VehestError`.
+    Returns
+    -------
+    dict
+        Folder, status and figures of the fit; empty where it was stopped before its first epoch was
+        over.
+
+    Raises
+    ------
+    VehestError
+        The training cannot be done, with its exit code.
     """
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
@@ -491,10 +530,30 @@ def train_estimator(overrides: Sequence[str], options: RunOptions) -> dict[str, 
 def evaluate_model(
     overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Evaluate a model by folder or start of its name, or the one that overrides train, on the
-    tests of a split.
+    """Evaluate a model, or the one that overrides train, on the tests of a split.
 
-    Raises `MissingError`.
+    Parameters
+    ----------
+    overrides : sequence of str
+        Of conf/eval.yaml.
+    model : str or None
+        Folder of a model, or start of its name; None for the one that the overrides train.
+    options : RunOptions
+        Of the command.
+    note : callable
+        Takes a remark on which model was chosen.
+
+    Returns
+    -------
+    dict
+        Folder, and figures of the tests, with and without faults.
+
+    Raises
+    ------
+    MissingError
+        The model is not there or not trained.
+    VehestError
+        It cannot be evaluated on this split.
     """
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
@@ -547,7 +606,7 @@ def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Art
         )
         if job is not None:
             calibration = runner.ensure(*job)
-    elif learnt:  # one of a model that learns nothing may have seen these tests
+    elif learnt:  # a calibration of a model without training may have used these tests
         calibration = calibration_of(model.folder, runner.output)
     if calibration is None:
         runner.messages.line(

@@ -123,6 +123,20 @@ def record_tables(
 def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
     """What a key of a table in ``folder`` is today; without ``data`` where raw files are not here.
 
+    Parameters
+    ----------
+    key : str
+        ``TABLE: WHAT``.
+    folder : Path
+        Of the table, in results/.
+    overrides : sequence of str
+        Of where raw files come from.
+
+    Returns
+    -------
+    dict
+        ``code`` or ``data``, or both.
+
     Raises
     ------
     ConfigurationError
@@ -156,9 +170,19 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str] = (),
 ) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when tables were made and its cause.
+    """What differs from when tables were made, as pairs with its cause, and a note on what was not
+    compared.
 
-    A note on what was not compared.
+    Parameters
+    ----------
+    records : mapping
+        Table -> its record.
+    keys : mapping
+        Key -> what it was.
+    folder : Path
+        Of the tables.
+    overrides : sequence of str
+        Of where raw files come from.
     """
     changes = []
     missing = []

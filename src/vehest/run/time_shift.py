@@ -45,6 +45,16 @@ class Series:
     def sampled(self, rate_hz: float) -> tuple[FloatArray, FloatArray]:
         """Deviations from the mean on a uniform clock, 0 where there is no sample, and 1 where
         there is one.
+
+        Parameters
+        ----------
+        rate_hz : float
+            [Hz].
+
+        Returns
+        -------
+        tuple of FloatArray
+            (N,) each; values between samples are interpolated, across gaps they count as missing.
         """
         grid = self.time[0] + np.arange(int((self.time[-1] - self.time[0]) * rate_hz) + 1) / rate_hz
         finite = np.isfinite(self.values)
@@ -67,6 +77,18 @@ def estimate_shift(estimate: Series, reference: Series) -> Shift:
 
     Every shift with at least half of the shorter series in common is tried. Gain and offset of the
     estimate do not matter. A delay of the estimator itself is part of the shift.
+
+    Parameters
+    ----------
+    estimate : Series
+        v or β of an estimate, on its own clock.
+    reference : Series
+        The same quantity of the recording's reference.
+
+    Returns
+    -------
+    Shift
+        Between samples by a parabola.
 
     Raises
     ------

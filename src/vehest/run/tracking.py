@@ -68,7 +68,11 @@ class Tracker:
         return STORE if self.config.get("name") == "mlflow" and not self.config.get("uri") else ""
 
     def log(self, *artefacts: Artefact | None) -> None:
-        """Log artefacts as runs while no other process logs, each unless it is logged."""
+        """Log models, calibrations and evaluations as runs while no other process logs, each unless
+        it is logged; None is skipped.
+
+        A failure is printed as a warning once and ends tracking for this run; no error is raised.
+        """
         if self.config.get("name") != "mlflow" or not self.complete:
             return
         self.complete = False
@@ -86,6 +90,9 @@ class Tracker:
             )
 
     def _log(self, artefact: Artefact) -> None:
+        """Log one artefact: parameters, figures, history and files but recordings; a run that a
+        killed process began is continued.
+        """
         from mlflow.entities import Metric, Param
 
         client = self._client
@@ -141,12 +148,14 @@ class Tracker:
         return get_artifact_repository(address, tracking_uri=self._address)
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
+        """Runs of the experiment with these tags."""
         condition = " and ".join(
             f"tags.`{name}` = '{value}'" for name, value in tags.items()
         )  # hashes and names of files: without quotes
         return list(self._client.search_runs([self._experiment_id], condition))
 
     def _new_run(self, name: str, tags: Mapping[str, str]) -> Any:
+        """A new run with a name, the command and tags."""
         source = " ".join(["vehest", *sys.argv[1:]])[:VALUE_LENGTH]
         about = {"mlflow.runName": name, "mlflow.source.name": source, OUTPUT_TAG: self._root}
         return self._client.create_run(self._experiment_id, tags={**about, **tags})
@@ -162,6 +171,9 @@ class Tracker:
 
     @cached_property
     def _client(self) -> Any:
+        """MLflow's client, connected once; the local store is made in one step where it is
+        missing.
+        """
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
         from mlflow import MlflowClient
@@ -189,6 +201,7 @@ class Tracker:
 
     @cached_property
     def _experiment_id(self) -> str:
+        """The experiment of the configuration, made where it is missing."""
         name = str(self.config.get("experiment", "vehest"))
         location = (self.output / "mlartifacts").resolve().as_uri() if self.store else None
         experiment = self._client.get_experiment_by_name(name)
@@ -200,10 +213,12 @@ class Tracker:
 
     @property
     def _root(self) -> str:
+        """The output root as an absolute path, which tells runs of several roots apart."""
         return str(self.output.resolve())
 
     @property
     def _address(self) -> str:
+        """Address of the store: that of the configuration, else the local one."""
         return str(self.config.get("uri") or f"sqlite:///{(self.output / STORE).absolute()}")
 
 

@@ -54,7 +54,11 @@ class TrainJob:
 
     @property
     def group(self) -> tuple[Any, ...]:
-        """Jobs of one group may be trained together."""
+        """Jobs of one group may be trained together.
+
+        Estimators, training options, seeds unless these are fitted together, ranges and inputs
+        decide.
+        """
         estimator = new_estimator(self.estimator)
         key = (estimator.batch_key, None if estimator.fits_seeds_together else self.seed)
         training = json.dumps(
@@ -82,6 +86,20 @@ def estimator_rate(config: Mapping[str, Any]) -> float:
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
     """A training and its artefact.
+
+    Parameters
+    ----------
+    config : mapping
+        As composed for ``train``.
+    split : Split
+        Ranges of training and validation; without effect where nothing is learnt.
+    data : mapping
+        Data set -> recordings at the estimator's rate.
+
+    Returns
+    -------
+    TrainJob
+        Its key holds changed options, seed, ranges, digests of recordings and versions.
 
     Raises
     ------
@@ -134,7 +152,20 @@ def training_options(config: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a training that enter its key: those that differ from their defaults, and the
     seed.
 
-    Raises `ConfigurationError`.
+    Parameters
+    ----------
+    config : mapping
+        As composed for ``train``.
+
+    Returns
+    -------
+    dict
+        ``estimator``, ``training`` and ``seed``; options of `UNKEYED` are left out.
+
+    Raises
+    ------
+    ConfigurationError
+        The estimator is unknown, or one of its settings or of the training is wrong.
     """
     estimator = new_estimator(config["estimator"])
     training: Any = settings_from_config(estimator.training_type, config["training"], "training")
@@ -157,7 +188,12 @@ def _plain(span: Span) -> dict[str, str]:
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone.
+    """Train the jobs of one group (`TrainJob.group`) together, each as if it were alone.
+
+    Returns
+    -------
+    list of tuple
+        Fitted estimator and record of its fit, one a job in their order.
 
     Raises
     ------
@@ -181,8 +217,8 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
-    """Write a fitted estimator, its history, its figures and, in a file of their own, its times
-    into ``folder``.
+    """Write a fitted estimator, the history and figures of its fit and, in a file of their own, its
+    times into ``folder``.
     """
     about = {
         "seed": job.seed,
@@ -222,6 +258,7 @@ def _divergence(record: FitRecord) -> dict[str, Any]:
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
+    """Method and transforms by which the recordings of a job were resampled."""
     config = next(iter(data.values())).config  # the same for all data sets of a job
     return {
         "method": config["method"],
@@ -230,12 +267,19 @@ def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
 
 
 def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file with a header, lines ending in LF."""
     with open(path, "w", newline="", encoding="utf-8") as stream:
         csv.writer(stream, lineterminator="\n").writerows([header, *rows])
 
 
 def read_fit_metrics(folder: Path) -> dict[str, float]:
-    """Figures of a fit, such as ``epochs``, and its times."""
+    """Figures of a fit, such as ``epochs``, and its times.
+
+    Raises
+    ------
+    DataError
+        A file is damaged.
+    """
     paths = (folder / FIT_METRICS, folder / TIMINGS)
     return {
         row["metric"]: number_in(row, "value", path)
@@ -282,6 +326,13 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
 def model_artefact(folder: Path) -> Artefact:
     """A model as an artefact of the stage ``train``, also where it has no manifest, such as
     `pretrained_folder` or a saved model.
+
+    Raises
+    ------
+    ConfigurationError
+        The folder holds an artefact of another stage.
+    DataError
+        The model's description or manifest is damaged.
     """
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)

@@ -62,6 +62,9 @@ def difference_suffix(differences: Differences) -> str:
 
 
 def _differences_of_variant(trainings: Mapping[str, TrainJob]) -> dict[str, Differences]:
+    """Differing options of trainings of one variant; raises `ConfigurationError` where two of one
+    seed have the same.
+    """
     options = {key: _options_of(training) for key, training in trainings.items()}
     names = dict.fromkeys(name for values in options.values() for name in values)
     differing = [
@@ -89,6 +92,9 @@ def _options_of(training: TrainJob) -> dict[str, str]:
 
 
 def _flattened(name: str, value: Any) -> Iterable[tuple[str, str]]:
+    """Dotted names of nested options with their values as text; a model to start from by its
+    name.
+    """
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _flattened(f"{name}.{key}", part)

@@ -120,6 +120,13 @@ def all_usabilities(
 
     There is at least one recording. A file or a package that cannot be used is a row with the
     reason.
+
+    Parameters
+    ----------
+    recordings : sequence of RecordingSummary
+        At least one.
+    dataset : mapping or None
+        Configuration of a data set, for values of its car.
     """
     cars = [car_of(dataset)] if dataset else []
     with_files = choices("estimator")
@@ -143,7 +150,24 @@ def usability(
     recordings: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary] | None = None,
 ) -> Usability:
-    """Whether the estimator of a configuration can be trained on recordings and used on them."""
+    """Whether the estimator of a configuration can be trained on recordings and used on them.
+
+    Parameters
+    ----------
+    name : str
+        Of the row.
+    config : Config
+        As composed for ``train``.
+    recordings : sequence of RecordingSummary
+        To train on.
+    to_estimate : sequence of RecordingSummary or None
+        To estimate; by default the same.
+
+    Returns
+    -------
+    Usability
+        An estimator of another package that fails has its error as ``to_give``.
+    """
     family = str(config["estimator"]["name"])
     to_estimate = recordings if to_estimate is None else to_estimate
     try:
@@ -297,6 +321,15 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
     """Channels that recordings of a split lack and its estimator needs, as one line.
 
     Empty if none; raises `ConfigurationError`.
+
+    Parameters
+    ----------
+    config : Config
+        Of a job.
+    split : Split
+        Its training ranges need what the fit reads; validation and tests what is scored.
+    contents : mapping
+        Data set -> its recordings.
     """
     estimator, training = _built(config)
     tested = split.test_spans if "evaluation" in config else ()
@@ -342,7 +375,7 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
 
 
 def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
-    """Those of the channels that some recording lacks."""
+    """Those of the needed channels that at least one recording lacks."""
     missing = [name for summary in recordings for name in channels if name not in summary.channels]
     return _with_supplies(missing, missing, recordings)
 
@@ -364,6 +397,7 @@ def _recordings(
 
 
 def _built(config: Config) -> tuple[Estimator, Any]:
+    """Estimator and settings of its training; raises `ConfigurationError`."""
     estimator = new_estimator(config["estimator"])
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 
@@ -374,6 +408,7 @@ def _missing(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> Missing:
+    """Channels that an estimator reads and its fit reads, and recordings lack."""
     read = [
         name
         for summary in to_estimate
@@ -391,7 +426,7 @@ def _missing(
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
     """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks.
 
-    None where nothing is learnt.
+    None where nothing is trained.
     """
     required = (
         (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
@@ -402,6 +437,9 @@ def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[s
 def _with_supplies(
     read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> Missing:
+    """Missing channels, each once, with transforms that make them of the channels that all
+    recordings have.
+    """
     common = common_channels(recordings)
     gappy = frozenset(name for summary in recordings for name in summary.gappy)
     rate = min((summary.rate_hz for summary in recordings), default=0.0)

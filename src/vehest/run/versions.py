@@ -22,12 +22,25 @@ TYRE_CHECK = "1"  # of a calibration of estimators whose tyre model bands check,
 
 
 def _checks_tyres(name: str) -> bool:
+    """Whether an estimator's bands depend on its tyre model, so that a calibration has a further
+    version.
+    """
     return estimator_class(name).training_friction is not Estimator.training_friction
 
 
 def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
     """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or
     study by name, and of ``faults``.
+
+    Parameters
+    ----------
+    stage : str
+        One of `VERSIONS`.
+    name : str
+        Of the source (``ingest``), study (``report``) or estimator (other stages); empty for a
+        stage without.
+    faults : bool
+        Whether an evaluation has faults.
 
     Raises
     ------

@@ -6,6 +6,11 @@ folder of a training with the same key
 
 Each model has its digest in the file, so that the file is consistent by itself: it grows training
 by training, and is replaced in one step.
+
+The key of a training contains the digests of its recordings. Simulated recordings differ in their
+last bits between processors, and so does this key. A model is therefore found by its *origin* as
+well: the key with how the recordings are made (configuration, versions of code, digests of raw
+files) in place of their digests.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -37,7 +42,7 @@ COMPRESSED = "zlib,"
 earlier versions have plain text.
 """
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
-FORMAT = 3  # in the key of a report that has weights: 3 has compressed files
+FORMAT = 4  # in the key of a report that has weights: 3 has compressed files, 4 origins
 MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
 MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
 
@@ -53,11 +58,17 @@ class PublishedModel:
     label: str
     code: str  # version of the training
     digest: str  # of the training's artefact
+    origin: str = ""  # the training's key with the origins of its recordings; empty: not known
     files: dict[str, str] = field(default_factory=dict)  # of `FILES` -> content, `compressed`
 
 
 class PublishedWeights:
     """Models of a study by the keys of their trainings; none where there is no such file.
+
+    Parameters
+    ----------
+    path : Path
+        weights.safetensors of a published study.
 
     Raises
     ------
@@ -71,17 +82,33 @@ class PublishedWeights:
         """Key of a training -> its published model, as last read or written."""
         self._read()
 
-    def __contains__(self, key: str) -> bool:
-        return key in self.models
+    def published_key(self, key: str, origin: str) -> str | None:
+        """The key under which the model of a training is published, its own or that of a training
+        of the same origin; None where it is not.
+        """
+        if key in self.models:
+            return key
+        return next(
+            (other for other, model in self.models.items() if model.origin == origin != ""), None
+        )
 
-    def add(self, models: Iterable[Artefact]) -> int:
+    def add(self, models: Iterable[Artefact], origins: Mapping[str, str] | None = None) -> int:
         """Add models of finished trainings, in one step: whoever reads or is killed finds the file
         of before or after.
+
+        Parameters
+        ----------
+        models : iterable of Artefact
+            Finished trainings. Each replaces the model that is published under its key, or under
+            another key of the same origin.
+        origins : mapping, optional
+            Key of a training -> its origin; they are recorded for models that are published
+            already, too.
 
         Returns
         -------
         int
-            Number of models that were not in the file, or not with this content.
+            Number of models that were not in the file, or not with this content and origin.
 
         Raises
         ------
@@ -93,22 +120,32 @@ class PublishedWeights:
             The disk is full or the folder cannot be written to.
         """
         self._read()  # another run may have added to it
-        added = {
-            model.key: model
-            for model in models
-            if model.key not in self.models or self.models[model.key].digest != model.digest
-        }
+        origins = origins or {}
+        added: dict[str, Artefact] = {}
+        replaced: set[str] = set()
+        for model in models:
+            origin = origins.get(model.key, "")
+            former = self.published_key(model.key, origin)
+            if former is not None:
+                record = self.models[former]
+                if record.digest == model.digest and origin in ("", record.origin):
+                    continue
+                replaced.add(former)
+            added[model.key] = model
         if not added:
             return 0
         tensors = {
             name: values
             for name, values in (load_file(self.path) if self.models else {}).items()
-            if name.partition("/")[0] not in added
+            if name.partition("/")[0] not in replaced
         }
         for key, model in added.items():
             of_model = load_file(model.folder / WEIGHTS)
             tensors |= {f"{key}/{name}": values for name, values in of_model.items()}
-        records = self.models | {key: _record_of(model) for key, model in added.items()}
+        kept = {key: record for key, record in self.models.items() if key not in replaced}
+        records = kept | {
+            key: _record_of(model, origins.get(key, "")) for key, model in added.items()
+        }
         about = {key: asdict(record) for key, record in sorted(records.items())}
         content = save(tensors, metadata={MODELS: json.dumps(about)})
         megabytes = len(content) / 1e6
@@ -125,6 +162,13 @@ class PublishedWeights:
     def write(self, key: str, folder: Path) -> None:
         """Write a model into the folder of its training, byte for byte as that did, but without
         times.
+
+        Parameters
+        ----------
+        key : str
+            Of the training.
+        folder : Path
+            Of the artefact, while it is made.
 
         Raises
         ------
@@ -199,26 +243,42 @@ def uncompressed(text: str) -> bytes:
     return content
 
 
-def _record_of(model: Artefact) -> PublishedModel:
+def _record_of(model: Artefact, origin: str) -> PublishedModel:
+    """What is published of a model beside its weights."""
     files = {
         name: compressed((model.folder / name).read_bytes())
         for name in FILES
         if name in model.outputs
     }
-    return PublishedModel(model.label, model.code, model.digest, files)
+    return PublishedModel(model.label, model.code, model.digest, origin, files)
 
 
 def publish_weights(
-    weights: PublishedWeights, models: Sequence[Artefact], output: Path, messages: Messages
+    weights: PublishedWeights,
+    models: Sequence[Artefact],
+    origins: Mapping[str, str],
+    output: Path,
+    messages: Messages,
 ) -> bool:
-    """Add models of finished trainings to a study's published weights.
+    """Add models of finished trainings, with their origins by key, to a study's published weights.
 
     Returns whether there was room for them.
+
+    Parameters
+    ----------
+    weights : PublishedWeights
+        Of the study.
+    models : sequence of Artefact
+        Finished trainings.
+    output : Path
+        Output root, where the lock lies.
+    messages : Messages
+        Prints how many were added, or that there is no room.
     """
     study = weights.path.parent.name
     with held(Lock(output, "publish", study), lambda: False):
         try:
-            n_added = weights.add(models)
+            n_added = weights.add(models, origins)
         except WeightsTooLargeError as error:
             messages.warn(
                 f"no more weights are published: {error}; '{weights.path}' stays as it is, "

@@ -1,5 +1,10 @@
 """One simulated drive: a driver takes a vehicle through a manoeuvre, sensors make a recording of
 it.
+
+Flow: manoeuvre and seed -> controller; at every tick of DRIVER_RATE_HZ observation -> command
+-> inputs of the plant (`_Ride.decide`); the plant integrates these up to the next tick or sample;
+states that were sampled -> Motion (true motion) -> `measure` -> Recording. Time 0 is the first
+sample, SETTLING_TIME after the start of the car.
 """
 
 from __future__ import annotations
@@ -88,6 +93,33 @@ def simulate_drive(
     plant steps must fit between samples at ``rate_hz``; the loss of grip over the drive, ``stint``,
     is unknown to the driver.
 
+    Parameters
+    ----------
+    id : str
+        Of the recording.
+    vehicle : Vehicle
+        Car of the multi-body plant.
+    manoeuvre : Manoeuvre
+        What is driven; it decides when the recording ends.
+    seed : int
+        Zero or positive; it is the entropy of all random streams.
+    rate_hz : float
+        Sampling rate of the recording [Hz].
+    sensors : SensorLevels
+        Sizes of the sensors' errors.
+    stability_control : bool
+        Whether yaw moments by braking one side act on the car.
+    surface : Surface
+        Friction along the way.
+    stint : Stint or None
+        Loss of grip over the time of the drive; None: none.
+
+    Returns
+    -------
+    Recording
+        Of kind ``simulated``, starting at 0 s, with the channels that `measure` returns, reference
+        channels included; the provenance is plain JSON data.
+
     Raises
     ------
     ConfigurationError
@@ -126,7 +158,13 @@ def simulate_drive(
 
 @contextmanager
 def naming(id: str, seed: int) -> Iterator[None]:
-    """Names drive and seed in the errors of a simulation."""
+    """Names drive and seed in the errors of a simulation.
+
+    Raises
+    ------
+    SimulationError
+        The one raised inside, with both before its text; other errors pass unchanged.
+    """
     try:
         yield
     except SimulationError as error:
@@ -250,6 +288,10 @@ def drive(
 
 
 class _Ride:
+    """State of one drive in the loop of `drive`: the car, its driver, and the samples taken so
+    far.
+    """
+
     def __init__(
         self,
         plant: MultiBodyPlant,
@@ -278,7 +320,22 @@ class _Ride:
         self._interventions = 0
 
     def decide(self, time: float) -> bool:
-        """The driver's next command [s]; false if the drive is over."""
+        """Let the driver decide, and set the inputs of the plant up to the next decision.
+
+        A driver who has given up (a spin, or beside the road) straightens the wheels and brakes
+        with STOPPING_SHARE of the grip. Gravity of bank and grade and the drag of the air, which
+        the plant's equations leave out, enter as external accelerations.
+
+        Parameters
+        ----------
+        time : float
+            Since the first sample [s]; negative while the car settles.
+
+        Returns
+        -------
+        bool
+            False if the drive is over; the inputs are then those of the last decision.
+        """
         observation = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
         decision = self._controller.command(time, observation)
         if self._stint is not None:
@@ -319,6 +376,9 @@ class _Ride:
         return True
 
     def _judge(self, time: float, decision: Command) -> None:
+        """Note when the car left its road or spun, which makes the driver give up, and since when
+        it stands.
+        """
         if self.gave_up_at is None and abs(decision.lateral_error) > self._half_width:
             self.left_road = True
         if self.gave_up_at is None and (self.left_road or self.state.spun):
@@ -329,6 +389,9 @@ class _Ride:
             self._stands_since = time
 
     def _is_over(self, time: float, decision: Command) -> bool:
+        """Whether the drive is over: AFTER_STAND after the stand, MAX_STOP_SECONDS after the driver
+        gave up, at the manoeuvre's own end, or after its longest time; sets ``completed``.
+        """
         if self._stands_since is not None and time >= self._stands_since + AFTER_STAND - 1e-9:
             self.completed = self.gave_up_at is None
             return True
@@ -338,7 +401,12 @@ class _Ride:
         return self.completed or (self._stands_since is None and time >= self._longest - 1e-9)
 
     def _slope(self, yaw: float) -> tuple[float, float]:
-        """Gravity along and across the car [m/s²]; keeps bank and grade as the car has them."""
+        """Gravity along and across the car [m/s²]; keeps bank and grade as the car has them.
+
+        The road's bank and grade are meant along its heading; a car at an angle to it has part of
+        each in the other direction. The angles that are kept, and recorded, are those along the
+        car's axes.
+        """
         decision = self.decision
         if decision.bank == 0.0 and decision.grade == 0.0:
             self.bank = self.grade = 0.0
@@ -353,7 +421,11 @@ class _Ride:
         return along, across
 
     def keep_sample(self) -> None:
-        """Keep the present state as a sample."""
+        """Keep the present state as a sample.
+
+        Keeps state, inputs, whether stability control acts, and the road at the car: friction,
+        bank, grade and lateral error.
+        """
         self._states.append(self.state)
         self._inputs.append(self.inputs)
         self._interventions += self.stability.active
@@ -362,7 +434,22 @@ class _Ride:
         )
 
     def trip(self, plant: MultiBodyPlant, rate_hz: float, drawn: dict[str, Any]) -> Trip:
-        """The samples that were kept."""
+        """The samples that were kept.
+
+        Parameters
+        ----------
+        plant : MultiBodyPlant
+            The plant that drove, for accelerations and tyre forces at the samples.
+        rate_hz : float
+            Rate at which samples were kept [Hz].
+        drawn : dict
+            Values that the seed drew.
+
+        Returns
+        -------
+        Trip
+            True motion, with flags. Sideslip counts above 1 m/s only, where it has a meaning.
+        """
         friction, bank, grade, lateral_error = np.array(self._road).T
         motion = plant.motion(
             self._states, np.array(self._inputs), rate_hz, friction=friction, bank=bank, grade=grade
@@ -396,6 +483,11 @@ def steps_per_tick(rate_hz: float, step: float, rate_name: str) -> int:
         Of the plant [s].
     rate_name : str
         Name of the rate in the error.
+
+    Returns
+    -------
+    int
+        At least 1.
 
     Raises
     ------

@@ -48,7 +48,13 @@ class Variation:
             )
 
     def drawn(self, generator: np.random.Generator) -> float:
-        """A scale."""
+        """A scale.
+
+        Parameters
+        ----------
+        generator : np.random.Generator
+            Of the drive; one draw is taken.
+        """
         low, high = self.factor
         if self.log:
             return float(np.exp(generator.uniform(np.log(low), np.log(high))))
@@ -58,6 +64,11 @@ class Variation:
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
     """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9,
     1.2]}``, ``log: true`` if wanted.
+
+    Returns
+    -------
+    tuple of Variation
+        In the order of the list, which is the order of the draws.
 
     Raises
     ------
@@ -69,6 +80,21 @@ def variations_from_config(entries: Any) -> tuple[Variation, ...]:
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
     """The vehicle with parameters scaled as the seed draws them; the same one if nothing varies.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        The car of the configuration.
+    variations : sequence of Variation
+        Each has one scale for all of its parameters; scales of a parameter that several variations
+        name multiply.
+    seed : int
+        Of the drive; the stream is the fleet's own.
+
+    Returns
+    -------
+    Vehicle
+        The scaled values as overrides, on top of those that the vehicle has.
 
     Raises
     ------
@@ -154,6 +180,19 @@ class SensorVariation:
     def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
         """Levels as the seed scales them; the same ones if nothing varies. References stay as they
         are.
+
+        Parameters
+        ----------
+        levels : SensorLevels
+            Levels of the data set.
+        seed : int
+            Of the drive. Scales are drawn sensor by sensor in the order of the fields of
+            SensorLevels.
+
+        Returns
+        -------
+        SensorLevels
+            With one scale for each sensor and kind of error; ``roll_share`` is drawn once.
         """
         if not self.factors and self.roll_share is None:
             return levels
@@ -178,6 +217,9 @@ class SensorVariation:
 
 
 def _range(value: Any, lowest: float = 0.0) -> tuple[float, float]:
+    """A pair of numbers [lowest, highest] with the lowest at or above ``lowest``; raises
+    `ConfigurationError` otherwise.
+    """
     numbers = (
         isinstance(value, Sequence)
         and not isinstance(value, str)

@@ -56,6 +56,11 @@ def simulate_planar_drive(
     ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels
     slip. Spins are driven on from.
 
+    Returns
+    -------
+    Recording
+        The channels are CHANNELS; the flag ``spun`` means a sideslip beyond 90°.
+
     Raises
     ------
     ConfigurationError
@@ -92,6 +97,24 @@ def drive_freely(
 ) -> Trip:
     """Drive a car for the time of a recording and keep its true motion; it starts from standstill,
     SETTLING_TIME before.
+
+    Parameters
+    ----------
+    plant : PlanarPlant
+        The car and its step.
+    manoeuvre : Freestyle
+        Habits of the driver and duration of the recording.
+    seed : int
+        Of the driver and of the surface's patches.
+    rate_hz : float
+        Sampling rate [Hz].
+    surface : Surface
+        Friction of the open area.
+
+    Returns
+    -------
+    Trip
+        Lateral errors are NaN: there is no line.
 
     Raises
     ------

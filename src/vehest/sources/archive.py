@@ -1,4 +1,8 @@
-"""Unpacks a zip archive of unknown origin into a temporary folder, within limits."""
+"""Unpacks a zip archive of unknown origin into a temporary folder, within limits.
+
+archive -> every entry's path, kind, method and stated size checked -> entries copied out ->
+folder, removed when the caller is done
+"""
 
 from __future__ import annotations
 
@@ -48,6 +52,7 @@ class _Archive(io.FileIO):
     """
 
     def read(self, size: int | None = -1, /) -> Any:
+        """Bytes as of a file; `DataError` for more at once than ``limits.text_bytes``."""
         n_bytes = (
             os.fstat(self.fileno()).st_size - self.tell() if size is None or size < 0 else size
         )
@@ -60,18 +65,41 @@ class _Archive(io.FileIO):
 
 
 def unpacked_limit(packed: int, most_bytes: int = MOST_BYTES) -> int:
-    """What ``packed`` bytes may unpack to on disk [bytes]."""
+    """What ``packed`` bytes may unpack to on disk [bytes].
+
+    It is `MOST_EXPANSION` times the packed size, at least `ALLOWED_BYTES` and at most
+    ``most_bytes``.
+    """
     return min(most_bytes, max(ALLOWED_BYTES, MOST_EXPANSION * packed))
 
 
 @contextmanager
 def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
-    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards; raises
-    `DataError` or `MissingError`.
+    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards.
 
     All entries are checked before anything is written: no path outside the folder, no links or
     special files, no more bytes or files than the limits. zipfile unpacks no entry beyond its
     stated size, and checks its checksum. Archives inside stay packed.
+
+    Parameters
+    ----------
+    file : Path
+        The archive; entries may be stored, or packed by deflate or bzip2.
+    most_bytes : int
+        Upper bound of the limit of `unpacked_limit` [bytes].
+
+    Yields
+    ------
+    Path
+        The folder, in which entries have the paths that the archive gives them.
+
+    Raises
+    ------
+    DataError
+        It is no sound archive, is packed by another method, holds more than the limits or an entry
+        that is no file inside the folder, or cannot be unpacked.
+    MissingError
+        There is no such file, or no room to unpack it.
     """
     with temporary_folder(file) as folder:
         try:
@@ -117,9 +145,17 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(file: Path) -> Iterator[Path]:
-    """Yield a folder to unpack a file into, which is removed afterwards.
+    """Yield a folder to unpack a file into, which is removed afterwards with all that it holds.
 
-    Raises `MissingError` where there is no room for one.
+    Parameters
+    ----------
+    file : Path
+        What shall be unpacked, for messages.
+
+    Raises
+    ------
+    MissingError
+        There is no room for a folder, or no permission to make one; the message names ``TMPDIR``.
     """
     try:
         temporary = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
@@ -133,6 +169,11 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
+    """Path of an entry inside the folder; `DataError` for one that leaves it, a link or special
+    file.
+
+    Backslashes count as slashes; an entry without Unix permissions counts as a plain file.
+    """
     name = entry.filename
     kind = stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))

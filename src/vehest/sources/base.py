@@ -1,4 +1,8 @@
-"""The interface of every source, and how a source is found by its name."""
+"""The interface of every source, and how a source is found by its name.
+
+data set (a mapping from conf/dataset) -> `open_source` -> `Source.read_raw`, of the files as they
+are -> transforms, reference moved to the centre of gravity -> `Recording`
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from vehest.data.car import CarValues
 from vehest.data.derived import ScaleToWheelbase
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable, suggestion
 from vehest.data.files import regular_file
-from vehest.data.recording import Kind, Recording
+from vehest.data.recording import DERIVED, Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import first_line
@@ -28,12 +32,15 @@ ENTRY_POINTS = "vehest.sources"
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 # key of a recording's provenance: transforms of its data set, and where its channels were measured
-DERIVED = "derived"
 SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
-    """The kind of a data set's recordings."""
+    """The kind of a data set's recordings.
+
+    They are simulated where its source is ``simulated`` or it declares that kind, and real
+    otherwise.
+    """
     return "simulated" if SIMULATED in (dataset.get("source"), dataset.get("kind")) else "real"
 
 
@@ -76,8 +83,14 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 
 def origin_in_words(recording: Recording) -> list[str]:
-    """Where a recording's channels were measured and which were derived, by its data set, a line
-    each.
+    """Where a recording's channels were measured and which were derived, by its data set.
+
+    Returns
+    -------
+    list of str
+        A line each of: where the reference was measured, and whether it was moved; where the
+        inertial unit is; the transforms; the channels that were held. Empty where the data set
+        declares none of them.
     """
     declared = recording.provenance.get(DERIVED) or {}
     lines = []
@@ -97,6 +110,7 @@ def origin_in_words(recording: Recording) -> list[str]:
 
 
 def _point_in_words(point: Any) -> str:
+    """A declared point, ``{x: …, y: …}`` [m] or ``unknown``, as seen from the centre of gravity."""
     if point == "unknown":
         return "at a point that is not known"
     x = float(point.get("x", 0.0))
@@ -135,12 +149,27 @@ def car_of(dataset: Mapping[str, Any]) -> CarValues:
 class Source(ABC):
     """Reads one data set.
 
-    Attributes:
-        options_type: dataclass of its own options, with their types and defaults.
-        options: the options of this data set.
-        version: raised when the recordings that it makes change.
+    Parameters
+    ----------
+    dataset : mapping
+        Its configuration: the keys of `CommonOptions` and those of ``options_type``.
 
-    Raises `ConfigurationError`: an unknown or missing option, or a value of the wrong type.
+    Attributes
+    ----------
+    options_type : type
+        Dataclass of the source's own options, with their types and defaults.
+    options : object
+        The options of this data set, an instance of ``options_type``.
+    version : str
+        Raised when the recordings that it makes change.
+    transforms : list
+        Transforms that the data set declares, in the order in which they are applied.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown or missing option, a value of the wrong type, a reference point together with a
+        transform that scales the car, or a simulated source that is declared real.
     """
 
     options_type: ClassVar[type]
@@ -183,6 +212,9 @@ class Source(ABC):
         self.options = self._validated(self.options_type)
 
     def _validated(self, kind: type[Options]) -> Options:
+        """The data set's values of the fields of ``kind``; keys that it lacks take their
+        defaults.
+        """
         names = {field.name for field in fields(cast(Any, kind))}
         options = {key: value for key, value in self.dataset.items() if key in names}
         return validated(kind, options, self.location, error=ConfigurationError, group="dataset")
@@ -203,9 +235,18 @@ class Source(ABC):
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
-        """Inputs of the recordings: name -> file, or a version where there is no file.
+        """Inputs of the recordings.
 
-        Raises `MissingError`: a file or folder is not there.
+        Returns
+        -------
+        dict
+            Name -> file, or a version where there is no file; a cached recording is made again when
+            one of them changes.
+
+        Raises
+        ------
+        MissingError
+            A file or folder is not there.
         """
 
     @abstractmethod
@@ -216,23 +257,39 @@ class Source(ABC):
         """One recording, with the channels that the data set derives and its reference at the
         centre of gravity.
 
-        Raises `MissingError`: there is none of that name, or a file is missing. Raises `DataError`:
-        its files cannot be used.
+        Parameters
+        ----------
+        recording_id : str
+            One of `ids`.
+
+        Raises
+        ------
+        MissingError
+            There is none of that name, or a file is missing.
+        DataError
+            Its files cannot be used, or its times are no clock.
         """
         return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
         """A recording of a file, or of a bag's folder, wherever it is, as `read` makes it.
 
-        Raises `ConfigurationError`: this source reads no single files. Raises `MissingError`: the
-        file is not there. Raises `DataError`: it cannot be used.
+        Raises
+        ------
+        ConfigurationError
+            This source reads no single files.
+        MissingError
+            The file is not there.
+        DataError
+            It cannot be used.
         """
         return self._prepared(self.read_raw_file(file))
 
     def file_parts(self, file: Path) -> Iterator[Recording]:
         """`read_file` in parts that follow one another, so that hours need little memory.
 
-        All at once where the source knows no better.
+        All at once where the source knows no better; then there is one part. Raises as `read_file`
+        does, when a part is asked for.
         """
         yield self.read_file(file)
 
@@ -294,9 +351,14 @@ class Source(ABC):
 
 
 def open_source(dataset: Mapping[str, Any]) -> Source:
-    """The source that a data set's configuration names.
+    """The source that a data set's configuration names, made with its options.
 
-    Raises `ConfigurationError` for an unknown source or option.
+    No file is opened: that happens when a recording is read.
+
+    Raises
+    ------
+    ConfigurationError
+        The source, or one of its options, is unknown or wrong.
     """
     return source_class(dataset)(dataset)
 
@@ -304,9 +366,22 @@ def open_source(dataset: Mapping[str, Any]) -> Source:
 def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     """A recording of a file wherever it is, read as a data set describes.
 
-    Raises `ConfigurationError`: the file is of another format than the data set's, or its source
-    reads no single files. Raises `MissingError`: it is not there. Raises `DataError`: it cannot be
-    used as it is.
+    Parameters
+    ----------
+    dataset : mapping
+        Configuration of the data set whose options hold for the file; its own files are not looked
+        at.
+    file : Path
+        The file, or a bag's folder.
+
+    Raises
+    ------
+    ConfigurationError
+        The file is of another format than the data set's, or its source reads no single files.
+    MissingError
+        It is not there.
+    DataError
+        It cannot be used as it is.
     """
     return source_of_file(dataset, file).read_file(file)
 
@@ -314,7 +389,13 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
 def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
     """The source of a data set that a file wherever it is shall be read by.
 
-    Raises as `read_single` does.
+    Raises
+    ------
+    ConfigurationError
+        The data set reads tables and the file is, by its ending, a log of another format, or the
+        data set is wrong.
+    DataError
+        The file is a spreadsheet.
     """
     require_no_spreadsheet(file)
     if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
@@ -326,7 +407,7 @@ def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
 
 
 def require_no_spreadsheet(file: Path) -> None:
-    """Raises `DataError` for a spreadsheet's file, which no source reads."""
+    """Raises `DataError` for a spreadsheet's file, by its ending, which no source reads."""
     if file.suffix.lower() in SPREADSHEETS:
         raise DataError(f"'{file}' is a spreadsheet; save it as CSV")
 
@@ -371,17 +452,32 @@ def source_names() -> list[str]:
 
 
 def _modules() -> list[str]:
+    """Names of the modules and packages in ``vehest.sources``, whether they are sources or not."""
     return [module.name for module in pkgutil.iter_modules(package.__path__)]
 
 
 def _class_of(module: str) -> type[Source] | None:
+    """``SOURCE`` of a module of ``vehest.sources``, which is imported for it; None of one
+    without.
+    """
     return getattr(importlib.import_module(f"{package.__name__}.{module}"), "SOURCE", None)
 
 
 def existing_folder(path: Any, dataset: str) -> Path:
-    """A folder of raw data.
+    """A folder of raw data, ``~`` expanded.
 
-    Raises `MissingError` where no root was given, or the folder is not there.
+    Parameters
+    ----------
+    path : object
+        The option ``path`` of a data set; empty, or beginning with ``None`` or ``null`` where its
+        root is not set.
+    dataset : str
+        Name of the data set, for messages.
+
+    Raises
+    ------
+    MissingError
+        No root was given, or the folder is not there.
     """
     folder = Path(str(path)).expanduser()
     has_root = bool(path) and folder.parts[:1] not in {("None",), ("null",)}
@@ -392,8 +488,21 @@ def existing_folder(path: Any, dataset: str) -> Path:
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:
-    """Refuse files that are missing or empty (`MissingError`), and pipes, devices and folders
-    (`DataError`).
+    """Refuse files that cannot be read as recordings.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Looked at in order; the first that is refused is named.
+    dataset : str
+        Name of the data set, for messages.
+
+    Raises
+    ------
+    MissingError
+        One is missing or empty.
+    DataError
+        One is a pipe, a device or a folder.
     """
     for file in files:
         try:

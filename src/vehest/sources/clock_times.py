@@ -1,4 +1,7 @@
-"""Times of day in text, with or without a date, and durations."""
+"""Times of day in text, with or without a date, and durations.
+
+text -> parts, by `CLOCK` or `DURATION` -> order of day and month, where there is a date -> seconds
+"""
 
 from __future__ import annotations
 
@@ -28,12 +31,25 @@ MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", 
 
 
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
-    """Times that are written as a clock's, in seconds, (N,); None for other text.
+    """Times that are written as a clock's, in seconds.
 
     ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``105930.25``, ``2024-05-03T10:59:30.25Z``,
     ``20240503T105930``, ``3.5.2024 10:59:30,25``, ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM``
-    and ``0 days 00:00:30.25``, or as a duration, ``PT1M30.25S`` or ``90.25 s``. With a date they
-    count from 1970, without one from midnight, and on beyond the next. The zone is not read.
+    and ``0 days 00:00:30.25``, or as a duration, ``PT1M30.25S`` or ``90.25 s``. The zone is not
+    read. Where the year does not come first, the day does as in Europe, or the month as in the
+    United States where AM or PM is written; the other order holds if this one makes impossible
+    dates or a step of `MAX_STEP` or more.
+
+    Parameters
+    ----------
+    column : pyarrow.ChunkedArray
+        Texts, shape (N,), all of them times of a clock or all durations.
+
+    Returns
+    -------
+    FloatArray or None
+        Times, shape (N,) [s]: with a date since 1970, without one since midnight, and on beyond the
+        next. None where one is missing, or any is other text.
     """
     from pyarrow import compute
 
@@ -90,10 +106,20 @@ def _days(
 
 
 def past_midnight(times: FloatArray) -> FloatArray:
-    """Times since midnight that go on past the next [s], (N,), of times of day.
+    """Times since midnight that go on past the next, of times of day.
 
     Midnight is a step from the last hour of a day to the first of the next. Any other step back,
     such as that after a stray 23:59:59, stays a step back.
+
+    Parameters
+    ----------
+    times : FloatArray
+        Times of day, shape (N,) [s], from 0 to 86 400.
+
+    Returns
+    -------
+    FloatArray
+        The same times with a day added for each midnight before them, shape (N,) [s].
     """
     is_midnight = (times[:-1] > DAY - HOUR) & (times[1:] < HOUR)
     return np.asarray(

@@ -46,20 +46,46 @@ RATE_TOLERANCE = 5e-3
 def require_clock(
     stamps: FloatArray, location: str, fix: str = SORT, *, may_repeat: bool = False
 ) -> None:
-    """Refuse time stamps that have a `clock_fault`, by a `DataError`.
+    """Refuse time stamps that have a `clock_fault`.
 
-    ``location`` names file and signal.
+    Parameters
+    ----------
+    stamps : FloatArray
+        Time stamps, shape (T,) [s].
+    location : str
+        File and signal, for messages.
+    fix : str
+        How to repair the order of the stamps, for messages.
+    may_repeat : bool
+        Whether stamps may repeat, as they do with software delay.
+
+    Raises
+    ------
+    DataError
+        They break the rule for every recording.
     """
     if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
         raise DataError(f"{location}: {fault}")
 
 
 def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
-    """How time stamps (T,) [s] break the rule for every recording, and what to do about it, in
-    words; empty where the rule holds.
+    """How time stamps break the rule for every recording, and what to do about it, in words.
 
-    It is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all. ``fix`` is how
-    to repair their order; they ``may_repeat`` where they have software delay.
+    The rule is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
+
+    Parameters
+    ----------
+    stamps : FloatArray
+        Time stamps, shape (T,) [s].
+    fix : str
+        How to repair their order, for the text.
+    may_repeat : bool
+        Whether they may repeat, as they do with software delay.
+
+    Returns
+    -------
+    str
+        The first fault that is found; empty where the rule holds.
     """
     if fault := _order_fault(stamps, fix, may_repeat):
         return fault
@@ -73,9 +99,17 @@ def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False
 
 
 def span_fault(stamps: FloatArray) -> str:
-    """A stray one among time stamps (T,), more than 1e8 median steps from the others, in words.
+    """A stray one among time stamps, in words.
 
-    Empty where none is.
+    Parameters
+    ----------
+    stamps : FloatArray
+        Increasing time stamps, two at least, shape (T,) [s].
+
+    Returns
+    -------
+    str
+        The longest gap, where the stamps span more than 1e8 median steps; empty where they do not.
     """
     step = typical_step(stamps)
     if not stamps[-1] - stamps[0] > MOST_STEPS * step:
@@ -97,6 +131,9 @@ def typical_step(stamps: FloatArray) -> float:
 
 
 def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
+    """The first stamp that is no time of a drive, goes backwards or repeats, in words; empty if
+    none.
+    """
     if len(stamps) < 2:
         return f"fewer than two time stamps; {fix}"
     odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
@@ -117,7 +154,20 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
 
 
 def unevenness(stamps: FloatArray) -> str:
-    """Gaps, jitter or drift of increasing time stamps [s], in words; empty where they are even."""
+    """Gaps, jitter or drift of increasing time stamps, in words.
+
+    Parameters
+    ----------
+    stamps : FloatArray
+        Increasing time stamps, two at least, shape (T,) [s].
+
+    Returns
+    -------
+    str
+        The first that holds of: an interval above 1.5 medians, one that differs by more than 1 %
+        from the median, a stamp more than half an interval from the straight line between first and
+        last. Empty where the stamps are even.
+    """
     steps = np.diff(stamps)
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
@@ -139,8 +189,23 @@ def unevenness(stamps: FloatArray) -> str:
 
 
 def require_samples(values: FloatArray, times: FloatArray, longest: float, location: str) -> None:
-    """Raise `DataError` for samples, (T,), that are not finite or whose increasing times [s] lie
-    further apart than ``longest`` [s].
+    """Refuse samples that are not finite, or that leave a gap.
+
+    Parameters
+    ----------
+    values : FloatArray
+        Samples in any unit, shape (T,).
+    times : FloatArray
+        Their increasing times, shape (T,) [s].
+    longest : float
+        Longest time between two samples [s].
+    location : str
+        File and signal, for messages.
+
+    Raises
+    ------
+    DataError
+        A sample is not finite, or two lie further apart than ``longest``.
     """
     bad = np.flatnonzero(~np.isfinite(values))
     steps = np.diff(times)
@@ -167,11 +232,24 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, locat
 
 
 def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
-    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most
-    ``longest`` [s] between two samples.
+    """Samples with straight lines across short gaps.
 
-    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches
-    across.
+    Parameters
+    ----------
+    samples : FloatArray
+        Samples in any unit, NaN where there is none, shape (T,).
+    times : FloatArray
+        Times of the rows, shape (T,) [s]. Where they go backwards or leave a gap above ``longest``,
+        a run begins, which no line reaches across.
+    longest : float
+        Longest time between two samples that a line crosses [s].
+
+    Returns
+    -------
+    FloatArray
+        Shape (T,), still NaN in longer gaps. Lines are straight over the number of the row, not
+        over its time. Beside the first and the last sample of a run that one stands, for at most
+        ``longest``.
     """
     measured = np.flatnonzero(np.isfinite(samples))
     if not 0 < len(measured) < len(samples):
@@ -213,7 +291,7 @@ class Clock:
         return self.start_time + np.arange(self.n_samples) / self.rate_hz
 
     def part(self, rows: slice) -> Clock:
-        """The clock of some of its ticks."""
+        """The clock of some of its ticks, evenly stamped: ``rows`` has a start and a stop."""
         start_time = self.start_time + rows.start / self.rate_hz
         return Clock(start_time, self.rate_hz, rows.stop - rows.start)
 
@@ -222,6 +300,18 @@ class Clock:
 
         A gappy channel's samples go to the nearest tick instead: interpolation would lose those
         between two gaps.
+
+        Parameters
+        ----------
+        samples : FloatArray
+            Samples at the file's stamps, shape (T,).
+        gappy : bool
+            Whether NaN in them means "not measured".
+
+        Returns
+        -------
+        FloatArray
+            Shape (n_samples,); the samples themselves where the file's rows are the ticks.
         """
         if self.stamps is None:
             return samples
@@ -238,15 +328,32 @@ class Clock:
 def uniform_clock(
     stamps: FloatArray, location: str, policy: ClockPolicy = "strict", fix: str = BRIDGE
 ) -> Clock:
-    """The uniform clock behind a file's time stamps (T,) [s]; ``location`` is the file, for
-    messages.
+    """The uniform clock behind a file's time stamps.
 
-    By ``policy``, ``strict`` refuses gaps, jitter above 1 % of an interval and drift,
-    ``interpolate`` bridges them, ``uniform`` takes the rows as evenly sampled and their stamps as
-    late, and refuses missing rows. ``fix`` is what to do where ``strict`` finds no even clock.
+    Parameters
+    ----------
+    stamps : FloatArray
+        Time stamps of the rows, shape (T,) [s].
+    location : str
+        The file, for messages.
+    policy : {'strict', 'interpolate', 'uniform'}
+        ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges
+        them, ``uniform`` takes the rows as evenly sampled and their stamps as late, and refuses
+        missing rows.
+    fix : str
+        What to do where ``strict`` finds no even clock, for messages.
 
-    Raises `DataError`: stamps break the rule of `require_clock`, are not as even as ``policy``
-    wants them, or an even clock over them would hold more samples than the limits allow.
+    Returns
+    -------
+    Clock
+        Its rate is the plain number that was meant, see `plain_rate`. Only with ``interpolate``
+        does it keep the stamps and may have another number of samples than the file has rows.
+
+    Raises
+    ------
+    DataError
+        Stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an
+        even clock over them would hold more samples than the limits allow.
     """
     require_clock(stamps, location, may_repeat=policy == "uniform")
     start = float(stamps[0])
@@ -280,8 +387,20 @@ def uniform_clock(
 
 
 def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
-    """The `uniform_clock` of stamps (T,) that come in blocks, where these are surely strict and
-    even; else None.
+    """The `uniform_clock` of stamps that come in blocks, where these are surely strict and even.
+
+    Only a line of each block is kept, so that the judgement is by an upper bound of the distance
+    from an even clock.
+
+    Parameters
+    ----------
+    blocks : iterable of FloatArray
+        Time stamps in their order, shape (T,) each, none of them empty [s].
+
+    Returns
+    -------
+    Clock or None
+        None where the bound does not suffice, or the stamps are few: they may still be even.
     """
     lines: list[tuple[int, int, float, float, float]] = []
     intervals: list[float] = []
@@ -329,19 +448,38 @@ def uniform_times(
     tolerated: float = 0.0,
     fix: str = "cut the range out or set clock: stamps",
 ) -> tuple[FloatArray, float, float]:
-    """Times of a sensor that samples evenly (T,) [s], from time stamps with software delay, (T,)
-    [s], which may repeat.
+    """Times of a sensor that samples evenly, from time stamps with software delay.
 
     A straight line through stamps over their number, by least squares; stamps beyond three standard
-    deviations, as a stalled computer makes them, do not count. A constant latency stays in. With
-    them the rate found [Hz], and the root mean square of stamps minus times [s].
+    deviations, as a stalled computer makes them, do not count. A constant latency stays in.
 
-    The sensor's nominal rate is ``rate_hz``; wandering of the stamps about the line by
-    ``tolerated`` [s] does not matter; ``location`` is file and topic, ``fix`` what to do where
-    samples are missing, for messages.
+    Parameters
+    ----------
+    stamps : FloatArray
+        Time stamps, which may repeat, shape (T,) [s].
+    rate_hz : float
+        The sensor's nominal rate [Hz].
+    location : str
+        File and topic, for messages.
+    tolerated : float
+        Wandering of the stamps about the line that does not matter [s].
+    fix : str
+        What to do where samples are missing, for messages.
 
-    Raises `DataError`: too few samples, stamps that go backwards or are no numbers, another rate,
-    or samples that are missing.
+    Returns
+    -------
+    times : FloatArray
+        Evenly spaced times, shape (T,) [s].
+    rate_hz : float
+        The rate found [Hz].
+    jitter : float
+        Root mean square of stamps minus times [s].
+
+    Raises
+    ------
+    DataError
+        Too few samples, stamps that go backwards or are no numbers, another rate than the nominal
+        one by more than 0.5 %, or samples that are missing.
     """
     if len(stamps) < MIN_SAMPLES_OF_CLOCK:
         raise DataError(
@@ -383,7 +521,11 @@ def uniform_times(
 
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
-    """Slope and intercept, points beyond three standard deviations left out."""
+    """Slope [s] and intercept [s] of stamps over their number, points beyond three standard
+    deviations left out.
+
+    The standard deviation is taken from the median absolute residual; at most ten rounds.
+    """
     middle = number.mean()
     origin = stamps[0]
     is_used = np.ones(len(stamps), dtype=bool)
@@ -399,9 +541,24 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
 
 
 def common_span(spans: Mapping[str, tuple[float, float]], location: str) -> tuple[float, float]:
-    """Time that all spans [s] have in common; their keys name them in messages.
+    """Time that all spans have in common.
 
-    Raises `DataError` where there is none.
+    Parameters
+    ----------
+    spans : mapping
+        Name, for messages -> first and last time [s]; one at least.
+    location : str
+        The file, for messages.
+
+    Returns
+    -------
+    begin, end : float
+        The latest beginning and the earliest end [s].
+
+    Raises
+    ------
+    DataError
+        Nothing is common to all.
     """
     late = max(spans, key=lambda name: spans[name][0])
     early = min(spans, key=lambda name: spans[name][1])
@@ -417,9 +574,26 @@ def common_span(spans: Mapping[str, tuple[float, float]], location: str) -> tupl
 
 
 def ticks_within(begin: float, end: float, rate_hz: float, location: str) -> FloatArray:
-    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], (T,).
+    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s].
 
-    `DataError` below two or above the limits.
+    Parameters
+    ----------
+    begin, end : float
+        Both ends are included, with a slack of 1e-6 of an interval [s].
+    rate_hz : float
+        Rate of the ticks [Hz].
+    location : str
+        The file, for messages.
+
+    Returns
+    -------
+    FloatArray
+        Times, shape (T,) [s].
+
+    Raises
+    ------
+    DataError
+        They would be fewer than two, or more than the limits allow.
     """
     n_samples = (end - begin) * rate_hz
     check_limit(
@@ -448,8 +622,26 @@ def at_ticks(
     hold: bool = False,
     slack: float = 0.0,
 ) -> FloatArray:
-    """Samples at other times [s]: along straight lines or, to ``hold``, the last one that is at
-    most ``slack`` [s] later than a tick.
+    """Samples at other times.
+
+    Parameters
+    ----------
+    samples : FloatArray
+        Samples in any unit, shape (T,).
+    stamps : FloatArray
+        Their increasing times, shape (T,) [s].
+    ticks : FloatArray
+        Times at which they are wanted, shape (N,) [s]; outside the stamps the first or last sample
+        stands.
+    hold : bool
+        Whether a sample stands until the next one; else straight lines lead from one to the other.
+    slack : float
+        How much later than a tick the sample may be that is held there [s].
+
+    Returns
+    -------
+    FloatArray
+        Shape (N,).
     """
     if not hold:
         return np.interp(ticks, stamps, samples)
@@ -457,8 +649,22 @@ def at_ticks(
 
 
 def on_nearest(samples: FloatArray, ticks: FloatArray, n_samples: int) -> FloatArray:
-    """Every sample that is measured on its tick, a whole number, NaN on the others, shape
-    (n_samples,).
+    """Every sample that is measured on its tick, NaN on the others.
+
+    Parameters
+    ----------
+    samples : FloatArray
+        Samples, NaN where nothing was measured, shape (T,).
+    ticks : FloatArray
+        Number of the tick of each, a whole number, shape (T,); those outside are left out. Of
+        several samples on one tick the last stays.
+    n_samples : int
+        Number of ticks.
+
+    Returns
+    -------
+    FloatArray
+        Shape (n_samples,).
     """
     placed = np.full(n_samples, np.nan)
     is_inside = (ticks >= 0) & (ticks < n_samples) & ~np.isnan(samples)
@@ -467,8 +673,18 @@ def on_nearest(samples: FloatArray, ticks: FloatArray, n_samples: int) -> FloatA
 
 
 def mean_step(steps: FloatArray) -> float:
-    """The sampling interval behind jittering time stamps [s]: the mean, a gap counting as the
-    samples that it lacks.
+    """The sampling interval behind jittering time stamps: the mean, a gap counting as the samples
+    that it lacks.
+
+    Parameters
+    ----------
+    steps : FloatArray
+        Intervals between the stamps, shape (T - 1,) [s].
+
+    Returns
+    -------
+    float
+        The interval [s]; the median, 0, where most stamps repeat.
     """
     step = float(np.median(steps))
     for _ in range(3 if step > 0 else 0):
@@ -477,11 +693,23 @@ def mean_step(steps: FloatArray) -> float:
 
 
 def plain_rate(rate: float, tolerance: float) -> float:
-    """The rate [Hz] that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones
+    """The rate that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones
     first.
 
     A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a
     rational multiple of any other.
+
+    Parameters
+    ----------
+    rate : float
+        The rate found [Hz].
+    tolerance : float
+        Share of it by which the plain one may differ.
+
+    Returns
+    -------
+    float
+        The plain rate [Hz], or ``rate`` where none is near enough.
     """
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale

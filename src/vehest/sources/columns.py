@@ -1,4 +1,8 @@
-"""From a file's columns to channels: units and signs, declared in conf/dataset."""
+"""From a file's columns to channels: units and signs, declared in conf/dataset.
+
+mapping from conf/dataset -> `Column`, checked -> samples in the file's unit -> samples in the
+channel's SI unit, signs by ISO 8855
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,21 @@ class Column:
     factor: Annotated[float, "a number other than 0"] = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
-        """Values in SI units and ISO 8855 signs."""
+        """Values in SI units and ISO 8855 signs.
+
+        Parameters
+        ----------
+        values : FloatArray
+            Samples as the file has them, any shape.
+        si_unit : str
+            The channel's unit.
+
+        Returns
+        -------
+        FloatArray
+            ``values`` times sign, factor and conversion; ``values`` itself, not a copy, where these
+            multiply to 1.
+        """
         factor = self.sign * self.factor * factor_to_si(self.unit, si_unit)
         return values if factor == 1.0 else values * factor
 
@@ -47,7 +65,14 @@ class SampledColumn(Column):
     invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
 
     def measured(self, values: FloatArray) -> FloatArray:
-        """Values in the file's unit, (T,), NaN where nothing was measured."""
+        """Values in the file's unit, NaN where nothing was measured.
+
+        Parameters
+        ----------
+        values : FloatArray
+            Samples in the file's unit, shape (T,); those within 1e-6, relatively, of a number of
+            ``invalid`` were not measured.
+        """
         is_code = [np.isclose(values, code, rtol=1e-6, atol=0.0) for code in self.invalid]
         return np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
 
@@ -55,7 +80,15 @@ class SampledColumn(Column):
 def measured_columns(
     columns: Mapping[str, Column], values: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
-    """Columns of a table, (T,) each, NaN where a channel's declaration says so."""
+    """Columns of a table, NaN where a channel's declaration says that nothing was measured.
+
+    Parameters
+    ----------
+    columns : mapping
+        Channel -> its declaration; only those of `SampledColumn` with ``invalid`` numbers count.
+    values : mapping
+        Name of a column -> samples in the file's unit, shape (T,); left unchanged.
+    """
     measured = {**values}
     for column in columns.values():
         if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
@@ -66,9 +99,26 @@ def measured_columns(
 def columns_from_config(
     entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column
 ) -> dict[str, Column]:
-    """Channel -> its declaration of ``kind``, as a data set declares them.
+    """A data set's declarations of channels.
 
-    `ConfigurationError` for an unknown channel, unit or key.
+    Parameters
+    ----------
+    entries : mapping
+        Channel -> its entry in conf/dataset.
+    dataset : str
+        Name of the data set, for messages.
+    kind : type
+        Class of the declarations, whose fields are the keys of an entry.
+
+    Returns
+    -------
+    dict
+        Channel -> its declaration, in the order of ``entries``.
+
+    Raises
+    ------
+    ConfigurationError
+        A channel, unit or key is unknown, or a unit is of another quantity than the channel.
     """
     columns = {}
     for name, entry in entries.items():
@@ -83,9 +133,24 @@ def columns_from_config(
 def column_from_config(
     entry: Any, location: str, si_unit: str, kind: type[Column] = Column
 ) -> Column:
-    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
+    """A declaration whose unit is convertible.
 
-    Raises `ConfigurationError` for another key or quantity.
+    Parameters
+    ----------
+    entry : mapping
+        The declaration in conf/dataset.
+    location : str
+        Data set and channel, for messages.
+    si_unit : str
+        Unit to which the declared one must be convertible.
+    kind : type
+        Class of the declaration.
+
+    Raises
+    ------
+    ConfigurationError
+        A key is unknown or missing, a value is of the wrong type, the factor is 0, or the unit is
+        unknown or of another quantity.
     """
     column = validated(kind, entry, location, error=ConfigurationError)
     if column.factor == 0:

@@ -40,6 +40,9 @@ Progress = Callable[[str, int, int | None], None]
 
 
 def _file_name(name: str) -> str:
+    """The name itself; `ValueError` for one with a folder in it, or that of the record of
+    checksums.
+    """
     if not NAME.fullmatch(name) or name == CHECKSUMS:
         raise ValueError(f"{name!r} is not the name of a file in one folder, such as drive_1.csv")
     return name
@@ -74,6 +77,9 @@ class Outcome:
 class Download:
     """Files of a data set, the folder where they belong, and the address of the folder that they
     come from.
+
+    A file counts as there if it is not empty. Its checksum is compared with that of ``sha256``, or
+    else with the recorded one.
     """
 
     folder: Path
@@ -82,13 +88,16 @@ class Download:
     sha256: Mapping[str, str] = field(default_factory=dict)  # checksums known beforehand, by name
 
     def address(self, name: str) -> str:
-        """Address of a file."""
+        """Address of a file: its name, percent-encoded, below ``url``."""
         return f"{self.url.rstrip('/')}/{quote(name)}"
 
     def missing(self) -> list[str]:
         """Files that are not there; those that are there are checked. Writes nothing.
 
-        Raises `DataError` where one is damaged.
+        Raises
+        ------
+        DataError
+            One has another checksum than expected, or the record of checksums is damaged.
         """
         return [name for name in self.files if self._checked(name) is None]
 
@@ -96,8 +105,24 @@ class Download:
         """Download missing files one after another; a file takes its name once it is complete,
         checked and recorded.
 
-        Raises `DataError`: a file that is there or that came has other bytes than recorded. Raises
-        `MissingError`: the server cannot be reached or does not have it, or the disk is full.
+        Parameters
+        ----------
+        progress : callable or None
+            Called after each chunk with the file's name, the bytes received and the bytes in all,
+            None where the server does not state them.
+
+        Yields
+        ------
+        Outcome
+            One a file, in the order of ``files``, as soon as it is there.
+
+        Raises
+        ------
+        DataError
+            A file that is there or that came has other bytes than recorded.
+        MissingError
+            The server cannot be reached or does not have it, the disk is full, or another process
+            is fetching into the folder.
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -112,6 +137,9 @@ class Download:
                 shutil.rmtree(self.folder / UNDER_WAY, ignore_errors=True)
 
     def _outcome(self, name: str, progress: Progress | None) -> Outcome:
+        """Check a file that is there, or fetch it; its checksum is recorded before it takes its
+        name.
+        """
         import pooch
 
         path = self.folder / name
@@ -168,6 +196,7 @@ class Download:
         return checksum
 
     def _expected(self, name: str) -> str | None:
+        """Known checksum of a file: the declared one, else the recorded one, else None."""
         return self.sha256.get(name) or _read_checksums(self.folder).get(name)
 
 
@@ -179,8 +208,22 @@ def _download(
 ) -> None:
     """Download ``url`` into ``output_file``, as pooch calls it.
 
-    Raises `MissingError`: the server refuses, sends a web page, or does not state a length. Raises
-    `OSError`: it is out of reach or breaks off, or the disk is full.
+    Parameters
+    ----------
+    url, output_file : str
+        Address and path; the file is written as chunks arrive.
+    pooch : object
+        The caller, which is not used.
+    report : callable or None
+        Called after each chunk with the bytes received and the length that the server states, or
+        None.
+
+    Raises
+    ------
+    MissingError
+        The server refuses, sends a web page, or does not state a length.
+    OSError
+        It is out of reach or breaks off, or the disk is full.
     """
     import requests
 
@@ -204,9 +247,19 @@ def _download(
 
 
 def download_of(source: Source) -> Download:
-    """Option ``download`` of a data set.
+    """Option ``download`` of a data set, with its folder.
 
-    Raises `ConfigurationError` where it is missing or wrong, `MissingError` without a data root.
+    Parameters
+    ----------
+    source : Source
+        The data set's source, which names the files where the option does not.
+
+    Raises
+    ------
+    ConfigurationError
+        The option is missing or wrong, or names no file, or one twice.
+    MissingError
+        No data root is set.
     """
     location = f"data set '{source.name}'"
     options = validated(
@@ -243,7 +296,10 @@ def download_of(source: Source) -> Download:
 def _read_checksums(folder: Path) -> dict[str, str]:
     """Recorded checksums by name, empty if there is no record.
 
-    Raises `DataError` where it is damaged.
+    Raises
+    ------
+    DataError
+        The record is damaged.
     """
     import pooch
 
@@ -273,7 +329,15 @@ def _record(folder: Path, name: str, sha256: str) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that no other process downloads into it."""
+    """Hold a folder, so that no other process downloads into it.
+
+    Folders on disks that know no locks are not held.
+
+    Raises
+    ------
+    MissingError
+        Another process holds it.
+    """
     import fcntl
 
     descriptor = os.open(folder, os.O_RDONLY)

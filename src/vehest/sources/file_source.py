@@ -17,11 +17,14 @@ from vehest.sources.tables import listed
 
 
 class FileSource(Source):
-    """Files that match the option ``files`` in the folder ``path``; a file's stem is the
-    recording's name, ``STEM_run_N`` that of a run.
+    """Files that match the option ``files`` in the folder ``path``.
 
-    Attributes:
-        gappy: channels in which NaN means "not measured".
+    A file's stem is the recording's name, ``STEM_run_N`` that of a run.
+
+    Attributes
+    ----------
+    gappy : frozenset of str
+        Channels in which NaN means "not measured".
     """
 
     gappy: frozenset[str] = frozenset()
@@ -37,13 +40,26 @@ class FileSource(Source):
         return list(self._recordings_by_name())
 
     def inputs(self) -> dict[str, str | Path]:
-        """The files."""
+        """The files that match, by their names without the folder.
+
+        Raises
+        ------
+        MissingError
+            The folder is not there, or nothing in it matches.
+        DataError
+            Two files make one name of a recording.
+        """
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one recording by its name.
+        """Read one recording by its name, without transforms.
 
-        Raises `MissingError` where there is none, `DataError` where it cannot be used.
+        Raises
+        ------
+        MissingError
+            There is none of that name.
+        DataError
+            It cannot be used.
         """
         by_name = self._recordings_by_name()
         if recording_id not in by_name:
@@ -54,9 +70,14 @@ class FileSource(Source):
         return self._read(*by_name[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a file wherever it is.
+        """Read a file wherever it is, without transforms.
 
-        Raises `MissingError` without it, `DataError` where it cannot be used or holds several runs.
+        Raises
+        ------
+        MissingError
+            The file is not there.
+        DataError
+            It cannot be used, or holds several runs of which the option ``run`` names none.
         """
         runs = list(self._runs_of(file))
         if len(runs) > 1:
@@ -89,6 +110,11 @@ class FileSource(Source):
         """All runs, or the one that the option ``run`` names.
 
         A source has them in the cache ``_runs_of``.
+
+        Raises
+        ------
+        DataError
+            The file holds no run, or none of that number.
         """
         runs = self._runs(file)
         number = getattr(self.options, "run", None)
@@ -98,6 +124,7 @@ class FileSource(Source):
         return runs if number is None else {number: runs[number]}
 
     def _files(self) -> list[Path]:
+        """The files that match, sorted; see `inputs` for what is raised."""
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)
         if not files:
@@ -113,12 +140,19 @@ class FileSource(Source):
         return files
 
     def _matching(self, folder: Path) -> list[Path]:
+        """Files in a folder that the pattern ``files`` matches, sorted by path; folders do not
+        count.
+        """
         return sorted(file for file in folder.glob(self.options.files) if file.is_file())
 
     def _id_of(self, file: Path) -> str:
+        """Name of a file's recording: its stem."""
         return file.stem
 
     def _name_of(self, file: Path, run: int | None) -> str:
+        """Name of a recording: that of the file, and the number of the run where runs are
+        distinguished.
+        """
         return self._id_of(file) if run is None else f"{self._id_of(file)}_run_{run}"
 
     def _require_pattern(self) -> None:
@@ -139,9 +173,25 @@ class FileSource(Source):
         channels: Mapping[str, FloatArray],
         provenance: Mapping[str, Any],
     ) -> Recording:
-        """A recording of this data set; raises `DataError` where its channels make none.
+        """A recording of this data set.
 
-        ``location`` names the file.
+        Parameters
+        ----------
+        recording_id : str
+            Its name.
+        location : str
+            The file, for messages.
+        clock : Clock
+            Rate and start of the samples.
+        channels : mapping
+            Channel -> samples in its SI unit, one a tick of the clock, shape (T,).
+        provenance : mapping
+            What the source adds to the names of data set and source.
+
+        Raises
+        ------
+        DataError
+            The channels make no recording.
         """
         try:
             return Recording(
@@ -160,9 +210,13 @@ class FileSource(Source):
     def _declared(
         self, entries: Mapping[str, Any] | None, kind: type[Column] = Column
     ) -> dict[str, Any]:
-        """Channel -> its declaration, one at least.
+        """Channel -> its declaration, one at least; those that the option ``gappy`` names are
+        `gappy`.
 
-        Those that the option ``gappy`` names are `gappy`.
+        Raises
+        ------
+        ConfigurationError
+            None is declared, one is wrong, or ``gappy`` names another channel.
         """
         columns = columns_from_config(entries or {}, self.name, kind)
         if not columns:

@@ -52,13 +52,27 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
     write a file.
 
     Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory``
-    and ten times its size; where it was unpacked, that of ``packed``, the file or folder that the
-    user has. Where the system has no such limits (Windows), eight times that time is all that ends
-    it. ``reader`` is ``module:function``, which returns arrays and a summary; ``request`` what JSON
-    holds.
+    and ten times its size. Where the system has no such limits (Windows), eight times that time is
+    all that ends it.
 
-    Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise,
-    as the file is damaged, or asks for more.
+    Parameters
+    ----------
+    reader : str
+        ``module:function``, which returns arrays and a summary.
+    file : Path
+        File or folder that is read.
+    packed : Path or None
+        Where ``file`` was unpacked, the file or folder that the user has, by whose size memory is
+        limited.
+    **request : object
+        Further arguments of the function, such as JSON holds.
+
+    Raises
+    ------
+    VehestError
+        As the reader raises it.
+    DataError
+        The process ended otherwise, as the file is damaged, or asks for more.
     """
     seconds = SECONDS + SECONDS_PER_BYTE * _size(file)
     memory = current_limits().memory + MEMORY_PER_BYTE * _size(packed or file)
@@ -101,7 +115,22 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
 
 
 def require_package(module: str, extra: str, purpose: str) -> None:
-    """See that an optional package is installed; raises `MissingError` where it is not."""
+    """See that an optional package is installed, without importing it.
+
+    Parameters
+    ----------
+    module : str
+        Name by which it is imported.
+    extra : str
+        Extra of vehest that installs it.
+    purpose : str
+        What needs it, for the message.
+
+    Raises
+    ------
+    MissingError
+        It is not installed.
+    """
     if find_spec(module) is None:
         raise MissingError(
             f"{purpose} needs the package {module}; install it with: pip install 'vehest[{extra}]'"
@@ -115,6 +144,9 @@ def _size(file: Path) -> int:
 
 
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
+    """The error of a process that sent no answer, by its exit status or the signal that ended
+    it.
+    """
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
         return DataError(
             f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is "
@@ -161,6 +193,9 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
 
 
 def _send(stream: BinaryIO, arrays: Arrays, answer: Mapping[str, Any]) -> None:
+    """Write arrays and answer as one Arrow stream: a row with a list a column, the answer as
+    metadata.
+    """
     columns = [
         pa.LargeListArray.from_arrays(pa.array([0, len(array)], pa.int64()), pa.array(array))
         for array in arrays.values()

@@ -43,6 +43,9 @@ class MdfSource(SignalSource):
     channel_type = MdfChannel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
+        """The signal of each channel, and version, start and the rates of the groups of the
+        measurement.
+        """
         requests = {
             name: (declared.column, declared.group) for name, declared in self.channels.items()
         }
@@ -61,12 +64,30 @@ class MdfSource(SignalSource):
 def read_measurement(
     file: Path, requests: Requests | None
 ) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
-    """Signals of a measurement by their keys, what was not read and why, and ``version``, ``start``
-    and, by key, ``signals`` of the file.
+    """Signals of a measurement.
 
-    ``requests`` is where each signal stands; None for every signal of numbers whose group has
-    times. Raises `MissingError` without file or asammdf, `DataError` where it or a wanted signal is
-    unusable.
+    Parameters
+    ----------
+    file : Path
+        ASAM MDF 2, 3 or 4.
+    requests : mapping or None
+        Key -> where its signal stands; None for every signal of numbers whose group has times.
+
+    Returns
+    -------
+    signals : dict
+        Key -> signal, whose stamps are those of its group [s].
+    skipped : list of str
+        What was not read and why; empty with ``requests``.
+    about : dict
+        ``version``, ``start`` and, by key, ``signals`` of the file.
+
+    Raises
+    ------
+    MissingError
+        There is no such file, or asammdf is not installed.
+    DataError
+        The file, or a signal of ``requests``, is unusable.
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), requests=requests)

@@ -33,8 +33,20 @@ class NamedColumn:
     text: str  # a sign, the name and a unit, as they were given
 
     def find(self, names: Sequence[str]) -> tuple[str, str, int] | None:
-        """Name, unit (empty if none is stated) and sign of the column in a table; None if the table
-        lacks it.
+        """The column in a table.
+
+        A name that is in the table as it was given is taken so, even if it begins with a minus sign
+        or has a colon in it.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Columns of the table.
+
+        Returns
+        -------
+        tuple or None
+            Name, unit (empty if none is stated) and sign, 1 or -1; None if the table lacks it.
         """
         for sign, text in ((1, self.text), (-1, self.text.removeprefix("-"))):
             if text in names:

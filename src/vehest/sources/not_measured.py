@@ -66,6 +66,12 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
     ----------
     values : FloatArray
         Samples in the file's unit, NaN where there is none, shape (N,).
+
+    Returns
+    -------
+    list of float
+        None, one or two of them, in the file's unit: the largest value, then the smallest. A code
+        stands in two samples at least, and in at most half of ``values``.
     """
     measured = values[np.isfinite(values)]
     codes = []
@@ -84,6 +90,9 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
 
 
 def _looks_like_code(value: float) -> bool:
+    """Whether a number is huge, the end of an integer's range or all nines, perhaps scaled by a
+    power of ten.
+    """
     if abs(value) >= MIN_HUGE:
         return True
     for scale in (1.0, 10.0, 100.0, 1e3, 1e4):

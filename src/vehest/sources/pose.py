@@ -48,15 +48,36 @@ class PoseOptions:
         """Reference channels: poses are differentiated by a Savitzky-Golay filter and the velocity
         is turned into the car's axes.
 
-        Args:
-            positions: of the rigid body's origin, x and y with z up [m], evenly sampled by
-            ``interval`` [s], shape (T, 2).
-            yaw: of the rigid body, unwrapped [rad], shape (T,).
-            turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-            at: times of the samples, and others [s] to which straight lines bring the velocities.
+        Parameters
+        ----------
+        positions : FloatArray
+            Of the rigid body's origin, x and y with z up, evenly sampled, shape (T, 2) [m].
+        yaw : FloatArray
+            Of the rigid body, unwrapped, shape (T,) [rad].
+        interval : float
+            Between two poses [s].
+        turned : float
+            From the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+        location : str
+            File and topic, for messages.
+        at : tuple of FloatArray or None
+            Times of the samples, shape (T,) [s], and others, shape (N,) [s], to which straight
+            lines bring the velocities.
 
-        Raises `DataError`: too few poses.
+        Returns
+        -------
+        dict
+            Those of ``channels``: velocities of the reference point [m/s], forward and to the left,
+            yaw rate, positive to the left [rad/s], and sideslip angle [rad], shape (T,) or (N,)
+            each.
 
+        Raises
+        ------
+        DataError
+            There are fewer poses than the filter's window has samples.
+
+        Notes
+        -----
         Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares
         procedures, Anal. Chem. 36 (8), 1964.
         """
@@ -94,12 +115,30 @@ class PoseOptions:
 def ground_plane(
     positions: FloatArray, orientations: FloatArray, up: UpAxis, location: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions in the ground plane, (T, 2) [m], and unwrapped yaw, (T,) [rad], z up, of positions
-    x, y, z in the world, (T, 3) [m].
+    """Positions in the ground plane and yaw, z up, of poses in the world.
 
-    Orientations are quaternions x, y, z, w from the rigid body's axes to the world's, (T, 4);
-    ``up`` is the upward axis of both, ``y`` is usual in motion capture, ``z`` in ROS. Raises
-    `DataError`: a quaternion is not of unit length.
+    Parameters
+    ----------
+    positions : FloatArray
+        x, y and z in the world, shape (T, 3) [m].
+    orientations : FloatArray
+        Quaternions x, y, z, w from the rigid body's axes to the world's, shape (T, 4).
+    up : {'y', 'z'}
+        Upward axis of both: ``y`` is usual in motion capture, ``z`` in ROS.
+    location : str
+        File and topic, for messages.
+
+    Returns
+    -------
+    plane : FloatArray
+        x and y, shape (T, 2) [m].
+    yaw : FloatArray
+        Unwrapped, counter-clockwise as seen from above, shape (T,) [rad].
+
+    Raises
+    ------
+    DataError
+        The length of a quaternion differs from 1 by 0.01 or more.
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(orientations, axis=1)

@@ -55,9 +55,30 @@ class SampleAndHold:
         """Held channels on every tick of a recording's clock, along straight lines, which look
         ahead by up to one interval.
 
-        NaN outside their samples. With them the ticks between two samples of every channel, and the
-        rate of the samples [Hz]. ``columns`` are those of the held channels, ``values`` a table's,
-        (T,). Raises `DataError`: there are no such samples.
+        Parameters
+        ----------
+        columns : mapping
+            Held channel -> its column.
+        values : mapping
+            Columns of the table in the file's unit, shape (T,) each.
+        clock : Clock
+            Clock of the recording.
+        location : str
+            The file, for messages.
+
+        Returns
+        -------
+        channels : dict
+            Channel -> samples in its SI unit, NaN outside of the first and last, one a tick.
+        inside : slice
+            Ticks between two samples of every channel.
+        rate_hz : float
+            Mean rate of the samples [Hz].
+
+        Raises
+        ------
+        DataError
+            The channels change in fewer than two rows, or no tick lies between samples of all.
         """
         markers = (
             {column.column for column in columns.values()}
@@ -104,7 +125,20 @@ def sample_and_hold_from_config(
 ) -> SampleAndHold:
     """A data set's declaration of held channels.
 
-    Raises `ConfigurationError` for an undeclared channel, or another mistake.
+    Parameters
+    ----------
+    entry : mapping
+        The option ``held``.
+    channels : sequence of str
+        Channels of the data set.
+    location : str
+        Data set and option, for messages.
+
+    Raises
+    ------
+    ConfigurationError
+        It names a channel that is not declared, gives a delay of one that is not held, or has
+        another mistake.
     """
     declared = validated(SampleAndHold, entry, location, error=ConfigurationError)
     if unknown := [name for name in declared.channels if name not in channels]:

@@ -23,7 +23,7 @@ from pydantic import Field
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import MISSING, Recording
 from vehest.sources.base import require_files
 from vehest.sources.clocks import (
     SLACK,
@@ -41,7 +41,6 @@ from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 MIN_COVERED = 0.5  # share of a file's time that its segments must cover
-MISSING = "missing_samples"  # key of a recording's provenance: channel -> texts
 FASTER = 1.05  # than the raster: the rest would fold into it
 
 
@@ -74,15 +73,35 @@ class Signal:
         return float(1.0 / np.median(np.diff(self.stamps)))
 
     def gaps(self, max_gap: float) -> list[tuple[float, float]]:
-        """First and last time of each gap between two samples that is longer than ``max_gap``
-        [s].
+        """Gaps between two samples that are longer than ``max_gap`` [s].
+
+        Samples that are marked as invalid count as none.
+
+        Returns
+        -------
+        list of tuple
+            First and last time of each, those of the samples beside it [s].
         """
         times = self.stamps[~np.isnan(self.values)]
         first = np.flatnonzero(np.diff(times) > max_gap * (1.0 + SLACK))
         return list(zip(times[first].tolist(), times[first + 1].tolist(), strict=True))
 
     def missing(self, begin: float, end: float, max_gap: float) -> list[str]:
-        """Samples that a segment from ``begin`` to ``end`` [s] lacks, or that end it, in words."""
+        """Samples that a segment lacks, or that end it, in words.
+
+        Parameters
+        ----------
+        begin, end : float
+            First and last time of the segment [s].
+        max_gap : float
+            Longest time between two samples that is interpolated [s].
+
+        Returns
+        -------
+        list of str
+            A line on samples inside that are marked as not measured, and one for a gap that begins
+            where the segment ends.
+        """
         lines = []
         unmeasured = self.stamps[np.isnan(self.values)]
         within = unmeasured[(unmeasured > begin) & (unmeasured < end)]
@@ -202,7 +221,13 @@ class SignalSource(FileSource):
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a file of signals.
 
-        Raises `MissingError` without it, `DataError` where it or its clocks are unusable.
+        Raises
+        ------
+        MissingError
+            There is no such file, or the package that reads it is not installed.
+        DataError
+            It is damaged, contradicts a declared unit, or its signals leave gaps, are faster than
+            the raster, or have no time in common.
         """
         (signals, provenance) = self._signals(file)
         number = {} if run is None else {"run": run}
@@ -239,15 +264,30 @@ class SignalSource(FileSource):
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the
-        provenance.
+        """The signal of each channel, and an entry for the provenance.
+
+        Returns
+        -------
+        signals : dict
+            Channel -> signal, whose stamps pass `require_clock`.
+        provenance : dict
+            What the format says of the file, for every recording of it.
         """
 
     def _clock(
         self, signals: Mapping[str, Signal], file: Path, run: int | None
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Stamps [s] at which every signal that is not gappy has values, the even clock behind them
-        [s], and its rate [Hz].
+        """Stamps and ticks of a recording, and its rate.
+
+        Returns
+        -------
+        stamps : FloatArray
+            Times at which every signal that is not gappy has values [s]: those of the raster, or
+            the ticks.
+        ticks : FloatArray
+            The even clock behind them, of the same length, shape (T,) [s].
+        rate_hz : float
+            Its rate [Hz].
         """
         begin, end = self._common_span(self._spanning(signals), file)
         segment = self._runs_of(file)[run]
@@ -305,6 +345,7 @@ class SignalSource(FileSource):
         return at_ticks(values, times, ticks, hold=declared.interpolation == "hold", slack=near)
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
+        """File, name, origin and channel of a signal, as the subject of a message."""
         return (
             f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel "
             f"'{name}',"

@@ -140,7 +140,15 @@ class SimulatedSource(Source):
         return list(self.drives)
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Simulate one drive."""
+        """Simulate one drive, with the data set's variations of vehicle and sensors.
+
+        The same drive, seed and options make the same recording, whatever other drives there are.
+
+        Raises
+        ------
+        MissingError
+            The data set has no drive of that name.
+        """
         if recording_id not in self.drives:
             raise MissingError(
                 f"{self.location} has no drive '{recording_id}' (it has "
@@ -164,6 +172,13 @@ class SimulatedSource(Source):
         )
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
+        """The call that simulates a drive; ``variations`` are those of the vehicle's parameters.
+
+        Raises
+        ------
+        ConfigurationError
+            The drive names an unknown vehicle, or its manoeuvre, sensors or surface is wrong.
+        """
         from vehest.simulation.driving.manoeuvres import MANOEUVRES, manoeuvre_from_config
         from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
         from vehest.simulation.road.surface import surface_from_config
@@ -205,6 +220,9 @@ class SimulatedSource(Source):
         )
 
     def _vehicles(self) -> dict[str, Mapping[str, Any]]:
+        """Name -> configuration of each vehicle; the name is empty where it declares a single
+        ``vehicle``.
+        """
         vehicle = self.dataset.get("vehicle")
         several = self.options.vehicles
         if isinstance(vehicle, Mapping) and not several:
@@ -221,6 +239,7 @@ class SimulatedSource(Source):
         )
 
     def _drives(self) -> dict[str, Drive]:
+        """Name of each drive -> its declaration; an entry with ``count`` makes as many names."""
         drives: dict[str, Drive] = {}
         for entry in self.options.drives or ():
             location = f"{self.location}: drive '{entry.id}'"

@@ -40,7 +40,26 @@ class TablePose(PoseOptions):
         self, values: Mapping[str, FloatArray], clock: Clock, location: str
     ) -> dict[str, FloatArray]:
         """Reference channels on the recording's clock, on which poses are differentiated: offline,
-        by half a window; raises `DataError`.
+        by half a window.
+
+        Parameters
+        ----------
+        values : mapping
+            Columns of the table in the file's unit, shape (T,) each.
+        clock : Clock
+            Clock of the recording; the table's rows are brought onto it.
+        location : str
+            The file, for messages.
+
+        Returns
+        -------
+        dict
+            As of `PoseOptions.references`, one sample a tick.
+
+        Raises
+        ------
+        DataError
+            A pose is no number, or there are fewer than the filter's window has samples.
         """
         poses = {
             name: column.to_si(values[column.column], UNITS[name])
@@ -65,7 +84,10 @@ class TablePose(PoseOptions):
 def table_pose_from_config(entry: Any, location: str) -> TablePose:
     """A data set's declaration of poses in columns.
 
-    Raises `ConfigurationError` where a column or unit is missing, or one unknown.
+    Raises
+    ------
+    ConfigurationError
+        A column or unit is missing, or one is unknown or of another quantity.
     """
     pose = validated(TablePose, entry, location, error=ConfigurationError)
     for name, unit in UNITS.items():

@@ -28,7 +28,18 @@ class TimeColumn(Column):
     sort: bool = False  # whether rows are brought into the order of their times
 
     def in_order(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Columns of a table, (T,) each, with times that go on where they wrapped, sorted."""
+        """Columns of a table with times that go on where they wrapped, sorted if declared so.
+
+        Parameters
+        ----------
+        values : mapping
+            Name -> column in the file's unit, shape (T,); it must hold the column of times.
+
+        Returns
+        -------
+        dict
+            Columns, shape (T,) each; rows of equal times keep their order.
+        """
         times = values[self.column]
         if self.wraps_at is not None:
             times = unwrapped(times, self.wraps_at)
@@ -40,7 +51,21 @@ class TimeColumn(Column):
 
 
 def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
-    """Times, (T,), of a counter that begins anew at a count, going on there."""
+    """Times of a counter that begins anew at a count, going on there.
+
+    Parameters
+    ----------
+    times : FloatArray
+        Counts, shape (T,).
+    wraps_at : float
+        The count at which it begins anew, in the same unit; a step back by more than half of it is
+        taken as such.
+
+    Returns
+    -------
+    FloatArray
+        Counts that go on, shape (T,).
+    """
     wraps = np.cumsum(np.diff(times, prepend=times[:1]) < -0.5 * wraps_at)
     return np.asarray(times + wraps_at * wraps, dtype=np.float64)
 
@@ -48,8 +73,25 @@ def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
 def dropped_rows_from_config(
     entries: Mapping[str, Iterable[int | str]], location: str
 ) -> dict[str, list[slice]]:
-    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or
-    ranges; raises `ConfigurationError`.
+    """Rows that a data set leaves out.
+
+    Parameters
+    ----------
+    entries : mapping
+        Stem of a file -> numbers of rows, from 1 below the header, or ranges such as ``700-750``
+        and ``700-``, both ends included.
+    location : str
+        The data set, for messages.
+
+    Returns
+    -------
+    dict
+        Stem -> rows, from 0.
+
+    Raises
+    ------
+    ConfigurationError
+        An entry is neither.
     """
     return {
         str(stem): [_rows(row, f"{location}: drop_rows of '{stem}'") for row in rows]
@@ -58,6 +100,7 @@ def dropped_rows_from_config(
 
 
 def _rows(row: int | str, location: str) -> slice:
+    """Rows, from 0, of a number or range, from 1; `ConfigurationError` for any other text."""
     match = RANGE.fullmatch(str(row).strip())
     first, last = match.groups(default=match[1]) if match else ("", "")
     if not first or (last and int(last) < int(first)):
@@ -71,10 +114,23 @@ def _rows(row: int | str, location: str) -> slice:
 def remaining_files(
     files: Sequence[Path], exclude: Iterable[str], dropped: Iterable[str], location: str
 ) -> list[Path]:
-    """Files whose stems match no pattern of ``exclude``.
+    """Files that a data set does not exclude.
 
-    Raises `MissingError` where a pattern, or a stem of ``dropped``, matches no file, or none
-    remains.
+    Parameters
+    ----------
+    files : sequence of Path
+        Files of the data set.
+    exclude : iterable of str
+        Patterns over the files' stems, which distinguish upper and lower case.
+    dropped : iterable of str
+        Stems of files of which rows are left out.
+    location : str
+        The data set, for messages.
+
+    Raises
+    ------
+    MissingError
+        A pattern, or a stem of ``dropped``, matches no file, or none remains.
     """
     patterns = list(exclude)
     for option, names in (("exclude", patterns), ("drop_rows", dropped)):
@@ -90,7 +146,27 @@ def remaining_files(
 
 
 def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
-    """Which rows count, shape (n_rows,); raises `DataError` where the table has no such row."""
+    """Which rows of a table count.
+
+    Parameters
+    ----------
+    n_rows : int
+        Number of its rows.
+    dropped : iterable of slice
+        Rows that are left out, from 0.
+    file : Path
+        For messages.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape (n_rows,).
+
+    Raises
+    ------
+    DataError
+        The table has no such row.
+    """
     is_remaining = np.ones(n_rows, dtype=np.bool_)
     for rows in dropped:
         last = rows.stop or rows.start + 1
@@ -106,7 +182,24 @@ def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray
 def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
     """Rows of each run that a column of whole numbers counts.
 
-    Raises `DataError` where a number is none, or a run begins again.
+    Parameters
+    ----------
+    numbers : FloatArray
+        The column, shape (N,).
+    column : str
+        Its name, for messages.
+    file : Path
+        For messages.
+
+    Returns
+    -------
+    dict
+        Number of each run -> its rows, in the order of the file.
+
+    Raises
+    ------
+    DataError
+        A number is none or not whole, or a run begins again after another.
     """
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
@@ -163,8 +256,19 @@ def timed_runs(
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
-    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N -
-    1,).
+    """Rows of uninterrupted runs in their order.
+
+    Parameters
+    ----------
+    begins : ndarray of bool
+        Whether a run begins with the next row, shape (N - 1,).
+    n_rows : int
+        Number of rows, N.
+
+    Returns
+    -------
+    list of slice
+        One at least, even where there are no rows.
     """
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]

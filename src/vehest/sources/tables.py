@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,7 +23,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, printable
+from vehest.data.errors import DataError, number_of, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked, current_limits
 from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
@@ -30,9 +31,11 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
 BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
+TAIL = 1 << 16  # bytes at the end of the rows, in which the last ones are
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
 # a row with a cell that is a number, or whose first one is missing
 ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
+UNFINISHED = re.compile(r"[-+]|[-+]?\.|[-+]?[\d.]+e[-+]?", re.IGNORECASE)  # a number, cut short
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -48,6 +51,7 @@ class TextLayout:
     missing: tuple[str, ...] = ()  # cells without a sample, beside empty ones, NaN, NA and null
     names: tuple[str, ...] | None = None  # of the columns where the file has no line of them
     clock: str | None = None  # column of times as a clock shows them, which become seconds
+    n_bytes: int | None = None  # of the file that are read; None for all of them
 
 
 def is_parquet(file: Path) -> bool:
@@ -58,7 +62,15 @@ def is_parquet(file: Path) -> bool:
 def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
     """Names of a table's columns, in order.
 
-    Raises `MissingError` where there is no such file, `DataError` where it cannot be read.
+    Those that ``layout`` states count before the file's own; see `names_of` for names that occur
+    twice.
+
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It cannot be read, or has more columns than the limits allow.
     """
     if layout.names is not None:
         names = list(layout.names)
@@ -90,8 +102,18 @@ def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
 def names_of(header: Sequence[str], first_row: Sequence[str]) -> list[str]:
     """Names of a table's columns, one for each cell of its rows, each once.
 
-    One that occurs again has the number of its column behind it. Rows may end in delimiters, which
-    make nameless columns; the line of names may end in more of them.
+    Parameters
+    ----------
+    header : sequence of str
+        Cells of the line of names; it may end in more delimiters than the rows.
+    first_row : sequence of str
+        Cells of the first row; rows may end in delimiters, which make nameless columns.
+
+    Returns
+    -------
+    list of str
+        A name that occurs several times has the number of its column behind it each time: ``speed
+        #3``.
     """
     n_cells = len(first_row)
     names = [*header, *[""] * (n_cells - len(header))]
@@ -117,9 +139,14 @@ def with_names(file: Path, layout: TextLayout) -> TextLayout:
 
 
 def read_head(file: Path, size: int = BLOCK) -> bytes:
-    """First bytes of a table, unpacked.
+    """First bytes of a table, unpacked; fewer than ``size`` where the table is shorter.
 
-    Raises `MissingError` where there is no such file, `DataError` where it cannot be read.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It cannot be read.
     """
     try:
         with table_stream(file) as stream:
@@ -129,7 +156,22 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
 
 
 def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -> None:
-    """See that a table has every wanted column once; raises `DataError` where it does not."""
+    """See that a table has every wanted column once.
+
+    Parameters
+    ----------
+    file : Path
+        For messages.
+    names : sequence of str
+        Columns of the table, as `column_names` gives them.
+    selected : iterable of str
+        Wanted columns.
+
+    Raises
+    ------
+    DataError
+        One is missing, or occurs several times.
+    """
     for name in selected:
         count = names.count(name)
         if count > 1:
@@ -157,17 +199,41 @@ def read_columns(
     layout: TextLayout = TextLayout(),
     text: bytes | None = None,
 ) -> dict[str, FloatArray]:
-    """Columns of numbers, shape (T,) each, NaN where a sample is missing; ``text`` is that of the
-    table where it is not the file's own.
+    """Columns of numbers.
 
-    Raises `MissingError`: there is no such file. Raises `DataError`: it cannot be read, lacks a
-    column, or holds text where numbers belong.
+    Parameters
+    ----------
+    file : Path
+        Table of text, perhaps packed, or Parquet.
+    selected : sequence of str
+        Names of the wanted columns; others are not converted.
+    layout : TextLayout
+        Layout of a table of text. Its column of clock times becomes seconds.
+    text : bytes or None
+        Text of the table where it is not the file's own.
+
+    Returns
+    -------
+    dict
+        Name -> float64, shape (T,), NaN where a sample is missing.
+
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It cannot be read, lacks a column, holds text where numbers belong, no rows, or more than
+        the limits allow.
     """
     require_columns(file, column_names(file, layout), selected)
     if is_parquet(file):
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, selected)
-    opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
+    opened = (
+        partial(table_stream, file, layout.n_bytes)
+        if text is None
+        else partial(pa.BufferReader, text)
+    )
     layout = with_names(file, layout)
     convert = _conversion(selected, layout)
     if text is None:
@@ -195,9 +261,29 @@ def read_columns(
 def column_parts(
     file: Path, selected: Sequence[str], layout: TextLayout, lengths: Iterable[int]
 ) -> Iterator[dict[str, FloatArray]]:
-    """Columns as `read_columns` gives them, so many rows at a time, at most as many as there are.
+    """Columns as `read_columns` gives them, so many rows at a time.
 
-    Raises as it does.
+    Parameters
+    ----------
+    file : Path
+        Table of text, perhaps packed, or Parquet.
+    selected : sequence of str
+        Names of the wanted columns, none of them of clock times.
+    layout : TextLayout
+        Layout of a table of text.
+    lengths : iterable of int
+        Rows of each part.
+
+    Yields
+    ------
+    dict
+        Name -> float64, shape (length,), read-only; shorter, or empty, where the table has no more
+        rows.
+
+    Raises
+    ------
+    MissingError, DataError
+        As `read_columns` does.
     """
     require_columns(file, column_names(file, layout), selected)
     try:
@@ -207,7 +293,7 @@ def column_parts(
             else:
                 layout = with_names(file, layout)
                 options = _options(layout, _conversion(selected, layout), [])
-                stream = opened.enter_context(table_stream(file))
+                stream = opened.enter_context(table_stream(file, layout.n_bytes))
                 opened.enter_context(decoding_failures_ignored())
                 batches = iter(pc.open_csv(stream, **options))
             batch = next(batches, None)
@@ -246,7 +332,18 @@ def parse_table(
 ) -> pa.Table:
     """Table of text as pyarrow converts it; raises what pyarrow raises.
 
-    Lines of text between or below the rows are left out, and appended to ``lines_of_text``.
+    Parameters
+    ----------
+    opened : callable
+        Opens the text; called once.
+    layout : TextLayout
+        Its layout.
+    convert : pyarrow.csv.ConvertOptions
+        Types of the columns, and which are read.
+    threads : bool
+        Whether pyarrow may use several threads; errors state the row only without.
+    lines_of_text : list of str or None
+        Takes the lines of text between or below the rows, which are left out of the table.
     """
     texts = [] if lines_of_text is None else lines_of_text
     with opened() as stream, decoding_failures_ignored():
@@ -260,6 +357,12 @@ def _options(
     *,
     threads: bool = True,
 ) -> dict[str, Any]:
+    """Arguments of pyarrow's reader for a layout.
+
+    A row of the wrong length is an error where it holds a number or lacks its first cell; any other
+    is a line of text, which is left out and appended to ``lines_of_text``.
+    """
+
     def handle(row: pc.InvalidRow) -> Literal["skip", "error"]:
         if re.search(ROW_OF_NUMBERS, row.text, re.IGNORECASE):
             return "error"
@@ -300,6 +403,9 @@ def decoding_failures_ignored() -> Iterator[None]:
 
 
 def _conversion(selected: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
+    """Types of the wanted columns, float64 or the text of a clock, and texts that count as
+    missing.
+    """
     return pc.ConvertOptions(
         column_types={
             name: pa.string() if name == layout.clock else pa.float64() for name in selected
@@ -310,25 +416,72 @@ def _conversion(selected: Sequence[str], layout: TextLayout) -> pc.ConvertOption
     )
 
 
-def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table, unpacked as it is read if it ends in ``.gz``, ``.bz2``, ``.zst`` or
-    ``.lz4``.
+def table_stream(file: Path, n_bytes: int | None = None) -> pa.NativeFile:
+    """Text of a table, or its first bytes, unpacked as it is read if it ends in ``.gz``, ``.bz2``,
+    ``.zst`` or ``.lz4``.
 
-    Raises `MissingError` where there is no such file, `DataError` for a pipe or a folder, `OSError`
-    where it cannot be opened.
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It is a pipe or a folder.
+    OSError
+        It cannot be opened.
     """
+    if n_bytes is not None:
+        return table_stream(file).get_stream(0, n_bytes)
     packed = PACKED.get(regular_file(file).suffix.lower())
     # pyarrow opens no name that is not UTF-8
     return pa.input_stream(open(file, "rb"), compression=packed)
 
 
-def require_memory(file: Path, layout: TextLayout) -> None:
-    """Refuse, by a `DataError`, a table that would take more memory as a whole than the limits
-    allow.
+def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
+    """End of a table whose logger was switched off while it wrote: bytes before it, and its text.
 
-    Weighed are its unpacked text and ``BYTES_PER_CELL`` for each delimiter and each end of a line,
+    It is zero bytes, a last row without an end that has fewer cells than the row above or ends
+    within a number, or both. None where the table is complete, packed or in UTF-16.
+    """
+    if is_parquet(file) or file.suffix.lower() in PACKED or layout.encoding.startswith("utf-16"):
+        return None
+    with open(regular_file(file), "rb") as stream:
+        size = end = stream.seek(0, os.SEEK_END)
+        tail = b""
+        while end and not tail:
+            start = max(end - TAIL, 0)
+            stream.seek(start)
+            tail = stream.read(end - start).rstrip(b"\0")
+            end = start + len(tail)
+    *above, last = re.split(r"\r\n|\n|\r", tail.decode(layout.encoding, errors="replace"))
+    has_zeros = end < size
+    cells, full = (
+        next(csv.reader([line], delimiter=layout.delimiter), [])
+        for line in (last, above[-1] if above else "")
+    )
+    is_row = all(re.search(ROW_OF_NUMBERS, line, re.IGNORECASE) for line in (last, *above[-1:]))
+    is_unfinished = bool(cells) and UNFINISHED.fullmatch(cells[-1].replace(layout.decimal, "."))
+    is_cut = (
+        len(cells) < len(full) or has_zeros or (is_unfinished and cells[-1] not in layout.missing)
+    )
+    if not (last.strip() and is_row and is_cut and len(cells) <= len(full)):
+        last = ""
+    texts = [f"a last row that is cut short ('{printable(last[-40:])}')"] if last else []
+    texts += [f"{number_of(size - end, 'zero byte')} at the end"] if has_zeros else []
+    n_bytes = end - len(last.encode(layout.encoding, errors="replace"))
+    return (n_bytes, " and ".join(texts)) if texts else None
+
+
+def require_memory(file: Path, layout: TextLayout) -> None:
+    """Refuse a table that would take more memory as a whole than the limits allow.
+
+    Weighed are its unpacked text and `BYTES_PER_CELL` for each delimiter and each end of a line,
     counted block by block without keeping any. Text that is not packed and too short to exceed the
     limit with every byte a cell is not looked through.
+
+    Raises
+    ------
+    DataError
+        It would take more, or cannot be unpacked.
     """
     size = regular_file(file).stat().st_size
     packed = file.suffix.lower() in PACKED
@@ -347,13 +500,14 @@ def require_memory(file: Path, layout: TextLayout) -> None:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names for a message."""
+    """Names for a message: the first twelve, printable and at most 60 characters each."""
     return ", ".join(printable(name[:60]) for name in names[:12]) + (
         ", …" if len(names) > 12 else ""
     )
 
 
 def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
+    """Clock times of a column, shape (N,) [s]; `DataError` for other text."""
     seconds = seconds_of_text(cells)
     if seconds is None:
         raise DataError(

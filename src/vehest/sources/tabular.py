@@ -6,7 +6,7 @@ Names, units and signs are declared in conf/dataset.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -18,7 +18,7 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
 from vehest.data.parquet import ROWS_AT_A_TIME
-from vehest.data.recording import PART, Recording, part_slices
+from vehest.data.recording import MISSING, PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
 from vehest.sources.clocks import Clock, ClockPolicy, bridged, even_clock, uniform_clock
@@ -48,6 +48,7 @@ from vehest.sources.tables import (
     TextLayout,
     column_names,
     column_parts,
+    cut_end,
     is_parquet,
     listed,
     read_columns,
@@ -183,7 +184,8 @@ class TabularSource(FileSource):
         columns = self._columns_of(file)
         selected = list(dict.fromkeys(column.column for column in columns.values()))
         try:
-            blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
+            layout = self._layout_of(file)
+            blocks = column_parts(file, [time.column], layout, repeat(ROWS_AT_A_TIME))
             clock = even_clock(
                 time.to_si(block[time.column], "s")
                 for block in takewhile(lambda block: len(block[time.column]), blocks)
@@ -194,7 +196,7 @@ class TabularSource(FileSource):
             check_limit("samples", clock.n_samples, f"'{file}' has {clock.n_samples} rows")
             slices = part_slices(clock.n_samples, clock.rate_hz)
             parts = column_parts(
-                file, selected, self.layout, (rows.stop - rows.start for rows in slices)
+                file, selected, layout, (rows.stop - rows.start for rows in slices)
             )
             for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
                 measured = measured_columns(self.columns or {}, values)
@@ -272,7 +274,8 @@ class TabularSource(FileSource):
         """Columns in the order of their times, without the rows that the data set leaves out."""
         time = self.time
         sorting = [time.column] if time is not None and time.sort else []
-        values = read_columns(file, list(dict.fromkeys([*selected, *sorting])), self.layout)
+        names = list(dict.fromkeys([*selected, *sorting]))
+        values = read_columns(file, names, self._layout_of(file))
         if time is not None and time.column in values:
             values = time.in_order(values)
         values = measured_columns(self.columns or {}, values)
@@ -281,6 +284,11 @@ class TabularSource(FileSource):
             return values
         is_remaining = remaining_rows(len(next(iter(values.values()))), dropped, file)
         return {name: samples[is_remaining] for name, samples in values.items()}
+
+    def _layout_of(self, file: Path) -> TextLayout:
+        """The layout of a file's rows, without an end that is cut short."""
+        end = cut_end(file, self.layout)
+        return self.layout if end is None else replace(self.layout, n_bytes=end[0])
 
     def _recording_of(
         self,
@@ -319,6 +327,9 @@ class TabularSource(FileSource):
             | ({} if run is None else {"run": run})
             | ({PART: part} if part[1] > 1 else {})
         )
+        end = cut_end(file, self.layout) if file.is_file() else None
+        if end is not None and run == [*self._runs_of(file)][-1]:
+            provenance[MISSING] = {"": [f"not read: {end[1]}"]}
         if file.stem in self.dropped:
             provenance["dropped_rows"] = list(self.options.drop_rows[file.stem])
         if self.pose is not None:

@@ -66,9 +66,20 @@ _SECOND = re.compile(r"sec(ond[saeoi]?)?|sek(unden?)?|秒")
 
 
 def plain_unit(text: str) -> str | None:
-    """A unit as vehest spells it, ``another unit`` for one that no channel has.
+    """A unit as vehest spells it.
 
-    A step of raw counts stays before it: ``0.01*deg/s``. None for an unknown spelling or none.
+    Blanks, dots, stars, brackets and, but for a few spellings, case do not matter.
+
+    Parameters
+    ----------
+    text : str
+        The unit as a file writes it.
+
+    Returns
+    -------
+    str or None
+        ``another unit`` for one that no channel has; a step of raw counts stays before it:
+        ``0.01*deg/s``. None for an unknown spelling or none.
     """
     step, rest = _STEPPED.fullmatch(text.strip("()[] ")).groups()  # type: ignore[union-attr]
     bare = re.sub(r"[\s·*×.Â()\[\]]", "", rest)  # Â: UTF-8 that was read as Latin-1
@@ -79,9 +90,26 @@ def plain_unit(text: str) -> str | None:
 
 
 def require_unit(written: str, column: Column, si_unit: str, location: str, fix: str) -> None:
-    """Refuse a declared unit that contradicts the file's; unknown spellings pass.
+    """Refuse a declared unit that contradicts the file's; unknown spellings pass, and so does a
+    column with a factor.
 
-    Raises `DataError` where the units differ.
+    Parameters
+    ----------
+    written : str
+        The unit as the file writes it.
+    column : Column
+        Declaration of the channel.
+    si_unit : str
+        Unit of the channel.
+    location : str
+        File and column, for messages.
+    fix : str
+        What else to do than to correct the unit, for messages.
+
+    Raises
+    ------
+    DataError
+        The units differ, even if only by a factor.
     """
     plain = plain_unit(written)
     if plain is None or column.factor != 1.0:

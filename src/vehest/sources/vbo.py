@@ -118,8 +118,13 @@ class VboSource(FileSource):
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a log.
 
-        Raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or
-        offset.
+        Raises
+        ------
+        MissingError
+            There is no such file.
+        DataError
+            It is damaged, lacks a column, contradicts a declared unit, or its clock or the offsets
+            of its slip angles are wrong.
         """
         log = self._log(file)
         rows = self._runs_of(file)[run]
@@ -147,11 +152,17 @@ class VboSource(FileSource):
 
 
 def read_log(file: Path) -> Log:
-    """Everything in a log; raises `DataError` where it is no such file, damaged, or more than the
-    limits allow.
+    """Everything in a log.
 
     A last row that is cut off, or comes more than half an interval late, as loggers write when they
     are stopped, is left out.
+
+    Raises
+    ------
+    MissingError
+        There is no such file.
+    DataError
+        It has no section of rows, is damaged, or holds more than the limits allow.
     """
     head, mark, rows = regular_file(file).read_bytes().partition(b"[data]")
     if not mark or len(head) > LONGEST_HEAD:
@@ -222,7 +233,20 @@ def require_slip_offsets(log: Log, location: str) -> None:
 
     The logger computes slip at points whose offsets from the antenna were entered as {lateral,
     longitudinal}. Where the two change places, front and rear wheel of a side have the same
-    longitudinal offset, and the same slip, which raises `DataError`.
+    longitudinal offset, and the same slip. Without these columns and offsets, or with few samples
+    in turns, nothing is checked.
+
+    Parameters
+    ----------
+    log : Log
+        The log.
+    location : str
+        The file, for messages.
+
+    Raises
+    ------
+    DataError
+        In turns the slip angles differ by less than a quarter of that (root mean squares).
     """
     required = ("Slip_FL", "Slip_RL", "YawRate", "velocity")
     if not {"FL", "RL"} <= set(log.offsets) or not set(required) <= set(log.columns):

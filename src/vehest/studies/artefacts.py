@@ -25,10 +25,26 @@ from vehest.evaluation.metrics import Protocol, Scored, score_all
 def read_frame(
     path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()
 ) -> pd.DataFrame:
-    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which
-    ``numbers`` hold numbers.
+    """A table that vehest wrote as CSV, its numbers bit for bit.
 
-    Else a `DataError`.
+    Parameters
+    ----------
+    path : Path
+        The CSV file, UTF-8 with a header.
+    columns : iterable of str
+        Columns that must be there.
+    numbers : iterable of str
+        Those of them that must hold numbers; a column that is empty throughout passes.
+
+    Returns
+    -------
+    pd.DataFrame
+        All columns of the file; an empty field is NaN, also in a column of text.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read as CSV, lacks a column, or has text where numbers belong.
     """
     text = read_text(path)
     try:
@@ -45,12 +61,20 @@ def read_frame(
 
 
 def write_frame(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV, numbers with all their digits."""
+    """Write a table as CSV, numbers with all their digits.
+
+    Parameters
+    ----------
+    table : pd.DataFrame
+        Its index is not written.
+    path : Path
+        Replaced if it is there; lines end in LF on every system.
+    """
     table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
 
 
 def nominal_rows(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Rows of metrics over all samples without a fault."""
+    """Rows of a long table with METRIC_COLUMNS over all samples without a fault."""
     return metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
 
 
@@ -107,6 +131,11 @@ class EvaluatedModel:
     def segments(self, test_set: str) -> Segments:
         """Sums of its errors over segments of a test set.
 
+        Returns
+        -------
+        Segments
+            Sums of squared errors and numbers of samples, one entry a segment.
+
         Raises
         ------
         DataError
@@ -121,13 +150,30 @@ class EvaluatedModel:
     def estimate(self, test_set: str, position: int) -> Estimate:
         """The stored estimate of the n-th range of a test set, or of the n-th sequence
         (`sequences`).
+
+        Parameters
+        ----------
+        test_set : str
+            Name of the test set, or ``validation``.
+        position : int
+            Counted from 0.
+
+        Returns
+        -------
+        Estimate
+            With all stored quantities, at the rate of the estimate.
+
+        Raises
+        ------
+        DataError
+            The file is missing or damaged.
         """
         return read_estimate(self.evaluation_folder / test_set / f"{position}.parquet")
 
 
 @dataclass(frozen=True)
 class PartArtefacts:
-    """One comparison: estimators that learnt on one split and were scored on it."""
+    """One comparison: estimators that were trained on one split and were scored on it."""
 
     study: str  # name of the study
     title: str  # its title
@@ -150,7 +196,22 @@ class PartArtefacts:
     failed: Mapping[str, str] = field(default_factory=dict)
 
     def reference(self, span: Span, channels: Iterable[str] | None = None) -> Recording:
-        """The recording of a range at the evaluation rate, with all or some of its channels."""
+        """The recording of a range at the evaluation rate, with all or some of its channels.
+
+        Parameters
+        ----------
+        span : Span
+            Only its data set and recording count; the recording is not cut.
+        channels : iterable of str, optional
+            Channels to read; None for all.
+
+        Raises
+        ------
+        KeyError
+            The recording has no file among ``references``.
+        DataError
+            The file is damaged.
+        """
         return read_recording(self.references[span.dataset, span.recording], channels)
 
     def reference_ranges(self, spans: Iterable[Span]) -> list[Recording]:
@@ -168,6 +229,16 @@ class PartArtefacts:
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
         """Estimate and reference of a model on each range of a test set, or on each sequence if the
         protocol cuts ranges.
+
+        Returns
+        -------
+        list of Scored
+            One a range or sequence, in the order of the split.
+
+        Raises
+        ------
+        DataError
+            An estimate is damaged, or does not cover its range.
         """
         spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
         return score_all(
@@ -179,7 +250,13 @@ class PartArtefacts:
 
 
 def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Tables of all parts as one; ``trained_on`` is followed by the part, where it has a name."""
+    """Tables of all parts as one; ``trained_on`` is followed by the part, where it has a name.
+
+    Parameters
+    ----------
+    tables : mapping
+        Part -> table with a column ``trained_on``; a part without a name leaves it as it is.
+    """
     named = [
         table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") if name else table
         for name, table in tables.items()
@@ -236,7 +313,7 @@ class Trial:
     training: Mapping[str, Any]  # how it was trained, as configured
     metric: str  # that chooses
     validation: float  # value of the metric on the validation range, to six significant digits
-    key: str  # of its training
+    origin: str  # of its training: `vehest.run.weights`
     evaluation: str  # version and options of its evaluation
     chosen: bool = False  # whether it has the lowest value of its search
 

@@ -84,7 +84,18 @@ _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rm
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report of a study that is not in parts; see `comparison`."""
+    """The report of a study that is not in parts; see `comparison`.
+
+    Parameters
+    ----------
+    artefacts : StudyArtefacts
+        Of a study that takes a split.
+
+    Returns
+    -------
+    dict
+        One document, named REPORT.
+    """
     return {REPORT: comparison(artefacts.first)}
 
 
@@ -111,7 +122,14 @@ class Additions:
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
-    """The verdict on each test set as lines of plain text, a line a sentence."""
+    """The verdict of the study's first part on each test set as lines of plain text, a line a
+    sentence.
+
+    Returns
+    -------
+    list of str
+        Without Markdown, test set after test set.
+    """
     part = artefacts.first
     return [
         plain_text(sentence)
@@ -130,6 +148,12 @@ def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> 
         The comparison.
     additions : Additions, optional
         What the study adds; without it, the verdict is that of `recommendation_of`.
+
+    Returns
+    -------
+    Document
+        Its first blocks are open on the page, the appendices are folded; tables and figures are
+        named after the test set (`file_of`).
 
     Raises
     ------
@@ -173,6 +197,7 @@ def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> 
 
 
 def _additions(artefacts: PartArtefacts) -> Additions:
+    """Verdict and recommended estimator of each test set, where the study adds nothing itself."""
     recommendations = {name: recommendation_of(artefacts, name) for name in artefacts.split.tests}
     sentences = {name: outcome.describe() for name, outcome in recommendations.items()}
     models = {
@@ -222,6 +247,18 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     at which sideslip is not scored. ``epochs`` is NaN for a method without. ``start`` is
     ``reference`` if the protocol passes the true initial state, else ``own``. Sideslip in deg,
     velocities in m/s.
+
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        A comparison whose models were scored on the validation range too, if they have several
+        seeds.
+
+    Returns
+    -------
+    pd.DataFrame
+        Test sets in the order of the split; candidates without a finite error come last, in the
+        order of the pipeline file.
 
     Raises
     ------
@@ -276,6 +313,9 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
 
 
 def _spread_of(values: FloatArray) -> dict[str, float]:
+    """Median, lowest, highest and sample standard deviation of the finite values; NaN where there
+    are none.
+    """
     finite = values[np.isfinite(values)]
     if not len(finite):
         return dict.fromkeys(_SPREAD, math.nan)
@@ -293,6 +333,9 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 
 
 def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
+    """Name, kind of data and ranges of a test set as a clause; more than three ranges are counted
+    only.
+    """
     spans = artefacts.split.tests[test_set]
     ranges = "; ".join(
         f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}"
@@ -321,7 +364,11 @@ def data_sentence(artefacts: PartArtefacts) -> str:
 
 
 def budget_sentence(artefacts: PartArtefacts) -> str:
-    """Numbers of estimators, seeds and epochs."""
+    """Numbers of estimators, seeds and epochs.
+
+    Epochs are those of trainings that have any: methods that are solved in closed form do not
+    count.
+    """
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = (
@@ -348,7 +395,15 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
 
 
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
-    """How one of several parts was made; its tables are called after it."""
+    """How one of several parts was made; its tables are called after it.
+
+    Parameters
+    ----------
+    name : str
+        Of the part; the table of ranges is ``ranges_NAME``.
+    part : PartArtefacts
+        What was compared.
+    """
     method, ranges = how_it_was_made(part)
     title = f"## Appendix: {as_text(part.title)}, method and ranges"
     return [
@@ -358,7 +413,14 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
 
 
 def data_of_parts(parts: Mapping[str, PartArtefacts]) -> dict[str, pd.DataFrame]:
-    """Ranges, method and notes of all parts, for the CSV files of these names."""
+    """Ranges, method and notes of all parts, for the CSV files of these names.
+
+    Returns
+    -------
+    dict
+        ``ranges``, ``method`` and ``notes``, each with a column ``part`` and a row a range,
+        statement or note.
+    """
     lines = {name: method_lines(part) for name, part in parts.items()}
     notes = {name: warnings_of(part) for name, part in parts.items()}
     ranges = [ranges_of(part).assign(part=name) for name, part in parts.items()]
@@ -370,6 +432,7 @@ def data_of_parts(parts: Mapping[str, PartArtefacts]) -> dict[str, pd.DataFrame]
 
 
 def _text_rows(lines_by_part: Mapping[str, Sequence[str]], column: str) -> pd.DataFrame:
+    """A table of two columns, the part and a line of text, a row a line."""
     rows = [(part, line) for part, lines in lines_by_part.items() for line in lines]
     return pd.DataFrame(rows, columns=["part", column])
 
@@ -385,6 +448,18 @@ def how_it_was_made(
 ) -> tuple[str, Table]:
     """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table
     ``ranges``.
+
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        The comparison.
+    choice : sequence of str
+        Sentences on how seeds or settings were chosen, in Markdown.
+
+    Returns
+    -------
+    tuple
+        The section as Markdown, and the table that follows it.
     """
     ranges = Table(
         "ranges",
@@ -421,7 +496,14 @@ def method_lines(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) ->
 
 
 def ranges_of(artefacts: PartArtefacts) -> pd.DataFrame:
-    """Ranges of training, validation and each test set, a row a range."""
+    """Ranges of training, validation and each test set of the split, a row a range.
+
+    Returns
+    -------
+    pd.DataFrame
+        Role, data set, kind, recording, range in words and seconds, NaN for a range that is open at
+        an end.
+    """
     split = artefacts.split
     roles = {
         "training": split.train,
@@ -485,7 +567,10 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
 
 
 def file_of(test_set: str) -> str:
-    """A test set as the end of the names of its tables and figures."""
+    """A test set as the end of the names of its tables and figures.
+
+    Characters other than lower-case letters, digits, ``_``, ``.`` and ``-`` become ``_``.
+    """
     return re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
 
 
@@ -645,6 +730,9 @@ def _forest(
 def _leaderboard_table(
     artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str
 ) -> list[Block]:
+    """The tables ``NAME``, errors over all seeds with their standing, and ``NAME_seeds``, errors of
+    single seeds; the first links each estimator's chosen model.
+    """
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
     decimals = decimals_for(frame["rmse_sideslip"].tolist())
@@ -740,6 +828,9 @@ def _drawn_rows(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
 def _training(
     artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, Line]
 ) -> list[Block]:
+    """Section ``Training``: learning curves of the drawn estimators' chosen seeds; none where no
+    method has a history of losses.
+    """
     models = {(*model.name, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []

@@ -35,7 +35,20 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as
     the appendix.
 
-    Raises `DataError`.
+    Parameters
+    ----------
+    artefacts : StudyArtefacts
+        A part a fold; a fold that could not be trained is missing and said to be.
+
+    Returns
+    -------
+    dict
+        One document, named REPORT.
+
+    Raises
+    ------
+    DataError
+        No estimator has finite errors in all folds, or a stored file is damaged.
     """
     parts = artefacts.parts
     folds = segments_of_folds(parts)
@@ -88,6 +101,22 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
     """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors
     in every fold.
+
+    Parameters
+    ----------
+    parts : mapping
+        Fold -> its comparison.
+
+    Returns
+    -------
+    dict
+        (estimator, variant) -> seeds in ascending order -> folds in the order of ``parts``. A
+        candidate must have the same seeds in every fold.
+
+    Raises
+    ------
+    DataError
+        No candidate has finite errors in all folds.
     """
     groups = [
         {
@@ -119,6 +148,23 @@ def overview(
 ) -> pd.DataFrame:
     """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands,
     and its error in each fold [deg].
+
+    Parameters
+    ----------
+    ranking : Ranking
+        Over all folds joined.
+    folds : mapping
+        As `segments_of_folds` returns it.
+    titles : mapping
+        (estimator, variant) -> title, as Markdown.
+    parts : sequence of str
+        Names of the folds, which are the names of their columns.
+
+    Returns
+    -------
+    pd.DataFrame
+        The error of a fold is taken over all seeds together; NaN where none of its samples is
+        scored.
     """
     rows = []
     for name in ranking.order:
@@ -144,6 +190,9 @@ def overview(
 def _left_out(
     parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]
 ) -> list[str]:
+    """Sentences on what is missing: models that failed in a fold, and candidates that are not in
+    every fold with finite errors.
+    """
     lines = [
         f"{as_text(part.title)}: {line}"
         for part in parts.values()
@@ -162,6 +211,7 @@ def _left_out(
 
 
 def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
+    """The table ``overview`` of the report, with a column a fold."""
     decimals = decimals_for(board["rmse_sideslip"].tolist())
     columns = {
         "title": Column("estimator"),

@@ -44,6 +44,21 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, figures and next commands.
 
     Then the appendices: what was not compared and the whole comparison.
+
+    Parameters
+    ----------
+    artefacts : StudyArtefacts
+        The first part is the comparison on all recordings; the others make the learning curve.
+
+    Returns
+    -------
+    dict
+        One document, named REPORT.
+
+    Raises
+    ------
+    DataError
+        Metrics are missing or ambiguous, or an estimate does not cover its range.
     """
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
@@ -82,6 +97,12 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     """Which estimator is recommended after a test set (`recommendation_of`), with the error to be
     expected, and what it beats.
+
+    Returns
+    -------
+    Verdict
+        Sentences on the best and the recommended estimator, on how much of the test is scored, and
+        on how much hard driving was recorded.
     """
     recommendation = recommendation_of(part, test_set)
     sentences = recommendation.describe(_reach(part, test_set))
@@ -252,6 +273,16 @@ def not_compared(part: PartArtefacts) -> list[str]:
     """Families that were not compared, each with the channels that its plainest form lacks.
 
     Those that failed or had no time come first.
+
+    Parameters
+    ----------
+    part : PartArtefacts
+        The comparison; channels are those of the first range of training.
+
+    Returns
+    -------
+    list of str
+        ``FAMILY: reason``.
     """
     lines = [f"{name}: {reason}" for name, reason in part.failed.items()]
     compared = {model.estimator for model in part.models} | {

@@ -64,11 +64,24 @@ OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
 )
-MAX_MINUTES_DEVIATION = 0.15  # of the minutes asked for, that ends of a few seconds may take off
+MAX_MINUTES_DEVIATION = (
+    0.15  # of the minutes asked for, by which ends of a few seconds may shorten them
+)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: errors with each amount of reference as one table, and a figure a curve."""
+    """Report: errors with each amount of reference as one table, and a figure a curve.
+
+    Parameters
+    ----------
+    artefacts : StudyArtefacts
+        Parts that differ in ``split.minutes`` and in what trainings start from.
+
+    Returns
+    -------
+    dict
+        One document, named REPORT, with its points as data.
+    """
     parts = list(artefacts.parts.values())
     curves = curves_of(parts)
     points = pd.DataFrame(
@@ -104,7 +117,19 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def overview_table(points: pd.DataFrame) -> Table:
-    """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns."""
+    """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns.
+
+    Parameters
+    ----------
+    points : pd.DataFrame
+        Rows of `rows_of_curve` of all curves, with a column ``curve``.
+
+    Returns
+    -------
+    Table
+        ``overview``: a column for each of COMMON_MINUTES that occurs, and the error with the most
+        minutes [deg].
+    """
     rows = []
     keys = ["curve", "title", "start"]
     amounts: list[float] = sorted(set(points["minutes"]) & set(COMMON_MINUTES))
@@ -131,6 +156,12 @@ def summary_of_curve(points: pd.DataFrame) -> dict[str, object]:
     which starting from another model makes a significant difference.
 
     ``points``: `rows_of_curve`, with a column ``curve``.
+
+    Returns
+    -------
+    dict
+        ``title``; ``ends``, the best at the fewest and the most minutes; ``lower`` and ``higher``,
+        minutes with a significant difference, as text.
     """
     ends = []
     for minutes in (points["minutes"].min(), points["minutes"].max()):
@@ -193,6 +224,21 @@ def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
     """A curve for every test set of parts that share it.
 
     Test sets with a single amount of reference make none.
+
+    Parameters
+    ----------
+    parts : sequence of PartArtefacts
+        Parts with the same name and ranges of a test set make one curve.
+
+    Returns
+    -------
+    list of Curve
+        In the order in which their test sets first occur.
+
+    Raises
+    ------
+    DataError
+        Stored errors by segment are damaged.
     """
     groups: dict[tuple[str, tuple[Span, ...]], list[PartArtefacts]] = {}
     for part in parts:
@@ -203,6 +249,13 @@ def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
 
 
 def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
+    """The curve of parts that share a test set.
+
+    Minutes are those asked for (``split.minutes``, which ends the split's name), or those recorded
+    where these differ by more than MAX_MINUTES_DEVIATION. Seeds and segments of the drive with
+    equal minutes are trainings of one point; an estimator with a single point is left out,
+    baselines aside.
+    """
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
         named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
@@ -278,7 +331,10 @@ def start_in_words(training: Mapping[str, object]) -> str:
 
 
 def minutes_of(part: PartArtefacts) -> float:
-    """Minutes of training and validation ranges together."""
+    """Minutes of training and validation ranges together.
+
+    An end that is open is taken from the recording, which is read for it.
+    """
     seconds = 0.0
     for span in (*part.split.train, *part.split.validation):
         start = span.start
@@ -292,7 +348,9 @@ def minutes_of(part: PartArtefacts) -> float:
 
 
 def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
-    """Sentences, figure and table of a curve; ``name`` ends the files' names."""
+    """Sentences, figure and table of the learning curves on one test set; ``name`` ends the files'
+    names.
+    """
     caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [
         _in_words(curve),
@@ -311,6 +369,12 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
 def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
     """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and
     how it stands to one from scratch.
+
+    Returns
+    -------
+    list of dict
+        Without the zero-sideslip baseline; ``against_scratch`` is ``lower``, ``higher``, not
+        significant, or a dash where there is nothing to compare with.
     """
     rows: list[dict[str, object]] = []
     for point in curve.points:
@@ -330,6 +394,9 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
 
 
 def _against_scratch(curve: Curve, point: Point) -> str:
+    """The verdict against the same estimator trained from scratch on as many minutes; empty where
+    it was not compared.
+    """
     plain = next(
         (candidate for candidate in curve.points if _differ_in_start(candidate, point)), None
     )
@@ -381,6 +448,9 @@ def _in_words(curve: Curve) -> str:
 
 
 def _figure(curve: Curve) -> MatplotlibFigure:
+    """RMSE(β) over the minutes, both logarithmic, a line an estimator and start; lines are shifted
+    by 3 % of a value each, so that their intervals do not cover one another.
+    """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     ranking = curve.ranking
@@ -413,7 +483,13 @@ def _figure(curve: Curve) -> MatplotlibFigure:
             (ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan
         )
         if math.isfinite(nothing):
-            axes.axhline(nothing, color="black", linewidth=0.7, linestyle=(0, (4, 3)))
+            axes.axhline(
+                nothing,
+                color="black",
+                linewidth=0.7,
+                linestyle=(0, (4, 3)),
+                label="zero-sideslip baseline",
+            )
         axes.set_xscale("log")
         axes.set_yscale("log")
         for axis in (axes.xaxis, axes.yaxis):

@@ -106,8 +106,8 @@ class SweepArtefacts:
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was
-    made.
+    """The report of a sweep, titled after the study: what was chosen, all combinations, what
+    failed, heat maps, how it was made.
     """
     part = artefacts.part
     blocks: list[Block] = [
@@ -132,6 +132,11 @@ def interval(values: FloatArray) -> tuple[float, float]:
     """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t
     distribution with n - 1 degrees of freedom.
 
+    Parameters
+    ----------
+    values : FloatArray
+        (n,), one a seed; a single value that is not finite makes both results NaN.
+
     Returns
     -------
     tuple[float, float]
@@ -152,6 +157,11 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
     """A summary as a terminal shows it: headers, and rows of cells.
 
     The chosen combination has a star.
+
+    Returns
+    -------
+    tuple
+        Headers, and rows of as many cells as text.
     """
     names = short_names(artefacts.keys)
     table = artefacts.table
@@ -176,9 +186,18 @@ def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
 
 
 def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
-    """A heat map for each set, where two numeric keys vary and any others are booleans.
+    """A heat map for each set, where two numeric keys vary and any others are booleans; else none.
 
-    Else none.
+    Parameters
+    ----------
+    artefacts : SweepArtefacts
+        Keys with a single value do not count.
+
+    Returns
+    -------
+    list of Figure
+        ``heat_map_SET``: the first key across, the second up, a panel for each setting of the
+        booleans.
     """
     table = artefacts.table
     varied = [key for key in artefacts.keys if table[key].nunique() > 1]
@@ -261,6 +280,17 @@ def heat_map(
     """Panels, (R, C) each, on one scale of colours, the darker the larger.
 
     Logarithmic where the largest value is 20 times the smallest.
+
+    Parameters
+    ----------
+    panels : sequence of Panel
+        Title, means, half intervals and framed cells of each.
+    columns, rows : sequence of str
+        Labels of the C columns and R rows, the first row at the bottom.
+    column_label, row_label : str
+        Labels of the axes.
+    quantity : str
+        Label of the colour bar, with its unit.
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
@@ -304,6 +334,9 @@ def heat_map(
 
 
 def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
+    """One panel: coloured cells with mean and half interval as text, white on dark colours, and
+    frames.
+    """
     from matplotlib.patches import Rectangle
 
     _, means, halves, marked = panel
@@ -351,6 +384,9 @@ def _kinds(artefacts: SweepArtefacts, name: str) -> str:
 
 
 def _chosen_sentence(artefacts: SweepArtefacts) -> str:
+    """Which combination was chosen on validation, with its errors and how many others lie within
+    its interval; or why none was chosen.
+    """
     if any(key.split(".")[0] == "fault" for key in artefacts.keys):
         return (
             "No combination is chosen: the combinations differ in faults, which are conditions "
@@ -390,6 +426,7 @@ def _set_in_words(name: str) -> str:
 
 
 def _with_interval(row: pd.Series, name: str) -> str:
+    """Mean and half interval of RMSE(β) of a combination on a set, with the degree sign."""
     mean = float(row[f"{METRIC}.{name}"])
     half = float(row[f"{METRIC}_half.{name}"])
     return mean_and_half(mean, half, decimals_for([mean])) + "°"
@@ -405,6 +442,7 @@ def mean_and_half(mean: float, half: float, decimals: int) -> str:
 
 
 def _budget(jobs: pd.DataFrame) -> str:
+    """Numbers of combinations, seeds and jobs, and the range of epochs, as a sentence."""
     done = jobs[jobs["status"] == DONE]
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
@@ -433,6 +471,7 @@ INTERVAL_AND_CHOICE = (
 
 
 def _table(artefacts: SweepArtefacts) -> Table:
+    """The table ``combinations`` of the report."""
     names = short_names(artefacts.keys)
     table = artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}

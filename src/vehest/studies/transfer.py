@@ -69,6 +69,16 @@ ERRORS_CAPTION = (
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Report: answer, errors as a figure, a summary by estimator and the errors of every test.
 
+    Parameters
+    ----------
+    artefacts : StudyArtefacts
+        A part is a vehicle or a test of its own.
+
+    Returns
+    -------
+    dict
+        One document, named REPORT, with leaderboards of the parts as data.
+
     Raises
     ------
     DataError
@@ -230,6 +240,20 @@ def standings(
 ) -> pd.DataFrame:
     """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its
     interval [deg], and what it beats.
+
+    Parameters
+    ----------
+    parts : mapping
+        Part -> its comparison.
+    rankings : mapping
+        (part, test set) -> ranking of its candidates.
+
+    Returns
+    -------
+    pd.DataFrame
+        A candidate without a finite error has NaN there. ``rmse_sideslip_best_lever`` [deg] and
+        ``lever_arm`` [m] are those of the lever arm that fits each model best, where the point of
+        the reference is not known.
     """
     no_rank: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
     no_rank |= dict.fromkeys(
@@ -283,11 +307,15 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
 
 
 def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
+    """A test as a row's name: title of the part, and the test set where it has several."""
     several = board[board["part"] == row["part"]]["test_set"].nunique() > 1
     return f"{row['title']}, {row['test_set']}" if several else str(row["title"])
 
 
 def _cell(row: Mapping[Any, Any]) -> str:
+    """An error [deg] as a cell, with a star where it is significantly better than both
+    baselines.
+    """
     error = row["rmse_sideslip"]
     if not math.isfinite(error):
         return MISSING
@@ -339,10 +367,16 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
                         solid_capstyle="butt",
                     )
                 axes.plot(value, height, marker="o", color=colour, markersize=3.0)
-            axes.axvline(1.0, color="black", linewidth=0.7)
+            axes.axvline(1.0, color="black", linewidth=0.7, label="zero-sideslip baseline")
             static = _first(rows_of_test, "static_map") / zero
             if math.isfinite(static):
-                axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
+                axes.axvline(
+                    static,
+                    color="#999999",
+                    linewidth=0.7,
+                    linestyle=(0, (3, 2)),
+                    label="static map",
+                )
             title = str(rows_of_test["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
             lines_of_title = [
@@ -358,10 +392,17 @@ def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
             axes.set_yticks(range(len(names)), [name[2] for name in names])
             axes.set_ylim(len(names) - 0.5, -0.5)
         figure.supxlabel("RMSE(β) over that of the zero-sideslip baseline", fontsize=7.5)
+        figure.legend(
+            *grid[0, 0].get_legend_handles_labels(),
+            loc="outside upper right",
+            ncols=2,
+            fontsize=6.5,
+        )
     return figure
 
 
 def _first(rows_of_test: pd.DataFrame, estimator: str) -> float:
+    """RMSE(β) [deg] of the first row of an estimator; NaN where there is none."""
     errors = rows_of_test[rows_of_test.index.get_level_values("estimator") == estimator][
         "rmse_sideslip"
     ]

@@ -45,13 +45,22 @@ class Adam:
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Set the gradient of every parameter to None, so that `step` skips those that receive
+        none.
+        """
         for parameter in self.parameters:
             parameter.grad = None
 
     @torch.no_grad()
     def step(self) -> None:
-        """Step all parameters that have a gradient."""
+        """Step all parameters that have a gradient.
+
+            m = β₁ m + (1 - β₁) g,   v = β₂ v + (1 - β₂) g²
+            θ = (1 - η λ) θ - η (m/(1 - β₁ᵗ))/(√(v/(1 - β₂ᵗ)) + ε)
+
+        with the step size η, the weight decay λ, β₁ = 0.9, β₂ = 0.999, ε = 1e-8, and the number t
+        of steps that the parameter has had. Moments begin at 0 with a parameter's first step.
+        """
         learning = [parameter for parameter in self.parameters if parameter.grad is not None]
         for parameter in learning:
             if not self.state[parameter]:

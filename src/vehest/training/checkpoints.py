@@ -1,4 +1,9 @@
-"""State of one member's unfinished training, from which a killed run reaches the same result."""
+"""State of one member's unfinished training, from which a killed run reaches the same result.
+
+A checkpoint is one safetensors file in a folder of the member: tensors, and in its metadata the
+plain values as JSON with a SHA-256 of both. `save_checkpoint` replaces it by one rename;
+`load_checkpoint` takes a damaged file or one of another layout for none, and training starts anew.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +33,20 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint in ``folder`` in one step. Raises `MissingError`: it cannot be
-    written.
+    """Replace the checkpoint in a folder in one step.
+
+    Parameters
+    ----------
+    folder : Path
+        Of one member.
+    checkpoint : Checkpoint
+        Its values must be JSON; a valid checkpoint has an integer ``epoch`` and perhaps
+        ``finished``.
+
+    Raises
+    ------
+    MissingError
+        It cannot be written.
     """
     with written_aside(folder / _FILE) as aside:
         tensors = {

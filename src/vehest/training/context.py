@@ -53,7 +53,19 @@ def record_of_epochs(
     interrupted: bool,
     **columns: Sequence[float],
 ) -> FitRecord:
-    """The record of a fit with one row an epoch: ``columns``, then epoch and losses."""
+    """The record of a fit with one row an epoch: ``columns``, then epoch and losses.
+
+    Parameters
+    ----------
+    train_loss, validation_loss : Sequence[float]
+        One value an epoch.
+    metrics : Mapping[str, float]
+        Further figures; ``epochs`` is added.
+    interrupted : bool
+        Whether the fit was stopped before it was over.
+    **columns : Sequence[float]
+        Further columns of the history, of the same length.
+    """
     epochs = len(train_loss)
     history = {
         **columns,

@@ -37,13 +37,16 @@ MAX_WINDOWS_TOGETHER = 1024
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
-    """Series (T, C) as a network consumes it."""
+    """Series (T, C) as a network consumes it: by its ``prepared``, otherwise unchanged."""
     hook = getattr(network, "prepared", None)
     return series if hook is None else hook(series)
 
 
 def constrain(network: nn.Module, parameters: Mapping[str, Tensor]) -> None:
-    """Bring parameters of shape (M, ...) back into their admissible range, in place."""
+    """Bring parameters of shape (M, ...) back into their admissible range, in place.
+
+    Nothing is done for a network without ``constrain``.
+    """
     hook = getattr(network, "constrain", None)
     if hook is not None:
         hook(parameters)
@@ -56,14 +59,26 @@ def is_plain(network: nn.Module) -> bool:
 
 @contextmanager
 def random_numbers(seed: int) -> Iterator[None]:
-    """Let torch draw from this seed on the CPU; restores its random state afterwards."""
+    """Let torch draw from this seed on the CPU; restores its random state afterwards.
+
+    Parameters
+    ----------
+    seed : int
+        Of torch's default generator on the CPU, within the context.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         yield
 
 
 def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
-    """Buffers and parameters that no gradient is wanted of, by name, (M, ...)."""
+    """Buffers and parameters that are not trained, by name, (M, ...).
+
+    Parameters
+    ----------
+    modules : Sequence[nn.Module]
+        M modules with equal names and shapes.
+    """
     frozen = [
         {name: p.detach() for name, p in module.named_parameters() if not p.requires_grad}
         for module in modules
@@ -76,7 +91,20 @@ def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
 
 
 class FlatParameters:
-    """Where each parameter of a module that is trained sits in a row of a (members, K) matrix."""
+    """Layout of the trained parameters of a module as a row of K numbers.
+
+    Parameters
+    ----------
+    module : nn.Module
+        Whose parameters that require a gradient are laid out, in the order of ``named_parameters``.
+
+    Attributes
+    ----------
+    shapes : dict[str, torch.Size]
+        Shape of each parameter by name.
+    size : int
+        K, numbers in a row.
+    """
 
     def __init__(self, module: nn.Module) -> None:
         self.shapes = {name: parameter.shape for name, parameter in _trained(module)}
@@ -106,6 +134,7 @@ class FlatParameters:
 
 
 def _trained(module: nn.Module) -> list[tuple[str, nn.Parameter]]:
+    """Parameters of a module that require a gradient, with their names, in its order."""
     return [
         (name, parameter)
         for name, parameter in module.named_parameters()
@@ -182,6 +211,7 @@ def _plain(
     """Predictions of M members by PyTorch alone, windows (M, B, N, C) -> (M, B)."""
 
     def predict(member_parameters: Mapping[str, Tensor], batch: Tensor) -> Tensor:
+        """Predictions (B,) of one member on its windows (B, N, C); raises `ConfigurationError`."""
         predicted = torch.func.functional_call(network, dict(member_parameters), (batch,))
         if predicted.shape not in (batch.shape[:1], (*batch.shape[:1], 1)):
             raise ConfigurationError(

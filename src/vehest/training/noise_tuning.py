@@ -59,6 +59,21 @@ class NoiseTuningSettings(Group):
     ) -> SearchRecord:
         """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see
         `vehest.training.search`.
+
+        Parameters
+        ----------
+        cost : Cost
+            Of parameters (K,).
+        boxes : Box
+            Admissible range of each parameter.
+        starts : Box
+            Range over which the starts of Nelder-Mead are spread; Optuna does not use it.
+        seed : int
+            Of Optuna's sampler.
+        context : FitContext
+            Progress and the wish to stop.
+        trials : int | None, default None
+            Evaluations of Optuna instead of ``self.trials``.
         """
         if self.method == "optuna":
             staged = {
@@ -120,6 +135,7 @@ class IdentificationSettings(NoiseTuningSettings):
     )
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for more stages than trials."""
         super().__post_init__()
         if self.stages > self.trials:
             raise ConfigurationError(

@@ -24,6 +24,11 @@ def robust_squares(errors: Tensor, limit: float) -> Tensor:
     limit : float
         c, in the same unit; 0: plain squares.
 
+    Returns
+    -------
+    Tensor
+        ρ(e) in the shape of the errors and the square of their unit; NaN stays NaN.
+
     Source: Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35
     (1), 1964.
     """
@@ -35,7 +40,7 @@ def robust_squares(errors: Tensor, limit: float) -> Tensor:
 
 
 def robust_squares_of_array(errors: FloatArray, limit: float) -> FloatArray:
-    """`robust_squares` of an array."""
+    """`robust_squares` of an array, without gradients."""
     if not limit:
         return np.square(errors)
     size = np.abs(errors)
@@ -46,7 +51,19 @@ def robust_squares_of_array(errors: FloatArray, limit: float) -> FloatArray:
 def robust_criterion(
     limit: float,
 ) -> Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]:
-    """Mean of `robust_squares` as a `Criterion` of one output; ``limit`` in the network's units."""
+    """Mean of `robust_squares` as a `Criterion` of a network with one output.
+
+    Parameters
+    ----------
+    limit : float
+        c, in the units of the network's output.
+
+    Returns
+    -------
+    Callable
+        Function of outputs (N, 1), targets (N,) and a gradient (N, 1), which it writes:
+        ∂/∂o_n = 2/N · clip(o_n - t_n, -c, c). It returns the mean over the samples.
+    """
 
     def criterion(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
         errors = outputs[:, 0] - targets

@@ -16,7 +16,7 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):
-    """What is learnt from, as a network sees it."""
+    """Training data, as a network receives it."""
 
     inputs: Tensor  # (N, C)
     targets: Tensor  # (N,)
@@ -63,6 +63,9 @@ def sample_phase(
 ) -> Phase:
     """Members learn from all samples, each in an order of its own; what is judged is their mean.
 
+    An epoch draws one permutation of the samples for each member; the last batch may be smaller.
+    The losses of members are added, so that each member's gradient is that of its own loss.
+
     Parameters
     ----------
     name : str
@@ -72,7 +75,7 @@ def sample_phase(
     settings : PhaseSettings
         Step size, epochs, patience.
     batch_size : int
-        Samples that a member sees at a time.
+        Samples of a member's batch.
     n_samples : int
         How many there are.
     members : int
@@ -81,9 +84,17 @@ def sample_phase(
         Of a batch, one a member, (M,).
     judge : Callable[[], Tensor]
         On validation samples, (M,).
+
+    Returns
+    -------
+    Phase
+        For `vehest.training.sequences.train_phases`.
     """
 
     def batches(generator: torch.Generator) -> Iterator[Draw]:
+        """All samples once, in an order of its own for each member, with a seed of dropout a
+        batch.
+        """
         order = torch.stack(
             [torch.randperm(n_samples, generator=generator) for _ in range(members)]
         )

@@ -1,5 +1,8 @@
 """Search inside a box for the parameters with the smallest cost: Nelder-Mead from a grid of starts,
 Optuna at once or in stages.
+
+Flow: ranges of the parameters -> starts or Optuna's proposals -> cost of each -> `SearchRecord`.
+Costs that are not finite become `UNUSABLE_COST`, so that a search goes on elsewhere.
 """
 
 from __future__ import annotations
@@ -59,6 +62,10 @@ def nelder_mead_over_grid(
     """Minimise a cost that need not be smooth nor finite, keeping the best of several local
     searches.
 
+    Parameters are divided by the width of their range, so that tolerances are relative to it. Each
+    search begins with a simplex of 5 % of the box (`_simplex`). A stop counts between two starts,
+    but not before the first one is over.
+
     Parameters
     ----------
     cost : Cost
@@ -72,6 +79,11 @@ def nelder_mead_over_grid(
         Grid and limits.
     context : FitContext
         Progress and the wish to stop.
+
+    Returns
+    -------
+    SearchRecord
+        With one row for each start.
 
     Raises
     ------
@@ -114,6 +126,9 @@ def finite_cost(cost: float) -> float:
 
 
 def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> SearchRecord:
+    """Record of a search from rows of start, result (K each) and cost; raises `DataError` where no
+    cost is usable.
+    """
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
     if best[-1] >= UNUSABLE_COST:
@@ -149,6 +164,10 @@ def optuna_search(
     """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps
     in smaller ones around the best so far.
 
+    Each stage is a study of its own with the seed ``seed`` plus its number. The box of a later
+    stage is ``shrink`` times as wide as the one before, centred at the best so far and moved inside
+    the bounds.
+
     Parameters
     ----------
     cost : Cost
@@ -165,6 +184,11 @@ def optuna_search(
         How many there are.
     shrink : float, default 0.3
         Width of the box of a stage, relative to that of the stage before.
+
+    Returns
+    -------
+    SearchRecord
+        With one row for each evaluation, in which the start is the point itself.
 
     Raises
     ------

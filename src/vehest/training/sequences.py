@@ -446,10 +446,14 @@ class _Run:
         return Checkpoint(tensors, values)
 
     def _save_now_and_then(self, in_any_case: bool = False) -> None:
+        """Store a checkpoint if the last one is older than ``checkpoint_seconds``, or in any
+        case.
+        """
         if in_any_case or time.monotonic() - self.saved > self.checkpoint_seconds:
             self._save(self._checkpoint())
 
     def _save(self, checkpoint: Checkpoint) -> None:
+        """Store a checkpoint in the folder of this member and in those of its twins."""
         self.saved = time.monotonic()
         for folder in self.folders:
             save_checkpoint(folder, checkpoint)
@@ -487,10 +491,25 @@ def _is_of(checkpoint: Checkpoint, phases: Sequence[Phase], state: Mapping[str, 
 
 
 def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator) -> Tensor:
-    """First rows of as many sequences of ``steps`` samples as fit into each of drives that lie one
-    after another, in random order.
+    """First rows of training sequences, drawn anew for each epoch.
 
-    Those of a drive follow one another from an offset that is drawn.
+    As many sequences of ``steps`` samples as fit into a drive follow one another without overlap,
+    from an offset that is drawn; the sequences of all drives are then shuffled.
+
+    Parameters
+    ----------
+    lengths : Sequence[int]
+        Samples of each drive; drives lie one after another in one series. A drive that is shorter
+        than a sequence is left out.
+    steps : int
+        Samples of a sequence.
+    generator : torch.Generator
+        Source of the offsets and of the order.
+
+    Returns
+    -------
+    Tensor
+        Rows of the series, int64, (number of sequences,).
     """
     firsts: list[int] = []
     offset = 0
@@ -516,6 +535,7 @@ def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:
 
 
 def _copies(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Copies of tensors without their gradients."""
     return {name: value.detach().clone() for name, value in tensors.items()}
 
 
@@ -536,8 +556,10 @@ def _tensors_below(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
 
 
 def _stream(seed: int, position: int) -> int:
-    """A stream for the batches of a phase that has nothing to do with the one the initial weights
-    were drawn from.
+    """Seed of the batches of a phase.
+
+    It is derived from the training's seed by ``SeedSequence``, so that it is independent of the
+    stream from which the initial weights were drawn and of those of other phases.
     """
     return int(
         np.random.SeedSequence([seed, 1, position]).generate_state(1, np.uint64)[0] >> np.uint64(1)

@@ -224,7 +224,24 @@ class _Batch:
     def predict(
         self, weights: Tensor, data: _Prepared, starts: Tensor, seeds: Sequence[int] = ()
     ) -> Tensor:
-        """Predictions (M, B) of all members, weights (M, K), on windows from ``starts`` (M, B)."""
+        """Predictions of all members on their own windows.
+
+        Parameters
+        ----------
+        weights : Tensor
+            (M, K); the current weights or their average.
+        data : _Prepared
+            Prepared series.
+        starts : Tensor
+            First rows of windows, (M, B).
+        seeds : Sequence[int], default ()
+            Of random layers, one a member.
+
+        Returns
+        -------
+        Tensor
+            (M, B) [m/s].
+        """
         return predict_members(
             self.network,
             {**self.layout.views(weights), **self.fixed},
@@ -236,7 +253,24 @@ class _Batch:
         )
 
     def step(self, data: _Prepared, windows: Tensor) -> Tensor:
-        """One step of Adam on windows (M, B); returns sums of squared errors, (M,)."""
+        """One step of Adam on one batch.
+
+        The loss of a member is its mean squared error; losses are added over members, so that each
+        row of the gradient is that of one member. Parameters are constrained afterwards, then
+        averaged.
+
+        Parameters
+        ----------
+        data : _Prepared
+            Training windows.
+        windows : Tensor
+            Indices of windows, (M, B).
+
+        Returns
+        -------
+        Tensor
+            Sum of squared errors of each member before the step, (M,), float64 [m²/s²].
+        """
         self.adam.zero_grad()
         prediction = self.predict(self.weights, data, data.starts[windows], self._dropout_seeds())
         losses = (prediction - data.targets[windows]).square().mean(dim=1)
@@ -249,7 +283,11 @@ class _Batch:
         return losses.detach().double() * windows.shape[1]
 
     def descend(self, data: _Prepared, windows: Tensor) -> Tensor:
-        """Steps on several batches by compiled code; arguments and result as those of `step`."""
+        """Steps on several batches by compiled code; arguments and result are those of `step`.
+
+        Bounds of parameters are found by constraining rows of -∞ and ∞ once. Adam's moments and the
+        average are changed in place.
+        """
         settings = self.settings
         weights = self.weights.detach()
         state = self.adam.state[self.weights]
@@ -310,6 +348,7 @@ class _Run:
     context: FitContext
 
     def __post_init__(self) -> None:
+        """Prepare both window sets, and activate all members with the networks' present weights."""
         self.network = self.networks[0]
         self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
         self.train = _Prepared(self.network, self.train_windows, self.settings)
@@ -466,6 +505,7 @@ class _Run:
         return checkpoints
 
     def _save(self, checkpoints: Sequence[Checkpoint]) -> None:
+        """Store one checkpoint for each member that has a folder."""
         self.saved = time.monotonic()
         for folder, checkpoint in zip(self.context.checkpoint_folders, checkpoints, strict=False):
             save_checkpoint(folder, checkpoint)
@@ -473,6 +513,9 @@ class _Run:
     def resume(self) -> None:
         """Go on from the members' checkpoints, if all have one and those that are not finished
         agree in the epoch.
+
+        Members that never diverged continue as one batch; each that did continues alone later.
+        Otherwise all start anew.
         """
         loaded = [load_checkpoint(folder) for folder in self.context.checkpoint_folders]
         checkpoints = [checkpoint for checkpoint in loaded if checkpoint is not None]
@@ -506,7 +549,11 @@ class _Run:
                 self.diverged[member] = _stacked([states[member]])
 
     def finish(self) -> list[FitRecord]:
-        """Copy the best weights into the networks."""
+        """Copy the best weights into the networks, set these to evaluation mode, and return the
+        records.
+
+        A member counts as interrupted only if the training was stopped before that member was over.
+        """
         seconds = (time.monotonic() - self.started) / len(self.networks)
         unfinished = {*self.active, *self.diverged} if self.interrupted else set()
         layout = FlatParameters(self.network)
@@ -524,7 +571,28 @@ def _stacked(states: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 class _Prepared:
-    """A window set as tensors, scaled once."""
+    """A window set as tensors, scaled once.
+
+    Parameters
+    ----------
+    network : nn.Module
+        Whose ``prepared`` the series passes.
+    windows : WindowSet
+        Series (T, C), first rows of windows, and targets [m/s].
+    settings : SupervisedSettings
+        Of which the precision is used.
+
+    Attributes
+    ----------
+    series : Tensor
+        (T, C), contiguous.
+    targets : Tensor
+        Lateral velocity of each window (W,) [m/s].
+    starts : Tensor
+        First row of each window (W,), int64.
+    n_window : int
+        Samples in a window.
+    """
 
     def __init__(
         self, network: nn.Module, windows: WindowSet, settings: SupervisedSettings
@@ -543,7 +611,7 @@ class _Prepared:
 
 
 def _shuffle_seed(seed: int) -> int:
-    """A stream for shuffling that has nothing to do with the one the initial weights were drawn
-    from.
+    """Seed of the order of windows, independent of the stream from which initial weights were
+    drawn.
     """
     return int(np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0] >> np.uint64(1))

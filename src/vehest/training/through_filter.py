@@ -105,6 +105,7 @@ class ThroughFilterSettings(Group):
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for sequences of which nothing would count."""
         super().__post_init__()
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
             raise ConfigurationError(
@@ -139,12 +140,30 @@ def one_step_phase(
     """Phase that trains the model as a predictor of the next sample, without the filter.
 
     Loss: mean over pairs of samples of Σ_i w_i (f(x, u)_i - x⁺_i)², with w = ``weights.one_step``.
+
+    Each pair is mirrored with the probability ``settings.mirrored``: signs of states and inputs
+    that change under a reflection at the car's longitudinal plane are those of
+    ``filtering.mirror``.
+
+    Parameters
+    ----------
+    filtering : Any
+        Module with ``moved(states (N, n), inputs (N, p)) -> (N, n)`` and ``mirror``.
+    train, validation : Sequence[Drive]
+        True states (T, n) and inputs (T, p); pairs are of consecutive samples within a drive.
+    weights : Weights
+        Of which those of the one-step prediction count.
+    settings : ThroughFilterSettings
+        Batch size, share of mirrored pairs, and settings of the phase.
+    trainable : Callable[[str], bool]
+        Which parameters of ``filtering`` learn, by name.
     """
     before, inputs, after = _pairs(train)
     judged = _pairs(validation)
     signs = [before.new_tensor(list(filtering.mirror[part])) for part in (0, 1)]
 
     def batches(generator: torch.Generator) -> Iterable[tuple[Tensor, Tensor]]:
+        """Rows of all pairs in random order, and which of them are mirrored."""
         for rows in torch.randperm(len(before), generator=generator).split(settings.one_step_batch):
             yield rows, _chosen(len(rows), settings.mirrored, generator)
 
@@ -180,6 +199,32 @@ def filter_phases(
     Loss of a batch: mean over its samples of Σ_i w_i (x̂_i - x_i)², with w = ``weights.training``,
     plus ``settings.likelihood`` times `gaussian_surprise`.
 
+    A sequence starts at its true state with the initial covariance of ``filtering``; the last state
+    may be off by up to ``settings.start_spread``. Validation uses fixed sequences of
+    ``settings.validation_steps`` from true states, of which the first ones do not count.
+
+    Parameters
+    ----------
+    filtering : Any
+        See the module.
+    train, validation : Sequence[Drive]
+        Drives of any length.
+    weights : Weights
+        Of the squared errors of states.
+    settings : ThroughFilterSettings
+        Sequences, curriculum, mirroring, likelihood.
+    phase_settings : PhaseSettings
+        Of each phase; epochs of the curriculum's phases are ``settings.curriculum_epochs``.
+    trainable : Callable[[str], bool]
+        Which parameters learn, by name.
+    name : str
+        Of the last phase; those of the curriculum append their length.
+
+    Returns
+    -------
+    list[Phase]
+        The first may start noise from the residuals of the model before its first validation.
+
     Raises
     ------
     DataError
@@ -189,6 +234,7 @@ def filter_phases(
     judged_by = torch.nonzero(weights.validation).flatten()
 
     def judge() -> float:
+        """Weighted mean squared error of estimates on validation sequences, as in use."""
         estimated = filtering.estimate_for_validation(judged)
         error = (estimated - judged.states)[:, settings.validation_drop_steps :]
         return float(_weighted(error, weights.validation))
@@ -198,9 +244,11 @@ def filter_phases(
             filtering.begin_noise(train, settings.start_spread)
 
     def phase(steps: int, epochs: int, label: str, first: bool) -> Phase:
+        """Phase of sequences of ``steps`` samples for ``epochs`` epochs."""
         fixed = sequences_of(train, steps)
 
         def batches(generator: torch.Generator) -> Iterable[tuple[Drive, Tensor]]:
+            """Mirrored sequences (B, T, ...) with the states that they start from, (B, n)."""
             drives = fixed if settings.placing == "fixed" else placed(train, steps, generator)
             order = torch.randperm(len(drives.states), generator=generator)
             for rows in order.split(settings.batch_size):
@@ -221,6 +269,9 @@ def filter_phases(
                 yield batch, start
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
+            """Weighted squared errors through the filter, plus the likelihood where it has a
+            weight.
+            """
             drives, start = batch
             truncated = settings.truncate_steps or None
             scored = slice(settings.drop_steps, None)
@@ -257,6 +308,11 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
     """Drives cut from their start into sequences of so many steps, without overlap; a remainder is
     left out.
 
+    Returns
+    -------
+    Drive
+        Of sequences (B, steps, ...), in the order of the drives.
+
     Raises
     ------
     DataError
@@ -271,7 +327,10 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
 
 
 def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> Drive:
-    """As many sequences of each drive as fit into it, each at a random place."""
+    """As many sequences of each drive as fit into it, each at a random place.
+
+    They may overlap. Raises `DataError` where no drive is long enough.
+    """
     starts = []
     for drive in drives:
         count = len(drive.states) // steps
@@ -281,6 +340,7 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
 
 
 def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
+    """Cut sequences from (drive, first row) pairs and stack them: (B, steps, ...)."""
     if not starts:
         raise DataError(
             f"no drive is {steps} samples long, as a sequence for training through a filter is; "
@@ -306,10 +366,22 @@ def _pairs(drives: Sequence[Drive]) -> list[Tensor]:
 
 
 def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
-    """Mean negative log-likelihood of errors, (..., k), under normal distributions of these
-    covariances, (..., k, k) [nat], scalar.
+    """Mean negative log-likelihood of errors under normal distributions.
 
     ½ (eᵀ P⁻¹ e + ln det P + k ln 2π), by the Cholesky factor of P.
+
+    Parameters
+    ----------
+    error : Tensor
+        e, (..., k).
+    covariance : Tensor
+        P, (..., k, k); where it is not positive definite the result is not finite or meaningless,
+        and nothing is raised.
+
+    Returns
+    -------
+    Tensor
+        Scalar [nat].
     """
     factor = torch.linalg.cholesky_ex(covariance).L
     whitened = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
@@ -322,4 +394,5 @@ def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _weighted(error: Tensor, weights: Tensor) -> Tensor:
+    """Mean of the weighted squared error, Σ_i w_i e_i², of errors (..., n) and weights (n,)."""
     return (error.square() @ weights).mean()

@@ -57,9 +57,29 @@ class Autoregression:
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows of unbroken stretches, (T, C) each.
+    """Fit orders 1 to ``max_order`` to the same rows of unbroken segments, (T, C) each.
 
     Keep that of least BIC; raises `DataError`.
+
+    Two passes find outliers: rows whose residual exceeds `OUTLIER` robust standard deviations in
+    any channel are left out, unless they are 2 % or more. Channels are standardised first.
+
+    Parameters
+    ----------
+    pieces : sequence of array
+        (T, C) each; rows with a NaN among them or their regressors are left out.
+    max_order : int
+        Largest p.
+
+    Returns
+    -------
+    Autoregression
+        In the channels' units.
+
+    Raises
+    ------
+    DataError
+        There are fewer than `ROWS_A_NUMBER` rows for each coefficient of a channel.
     """
     n_channels = pieces[0].shape[1]
     regressors, targets = _rows(pieces, max_order)
@@ -126,7 +146,10 @@ def _rows(pieces: Sequence[FloatArray], order: int) -> tuple[FloatArray, FloatAr
 
 
 def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) -> FloatArray:
-    """Constant and coefficients of the first ``columns`` regressors, (1 + columns, C)."""
+    """Constant and coefficients of the first ``columns`` regressors, (1 + columns, C).
+
+    Normal equations with a ridge of 1e-10, so that channels that depend on each other do not fail.
+    """
     design = np.concatenate([np.ones((len(regressors), 1)), regressors[:, :columns]], axis=1)
     gram = design.T @ design
     # where one channel is another's multiple
@@ -139,12 +162,23 @@ def learn_noise_levels(
 ) -> tuple[FloatArray, FloatArray]:
     """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
 
+    Parameters
+    ----------
+    innovations : array
+        (T, C); rows that are not finite are left out.
+    covariance : array
+        Of all innovations, (C, C), of which the diagonal counts.
+    speed : array
+        (T,), of which the size counts.
+    n_levels : int
+        L.
+
     Returns
     -------
     tuple
         Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
-        samples; and root mean squares there, (L, C), outliers cut off, between which straight
-        lines hold.
+        samples; and root mean squares there, (L, C), outliers cut off, within `LEVELS`; they
+        are interpolated linearly between the speeds.
     """
     is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
     scaled = innovations[is_finite] / np.sqrt(np.diag(covariance))

@@ -15,6 +15,9 @@ The rule of w was fixed before any of its effects was looked at: with m the 99.9
 in training, w is the largest of 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre
 other than those calibrated on.
 
+Order of sums in `band_rows`: over `TERMS` in order. A row needs no other one, so that online and
+batch agree to the bit.
+
 Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical
 models, JASA 118 (544), 2023 (pooling CDFs); Lee, Barber & Willett, Distribution-free inference with
 hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et al., Distribution-free
@@ -79,9 +82,10 @@ class Quantity:
     factors: tuple[float, ...]  # q of each level
     # of each level, whether there are too few blocks for it (`pooled_quantile`)
     beyond: tuple[bool, ...]
-    effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
+    effective_blocks: float  # Kish's effective number of blocks, by the squared scores
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for terms, factors or floors that no calibration leaves."""
         _check_terms("weights", self.weights, 0.0)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
             raise DataError(
@@ -93,7 +97,11 @@ class Quantity:
         check_number("effective_blocks", self.effective_blocks, 0.0)
 
     def beside(self, level: float) -> FloatArray:
-        """Half widths of all `LEVELS` over that of one, (L,)."""
+        """Half widths of all `LEVELS` over that of one, (L,).
+
+        They are ones where the factor of that level is 0. Raises `ValueError`: the level is none of
+        `LEVELS`.
+        """
         factors = np.array(self.factors)
         level_factor = factors[LEVELS.index(level)]
         return factors / level_factor if level_factor > 0 else np.ones_like(factors)
@@ -121,6 +129,7 @@ class Bands:
     tyre_check: TyreCheck | None = None  # of the estimator's tyre model; None: it has none
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for unknown channels or numbers out of range."""
         check_channels("bands.channels", self.channels)
         _check_terms("largest", self.largest, MIN_TERM)
         check_number("bands.n_blocks", self.n_blocks, 0)
@@ -151,6 +160,9 @@ class Bands:
         """Arguments of `band_rows` for `CHANNEL_LEVEL`.
 
         ``elsewhere``: the car or its tyres are others than those calibrated on.
+
+        The factor 2 of another vehicle multiplies both factors of the level; floors and weights
+        stay.
         """
         level_place = LEVELS.index(CHANNEL_LEVEL)
         wider = OTHER_VEHICLE if elsewhere else 1.0
@@ -182,6 +194,17 @@ class Bands:
         """Half widths at `CHANNEL_LEVEL`, (T, 2): v [m/s] and β [rad].
 
         NaN where there is no estimate. Arguments as of `band_rows`; no ``tyre_error``: 0.
+
+        Parameters
+        ----------
+        rows : array
+            Inputs of the model, (T, C), in the order of ``channels``.
+        vy, variance : array
+            Estimate [m/s] and variance of its error [m²/s²], (T,).
+        tyre_error : array or None
+            Mean squared errors of the tyre check, (T,) [m²/s²].
+        elsewhere : bool
+            Whether the car or its tyres are others than those calibrated on.
         """
         bands = np.empty((len(vy), 2))
         added = np.zeros(len(vy)) if tyre_error is None else tyre_error
@@ -190,6 +213,9 @@ class Bands:
 
 
 def _check_terms(name_of_terms: str, numbers: Mapping[str, float], smallest: float) -> None:
+    """Raise `DataError` unless all terms are known and their numbers 0 or within ``smallest``
+    and `MAX_TERM`.
+    """
     if not numbers.keys() <= set(TERMS):
         raise DataError(f"{name_of_terms} must be numbers from 0 on, of: {', '.join(TERMS)}")
     for name, number in numbers.items():
@@ -211,13 +237,29 @@ class PackedBands(NamedTuple):
 def band_rows(  # type: ignore[no-untyped-def]
     rows, vy, variance, tyre_error, columns, numbers, bands
 ):
-    """Write ``bands`` of one level, (T, 2), v [m/s] and β [rad].
+    """Write the half widths of one level.
 
-    Inputs are ``rows`` (T, C), estimates [m/s] and their variances [m²/s²] or NaN, and the mean
-    squared errors of the tyre check [m²/s²], 0 without one.
+        half width of v = q_v w √max(Σ_j c_j f_j² + b_v x, floor_v²)
+        half width of β = min(q_β w √max((Σ_j d_j f_j² + b_β x)/max(|u|, 1 m/s)², floor_β²), π)
 
-    NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and
-    ``numbers`` are of `PackedBands`.
+    with the terms f_j (`TERMS`), the mean squared error x of the tyre check, and w = max(1,
+    |f_j|/m_j) over the features from vx on.
+
+    Parameters
+    ----------
+    rows : array
+        Inputs of the model, (T, C); NaN was not measured and counts as the training's largest
+        value.
+    vy : array
+        Estimates, (T,) [m/s]; where one is not finite, so is the band.
+    variance : array
+        Of their errors, (T,) [m²/s²]; NaN without one.
+    tyre_error : array
+        x, (T,) [m²/s²], 0 without a check.
+    columns, numbers : array
+        See `PackedBands`.
+    bands : array
+        Output, (T, 2): v [m/s] and β [rad]. β is π where the speed was not measured.
     """
     n_terms = (len(numbers) - HEAD_LENGTH) // 3
     terms = np.empty(n_terms)
@@ -259,7 +301,19 @@ def band_rows(  # type: ignore[no-untyped-def]
 def with_bands(
     estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False
 ) -> Estimate:
-    """Add 90 % half widths ``band_vy`` [m/s] and ``band_sideslip`` [rad] to an estimate."""
+    """Add 90 % half widths ``band_vy`` [m/s] and ``band_sideslip`` [rad] to an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the recording, with ``vx`` and ``friction`` where the bands have a tyre check.
+    measured : Recording
+        With the channels that the model reads.
+    bands : Bands
+        Calibrated with the model.
+    elsewhere : bool
+        Whether the car or its tyres are others than those calibrated on.
+    """
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     error = tyre_error_of(bands.tyre_check, estimate)
     half = bands.half_widths(rows, vy, variance, error, elsewhere=elsewhere)
@@ -304,6 +358,7 @@ def tyre_error_of(check: TyreCheck | None, estimate: Estimate) -> FloatArray:
 
 
 def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
+    """Column of each of `COLUMNS` among channels, -1 where it is not there, (5,)."""
     return np.array(
         [channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64
     )
@@ -314,7 +369,7 @@ def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A range with its estimate, as bands are learnt from it; arrays of T samples."""
+    """A range with its estimate, as bands are calibrated on it; arrays of T samples."""
 
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]
@@ -342,6 +397,20 @@ def calibrated(
 
     ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model
     and its recordings. Raises `DataError` where one of the two has no sample whose error is known.
+
+    Steps: terms of all training samples; their 99.9th percentiles (domain); scales by
+    `fitted_scale`; blocks of the validation; factors by `pooled_quantile` of |error|/(s w). With a
+    tyre check the scores are computed twice: factors without it give its weights, then factors with
+    it.
+
+    Parameters
+    ----------
+    training, validation : sequence of Piece
+        Ranges with estimates; samples without an error are left out.
+    channels : tuple of str
+        Columns of the rows.
+    **origin : any
+        Fields of `Bands` that describe model and recordings.
     """
     for pieces, role in ((training, "training"), (validation, "validation")):
         if not any(piece.has_error.any() for piece in pieces):
@@ -441,6 +510,7 @@ def terms_of(
 
 
 def _with_factors(scale: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
+    """A scale with the factors of all `LEVELS` from scores (N,) in blocks (N,)."""
     factors, is_beyond = zip(
         *(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True
     )
@@ -514,14 +584,14 @@ def pooled_quantile(
     N, as in split conformal prediction. In between the level is met on average, nearly: the rest of
     the guarantee would make bands of few blocks far too wide.
 
-    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
-    (design effect).
-
     Returns
     -------
     tuple
         The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small
         for the level, where by rule it is the largest score times 1 + 1/n.
+
+    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
+    (design effect).
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
     n_blocks = len(counts)

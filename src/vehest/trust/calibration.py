@@ -48,6 +48,18 @@ def learn_trust(
 
     Training ranges give scales, limits and relations between channels; validation ranges give
     factors of bands and, together with the others, thresholds of health.
+
+    What cannot be learnt is None, and the reason is a note in `About`: a missing reference does not
+    prevent limits and health.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        Fitted.
+    train, validation : sequence of Stretch
+        Ranges at the estimator's rate.
+    variant : str
+        The paper's name of the configuration, for people.
     """
     bands = None
     guard = None
@@ -95,6 +107,10 @@ def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]
     """Ranges after their starts with the model's estimates on them.
 
     Raises `DataError` where a recording lacks a channel.
+
+    Errors are v̂ - v [m/s] and β̂ - β, wrapped to ±π [rad], against ``vy_ref`` and atan2(vy_ref,
+    vx). The first `SKIP_SECONDS` of each range do not count; a warm-up before the range does not
+    either.
     """
     pieces: list[Piece] = []
     check = tyre_check_of(estimator)

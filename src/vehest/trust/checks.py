@@ -27,7 +27,17 @@ def check_channels(place: str, names: Sequence[str]) -> None:
 
 
 def check_number(place: str, value: float, low: float, high: float = MAX_NUMBER) -> None:
-    """Raise `DataError` unless a number lies between two others, both included; NaN does not."""
+    """Raise `DataError` unless a number lies between two others, both included; NaN does not.
+
+    Parameters
+    ----------
+    place : str
+        Where the number stands, for messages.
+    value : float
+        The number.
+    low, high : float
+        Limits. With the smallest positive number as ``low`` the message asks for a positive one.
+    """
     if low == math.ulp(0.0) and not value > 0.0:
         raise DataError(f"{place} must be positive, not {value:.4g}")
     if not low <= value <= high:
@@ -43,7 +53,17 @@ def check_numbers(
 
 
 def check_shape(place: str, values: Any, *shape: int) -> None:
-    """Raise `DataError` unless nested tuples have a shape and numbers up to `MAX_NUMBER`."""
+    """Raise `DataError` unless nested tuples have a shape and numbers up to `MAX_NUMBER`.
+
+    Parameters
+    ----------
+    place : str
+        Where the numbers stand, for messages.
+    values : any
+        Nested tuples, or a number without a shape.
+    *shape : int
+        Length of each dimension, the outermost first. NaN is refused.
+    """
     if not shape:
         if not math.fabs(values) <= MAX_NUMBER:
             raise DataError(f"{place} holds {values:.4g}, beyond {MAX_NUMBER:g}")

@@ -81,6 +81,15 @@ class SampleClock:
     def missing_before(self, time: float) -> int:
         """Take the stamp of a sample [s].
 
+        A stamp that is not finite counts as the next one at the input rate, and as uneven. A stamp
+        that lies `RESET_SECONDS` or more before the last one sets the clock back: it is new, and
+        the clock is not trusted for `RECOVERY_SECONDS`.
+
+        Parameters
+        ----------
+        time : float
+            Stamp of the sample [s].
+
         Returns
         -------
         int
@@ -121,15 +130,20 @@ class SampleClock:
         return missing
 
     def _count_uneven(self) -> None:
+        """Count an uneven interval; after ``fault_calls`` more uneven than even ones the clock
+        is suspect.
+        """
         self._uneven = min(self._uneven + 1, self.fault_calls)
         if self._uneven == self.fault_calls:
             self._suspect(CLOCK_UNEVEN)
 
     def _suspect(self, fault: int) -> None:
+        """Distrust the clock until ``recovery_calls`` even samples have come."""
         self.fault = fault
         self._recovering = self.recovery_calls
 
     def _recover(self) -> None:
+        """Count an even sample."""
         self._uneven = max(self._uneven - 1, 0)
         self._recovering = max(self._recovering - 1, 0)
         if self._recovering == 0:

@@ -17,6 +17,10 @@ Both use the same compiled recursions.
 
 An estimator that breaks down numerically returns NaN. An exception that it raises is a defect and
 is passed on.
+
+`GuardedRun` runs each step over all rows of a piece up to the next wait, restart or loss;
+`GuardedStepper` runs all steps for one row. Rows pass the same compiled functions with the same
+state, so that both return the same bits.
 """
 
 from __future__ import annotations
@@ -57,9 +61,9 @@ MOTION = ("vx", "yaw_rate", "ay")
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits learnt with an estimator, or those of any car.
+    """The limits calibrated with an estimator, or those of any car.
 
-    `DataError` where ``trust`` was learnt with another one.
+    `DataError` where ``trust`` was calibrated with another one.
     """
     if trust is not None:
         trust.check_fit(estimator)
@@ -74,9 +78,10 @@ class GuardedRun:
     neither band nor health of channels. The state of a protocol, ``initial_state``, is that at the
     first sample; ``elsewhere``: the car or its tyres are others than those that were calibrated on.
 
-    Attributes:
-        takes_parts: whether the estimator can go on where it stopped; else the recording must come
-        whole.
+    Attributes
+    ----------
+    takes_parts : bool
+        Whether the estimator continues where it stopped; else the recording must come whole.
     """
 
     def __init__(
@@ -319,7 +324,14 @@ class GuardedRun:
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
-    """Accepted `MOTION` of each row, (T, 3), bridged values included; NaN if unknown."""
+    """Accepted vx, yaw rate and ay of T rows after the guard, whose columns are ``channels``.
+
+    Returns
+    -------
+    array
+        (T, 3) [m/s, rad/s, m/s²], bridged values included; NaN where a channel is not read, or was
+        not measured while the estimator waits.
+    """
     motion = np.full((len(cleaned.rows), len(MOTION)), np.nan)
     for column, name in enumerate(MOTION):
         if name in channels:
@@ -339,11 +351,17 @@ class GuardedStepper(Stepper):
     anti-aliasing filter first. ``clock`` judges other stamps than those of `step`, such as the
     frames' that samples are formed from, and whoever passes it takes them.
 
-    Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
+    Attributes
+    ----------
+    last : dict
+        Result of the last step.
+    marks : int
+        Marks of `vehest.trust.watch` for it.
 
-    Attributes:
-        last: what the last step returned.
-        marks: of `vehest.trust.watch` for it.
+    Raises
+    ------
+    ConfigurationError
+        The estimator is not causal, or the bus is slower than it.
     """
 
     def __init__(
@@ -435,6 +453,12 @@ class GuardedStepper(Stepper):
         return self.last
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
+        """Take a sample or None as one row at the bus's rate, and step where the front end makes a
+        row of it.
+
+        Channels without a number become NaN one by one, so that one of them does not cost the
+        others.
+        """
         row: FloatArray | None = self._row
         self._row[0] = math.nan
         if sample is not None:
@@ -451,6 +475,11 @@ class GuardedStepper(Stepper):
         return self.last
 
     def _stepped(self, row: FloatArray) -> dict[str, float]:
+        """Guard, health, estimator, watch, verdict and bands of one row (1, C); returns the
+        quantities.
+
+        While the clock is not trusted, the row is invalid by the clock's reason from the start.
+        """
         cleaned = self.guard(row)
         verdict = self.monitor.before(row, cleaned)
         if self.clock.fault:
@@ -489,7 +518,10 @@ class GuardedStepper(Stepper):
         return quantities
 
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float]:
-        """The estimator on a row: v, its own vx and the variance of v's error."""
+        """The estimator on a row: v, its own vx and the variance of v's error.
+
+        NaN while the guard waits; the estimator starts anew where the guard says so.
+        """
         flow = cleaned.flow[0]
         self._extra_quantities = {}
         self._tyre_error = np.zeros(1)

@@ -103,6 +103,9 @@ class Fault:
     size: float | None = None
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for an unknown kind, channel or severity, or a size out of
+        range.
+        """
         for name, choices in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
             value = getattr(self, name)
             if value not in choices:
@@ -141,7 +144,7 @@ class Fault:
     def condition(self) -> str:
         """``bias:ay:mild``.
 
-        A given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
+        A given size replaces the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
         """
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
@@ -173,6 +176,13 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
     """Size of a fault, as in the module's tables.
 
     Offsets of wheels and motor are shares of the largest speed.
+
+    Returns
+    -------
+    float
+        In the channel's unit (of wheels and motor: a share) for offsets, drifts a second, spikes
+        and noise; a share, a factor or seconds for other kinds (`KINDS`). NaN: a lost wheel that
+        drops out.
     """
     channel_range = CHANNELS[channel]
     at = SEVERITIES.index(severity)
@@ -194,6 +204,15 @@ def inject(
     """Samples, channel -> (T,) [SI], with a fault in one channel, which may then have any value.
 
     Raises `ConfigurationError` where there is no such channel.
+
+    Parameters
+    ----------
+    samples : mapping
+        Channel -> (T,) [SI]; it is not changed.
+    rate_hz : float
+        Sampling rate [Hz].
+    fault : Fault
+        Kind, channel, size and time.
     """
     if fault.channel not in samples:
         raise ConfigurationError(
@@ -210,7 +229,11 @@ def inject(
 
 
 def window(fault: Fault, n_samples: int, rate_hz: float) -> tuple[int, int]:
-    """First index and end index of the samples while a fault lasts."""
+    """First index and end index of the samples while a fault lasts.
+
+    Times are counted from the first sample; a sample at the onset is inside, one at the end is not.
+    Both indices are at most the number of samples.
+    """
     ends = (fault.onset * rate_hz, (fault.onset + fault.duration) * rate_hz)
     first, end = (
         min(math.ceil(at - 1e-6) if math.isfinite(at) else n_samples, n_samples) for at in ends
@@ -219,7 +242,28 @@ def window(fault: Fault, n_samples: int, rate_hz: float) -> tuple[int, int]:
 
 
 class FaultedChannel:
-    """A channel while its fault lasts, with the random draws of the fault."""
+    """A channel while its fault lasts, with the random draws of the fault.
+
+    Parameters
+    ----------
+    fault : Fault
+        Its seed, kind and channel determine all random draws.
+    values : array
+        The channel, (T,) [SI].
+    first, end : int
+        Samples while the fault lasts.
+    rate_hz : float
+        Sampling rate [Hz].
+
+    Attributes
+    ----------
+    inside : array
+        Values while the fault lasts, (end - first,).
+    seconds : array
+        Times since its onset, (end - first,) [s].
+    size : float
+        With a drawn sign for bias, drift and scale, and in rad/s for offsets of wheels and motor.
+    """
 
     def __init__(
         self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float
@@ -271,16 +315,19 @@ class FaultedChannel:
 
 
 def _sample_and_hold(at: FaultedChannel) -> FloatArray:
+    """Hold each value for ``size`` seconds, two samples at least."""
     samples = max(round(at.size * at.rate_hz), 2)
     return at.inside[np.arange(len(at.inside)) // samples * samples]
 
 
 def _saturation(at: FaultedChannel) -> FloatArray:
+    """Clip to a share of the largest size that the channel has while the fault lasts."""
     limit = at.size * _reach(at.inside)
     return np.clip(at.inside, -limit, limit)
 
 
 def _lost_wheel(at: FaultedChannel) -> FloatArray:
+    """Scale the speed to ``size`` times itself within `LOSS_SECONDS`; NaN: it drops out at once."""
     if math.isnan(at.size):
         return np.full_like(at.inside, np.nan)
     return at.inside * (1.0 + (at.size - 1.0) * np.minimum(at.seconds / LOSS_SECONDS, 1.0))
@@ -360,8 +407,10 @@ def _turns(channel: str) -> bool:
 
 
 def _reach(values: FloatArray) -> float:
+    """Largest finite size of values; 0 where there is none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def _range(channel: Channel) -> float:
+    """Largest size that a channel may have, in its unit."""
     return max(abs(channel.low), abs(channel.high))

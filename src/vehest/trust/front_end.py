@@ -1,4 +1,10 @@
-"""From the rate of a vehicle's bus to that of an estimator, causally and without aliasing."""
+"""From the rate of a vehicle's bus to that of an estimator, causally and without aliasing.
+
+    row (1, C) at the bus's rate --guard--> accepted values --filter_row--> low-passed values
+    --every 1/ratio rows--> row (1, C) for the estimator
+
+The filter's group delay is the price of running causally; `FrontEnd.delay` states it.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +37,19 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     filter starts as in a steady signal. What lay above the model's Nyquist frequency is gone in
     them, and white noise of the density below it takes its place, since some of it comes through
     the filter.
+
+    Parameters
+    ----------
+    samples : array
+        (T, C) at the model's rate; NaN stays NaN in the result.
+    rate_hz : float
+        The model's rate [Hz].
+
+    Returns
+    -------
+    array
+        (T, C) at the model's rate. The noise is drawn from a fixed seed, so that limits that are
+        learnt from it are reproducible.
     """
     at = np.arange(len(samples))
     measured_columns = [np.isfinite(column) for column in samples.T]
@@ -69,8 +88,8 @@ class FrontEnd:
     not measured holds its last value in the filter, and is passed on as not measured. After longer
     gaps the filter starts from the first sample that is back.
 
-    ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order
-    of the columns.
+    ``limits`` of the guard are those calibrated at the estimator's rate; ``channels`` are in the
+    order of the columns.
 
     Raises `ConfigurationError`: the bus is slower than the estimator, or faster than any.
     """
@@ -126,6 +145,8 @@ class FrontEnd:
         """Take one row, (1, C).
 
         Returns a row for the estimator where one is due, NaN what was not measured.
+
+        The first row is always due. While the guard waits, the filter forgets its state.
         """
         cleaned = self.guard(row)
         waits = bool(cleaned.flow[0] == WAIT)
@@ -145,9 +166,19 @@ class FrontEnd:
 
 @entry(nogil=True)
 def filter_row(row, sections, state):  # type: ignore[no-untyped-def]
-    """Second-order sections (S, 6), direct form II transposed, on values (C,), in place; NaN stays.
+    """Second-order sections, direct form II transposed, on one row, in place.
 
-    A channel whose ``state``, (S, C, 2), is NaN starts as if its value had always stood.
+        y = b₀ x + s₀,   s₀ = b₁ x - a₁ y + s₁,   s₁ = b₂ x - a₂ y,   x of the next section = y
+
+    Parameters
+    ----------
+    row : array
+        Values, (C,); NaN stays, and leaves the state of its channel as it is.
+    sections : array
+        Coefficients b₀, b₁, b₂, 1, a₁, a₂ of each section, (S, 6).
+    state : array
+        (S, C, 2), changed in place. A channel whose state is NaN starts as if its value had always
+        stood.
     """
     for c in range(row.shape[0]):
         x = row[c]

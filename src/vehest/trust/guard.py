@@ -1,11 +1,11 @@
-"""Rejects implausible samples before an estimator sees them.
+"""Rejects implausible samples before an estimator receives them.
 
     rows -> Guard -> rows, measured, flow (use, wait, restart)
 
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has
-stood still for longer than it ever did where the estimator learnt counts as not measured. Channels
+stood still for longer than it ever did in the estimator's training counts as not measured. Channels
 that a method can do without become NaN then; the others hold the last value that was accepted, for
-half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels
+half a second at most. After longer gaps the estimator starts anew when the channels
 are back.
 """
 
@@ -43,22 +43,22 @@ REACHED = {
 }
 """Unit -> size and change a second that some road car reaches, and change by sensor noise.
 
-They apply where none was learnt.
+They apply where none was calibrated.
 """
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
 """Starts of names whose ranges and changes differ too much between cars.
 
-Their limits have to be learnt.
+Their limits have to be calibrated.
 """
 
 STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steering may stand still
 
 ENDLESS = 1e300  # stops of channels that have none
 
-MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that can be learnt
+MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that calibration allows
 TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
-MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that can be learnt
+MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that calibration allows
 
 STANDSTILL_SPEED = 0.5  # m/s
 STANDSTILL_YAW_RATE = 0.05  # rad/s; below both, nothing is expected to move
@@ -84,6 +84,7 @@ class ChannelLimits:
     )
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for limits in the wrong order or out of range."""
         if not self.low < self.high:
             raise DataError(f"low must be below high, not {self.low:.4g} and {self.high:.4g}")
         check_number("jump", self.jump, math.ulp(0.0))
@@ -102,6 +103,9 @@ class GuardLimits:
     largest_tan_sideslip: float = 1.0
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for limits that are wider than a channel's table or than any car
+        allows.
+        """
         check_channels("guard.channels", list(self.channels))
         for name, limits in self.channels.items():
             table = CHANNELS[name]
@@ -126,6 +130,15 @@ def learn_limits(
 
     A range is that of any car or, if more, `MAX_OVER_TRAINING` times the largest value; a jump
     likewise; a channel may stand still for twice its longest run while the car moved.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Training drives.
+    channels : sequence of str
+        Channels that the estimator reads; one that no recording has gets the limits of any car.
+    rate_hz : float
+        Sampling rate of all recordings [Hz].
     """
     channel_limits = {}
     for name in channels:
@@ -165,6 +178,10 @@ def _largest(parts: Sequence[FloatArray]) -> float:
 
 
 def _usual(name: str, rate_hz: float) -> ChannelLimits:
+    """Limits of a channel that hold for any car, at a rate [Hz].
+
+    Channels in `FREE` have the range and the span of their table.
+    """
     table = CHANNELS[name]
     size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
     if name.startswith(FREE):
@@ -183,6 +200,7 @@ def _fastest(name: str, rate_hz: float) -> float:
 
 
 def _tan_sideslip(recording: Recording) -> FloatArray:
+    """|v|/max(|u|, 1 m/s) of a recording's references; empty where it has none."""
     name = "vx_ref" if "vx_ref" in recording else "vx"
     if not ("vy_ref" in recording and name in recording):
         return np.zeros(0)
@@ -251,7 +269,7 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
 
 
 class Cleaned(NamedTuple):
-    """Rows as an estimator may see them."""
+    """Rows as an estimator receives them."""
 
     # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is
     # `WAIT`
@@ -305,7 +323,18 @@ class Guard:
         self.state[-1, 0] = WAIT
 
     def __call__(self, rows: FloatArray) -> Cleaned:
-        """Go on with further rows, (T, C)."""
+        """Go on with further rows, (T, C).
+
+        Parameters
+        ----------
+        rows : array
+            As received, in the order of the channels; any value, NaN and infinity included.
+
+        Returns
+        -------
+        Cleaned
+            Of these rows. Parts of a recording give the same as the whole.
+        """
         clean = np.empty_like(rows)
         measured = np.empty(rows.shape, np.bool_)
         flow = np.empty(len(rows), np.int8)
@@ -320,6 +349,11 @@ def guard_rows(  # type: ignore[no-untyped-def]
     rows, state, limits, skippable, settings, clean, measured, flow
 ):
     """Accept or reject values, row by row.
+
+    A value within the range is accepted unless it has stood still for too long between its stops
+    while the car moves, or jumps from a value that is at most ``bridged`` samples old. A jump is
+    accepted once ``persists`` samples have confirmed its new level. The estimator waits where a
+    channel that it needs, or every skippable one, has been missing for longer than ``bridged``.
 
     Parameters
     ----------

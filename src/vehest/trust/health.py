@@ -138,7 +138,10 @@ RETIRED = (kernel.NOISE, kernel.SMOOTH, kernel.SCALE, kernel.LATE)  # kinds of e
 
 
 def reason_in_words(code: float) -> str:
-    """Text of a reason's code; empty for 0."""
+    """Text of a reason's code; empty for 0.
+
+    The code is 10000 kind + 100 (number of the channel) + number of the partner, see `REASONS`.
+    """
     kind, channels_code = divmod(round(code), 10_000)
     channel, partner = divmod(channels_code, 100)
     return REASONS[kind][0].format(
@@ -198,6 +201,7 @@ class HealthModel:
     limits_behind_front_end: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        """Bring limits of earlier versions into the present order, then check shapes and ranges."""
         channels = len(self.channels)
         relations = len(self.relations)
         for name in ("healthy", "heaviest"):
@@ -243,7 +247,7 @@ class HealthModel:
                 )
 
     def _check_ranges(self) -> None:
-        """Raise `DataError` unless numbers can be what training leaves behind."""
+        """Raise `DataError` unless numbers are in ranges that training can produce."""
         check_number("health.rate_hz", self.rate_hz, math.ulp(0.0), HIGHEST_RATE)
         for name in ("deviation", "largest", "longest_gap", "spin", "speeds"):
             check_numbers(f"health.{name}", getattr(self, name), 0.0)
@@ -376,6 +380,9 @@ class HealthModel:
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
         """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the
         latest first, and their power, (C, C).
+
+        With G_j = I - Σ_{l ≤ j} A_l, the effect of a step after j samples, the score of a step is
+        Σ_j G_jᵀ S⁻¹ ε_{k-p+1+j} and its variance Σ_j G_jᵀ S⁻¹ G_j.
         """
         coefficients = np.array(self.coefficients)
         precision = np.array(self.precision)
@@ -463,6 +470,11 @@ def learn_health(
         In the order of the rows' columns.
     rate_hz : float
         Sampling rate of all recordings [Hz].
+
+    Returns
+    -------
+    HealthModel
+        With limits for rows as measured and for rows behind the filter from a faster bus.
 
     Raises
     ------
@@ -578,11 +590,15 @@ def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]
 
 
 def _plain(values: FloatArray) -> Any:
+    """Nested tuples of an array's numbers, as YAML holds them."""
     return tuple(_plain(part) for part in values) if values.ndim > 1 else tuple(values.tolist())
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """Add the mean offset of each channel over all drives, and the largest weight of a sample."""
+    """Add the mean offset of each channel over all drives, and the largest weight of a sample.
+
+    It is called twice, since the largest weight of a sample changes the offsets.
+    """
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
@@ -598,7 +614,15 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
-    """Largest values of K statistics in B blocks of `BLOCK_SECONDS`, (B, K), without limits."""
+    """Largest values of K statistics in B blocks of `BLOCK_SECONDS`, (B, K), without limits.
+
+    Parameters
+    ----------
+    model : HealthModel
+        Its limits do not count.
+    recordings : sequence of Recording
+        Each begins with a new state; the last block of one may be shorter.
+    """
     packed = replace(model, limits=()).packed()
     n_statistics = len(model.statistics)
     length = max(round(BLOCK_SECONDS * model.rate_hz), 1)
@@ -643,8 +667,13 @@ def limits_from(
     """Limits of all K statistics from healthy drives.
 
     A limit is the largest value times `margin`. Blocks that exceed all others by `OUTLIER_FACTOR`
-    are not counted, since recordings have faults of their own: at most `MAX_OUTLIER_SHARE` of the
-    blocks, and one where there are thirty blocks or more.
+    are not counted, since recordings have faults of their own: of thirty blocks or more at most
+    `MAX_OUTLIER_SHARE`, but one at least; of fewer, none.
+
+    Rules: ``share`` is at most half way from the largest value to 1; ``domain`` is
+    `DAY_TO_DAY_FACTOR` alone; ``run`` has two samples more, and `MIN_RUN_SAMPLES` at least; the
+    others have a smallest limit (`MIN_LIMITS`). A limit that would be 0, and that of the share of a
+    channel that always repeats, is 1e300, which is never exceeded.
 
     Parameters
     ----------

@@ -13,6 +13,12 @@ is detected by its likelihood ratio over exponentially forgotten samples,
 which is N(0, 1) without a fault. Innovations count with at most `CLIP` deviations in it, and no
 sample with more than its share, so that a kerb is no offset.
 
+A row passes, in this order: `_receive` (gaps, repeated samples), `_describe` (features, y, noise
+level), `_predict` (ε), `_look_at_innovations`, `_look_for_offsets`, `_look_at_values`,
+`_look_at_relations` (statistics), `_decide` (status, reason), `_remember`. Sums run over channels,
+lags and features in order of their index, so that rows one at a time, a recording at once and the
+export in C give the same. There is no gradient.
+
 Source: Willsky & Jones, A generalized likelihood ratio approach to the detection and estimation of
 jumps in linear systems, IEEE Trans. Automatic Control 21 (1), 1976; windows replaced by forgetting.
 """
@@ -223,13 +229,22 @@ class State(NamedTuple):
 
 @compiling.entry(nogil=True, _nrt=False)
 def health_kernel(rows, measured, tables, memory, out, statistics):
-    """Judge rows (T, C), as received, one after another.
+    """Judge rows, as received, one after another.
 
-    ``measured`` tells which of their values count as measured.
-
-    ``tables`` are of `HealthModel.packed`, ``memory`` is of `HealthModel.start` and changed in
-    place. Output are ``out``, (3, T): status, code of the reason, largest statistic over its limit;
-    and ``statistics``, (T, K), or (0, K) where they are not wanted.
+    Parameters
+    ----------
+    rows : array
+        (T, C) [SI].
+    measured : array
+        Which of their values count as measured, bool (T, C).
+    tables : array
+        Flat array of a `Model`, as of `HealthModel.packed`.
+    memory : array
+        Flat array of a `State`, as of `HealthModel.start`; changed in place.
+    out : array
+        Output, (3, T): status, code of the reason, largest statistic over its limit.
+    statistics : array
+        Output, (T, K), or (0, K) where they are not wanted.
     """
     model = open_views(Model, tables, open_views(Layout, tables, ()))
     state = open_views(State, memory, model.layout)
@@ -254,7 +269,7 @@ def _receive(k, rows, measured, model, state):
 
     Returns the channel that has been missing for longest beyond its limit, -1 if none has.
 
-    The last value stands for one that was not measured. A channel that is back has p rows to settle
+    The last value replaces one that was not measured. A channel that is back has p rows to settle
     in.
     """
     first = state.rows[0] == 0.0
@@ -291,6 +306,7 @@ def _receive(k, rows, measured, model, state):
 
 @part()
 def _value(state, column):
+    """Present value of a column, 0 where there is none (-1)."""
     return state.x[column] if column >= 0 else 0.0
 
 
@@ -299,6 +315,11 @@ def _describe(model, state):
     """Features with their derivatives, y = x - W φ(x) and the noise at this speed.
 
     Returns whether the car stands.
+
+    Features are 1, r, u, u r, (u r)³/100, r/w, ay, ay/w², ay³/100, r², u², ax and v r, with w =
+    max(|u|, least speed). The drift v' = y_ay - v/`SLIDE_SECONDS`, at most |u| in size, replaces
+    the unknown v. The noise level is interpolated between the speeds of training, and constant
+    beyond them.
     """
     columns = model.layout
     settings = model.settings
@@ -385,6 +406,10 @@ def _predict(model, state):
     """Innovations, scaled and clipped, and their scores S⁻¹ε.
 
     Zero where nothing can be predicted.
+
+    ε = y - c - Σ_l A_l y_{k-l}, over the noise level; clipped to `CLIP` deviations for offsets and
+    to `STEP_CLIP` for steps. A channel that is missing takes its prediction as y, so that the
+    others' next predictions stay possible.
     """
     C = model.layout.channels
     p = model.layout.order
@@ -428,7 +453,11 @@ def _predict(model, state):
 
 @part()
 def _look_at_innovations(model, state):
-    """Jumps out of what has been usual for half a second."""
+    """Jumps out of what has been usual for half a second.
+
+    z = |(S⁻¹ε)_i|/√(S⁻¹)_ii, over √(`CALM` + energy), the mean square of the channel's own
+    innovations before; the energy is updated afterwards.
+    """
     statistics = state.statistics
     for i in range(model.layout.channels):
         z = (
@@ -462,7 +491,11 @@ def _slope(i, model, state):
 
 @part()
 def _look_for_step(i, counts, model, state):
-    """A step in channel i that began p samples ago."""
+    """A step in channel i that began p samples ago.
+
+    z = |Σ_m J_m/level_m · stepped_m|/√(JᵀP J), with both J over the noise level and P the step's
+    power.
+    """
     C = model.layout.channels
     step = 0.0
     power = 0.0
@@ -477,7 +510,11 @@ def _look_for_step(i, counts, model, state):
 
 @part()
 def _look_for_offset(i, counts, model, state):
-    """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations."""
+    """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations.
+
+    Numerator and denominator of z (module) are forgotten by λ and λ². From the numerator the offset
+    of healthy drives times the weight is subtracted; a sample counts with at most ``heaviest``.
+    """
     C = model.layout.channels
     top = 0.0
     weight = 0.0
@@ -505,7 +542,11 @@ def _look_for_offset(i, counts, model, state):
 
 @part()
 def _look_for_offsets(model, state):
-    """Steps and offsets of each channel."""
+    """Steps and offsets of each channel.
+
+    The largest offset statistic is limited to `CAP` times its limit by scaling the numerators of
+    all channels.
+    """
     C = model.layout.channels
     offset_statistics = state.statistics.offset
     highest = 0.0
@@ -527,7 +568,11 @@ def _look_for_offsets(model, state):
 
 @part()
 def _look_at_values(is_standing, model, state):
-    """Runs and shares of equal samples, range, slip; returns how many wheels are slow."""
+    """Runs and shares of equal samples, range, slip; returns how many wheels are slow.
+
+    Nothing is frozen where the car stands or a channel may rest. The slip of a wheel is 1 - x/x̂,
+    with x̂ the speed that its relation expects.
+    """
     slow = 0
     statistics = state.statistics
     fast = abs(_value(state, model.layout.speed)) > model.settings.least_speed
@@ -550,6 +595,10 @@ def _look_at_relations(is_standing, model, state):
     """Means of the residuals of relations.
 
     That of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f.
+
+    The short means of both sides give sign and unit (`_relation_kind`); the long mean of the
+    residual is the statistic, at most `CAP` times its limit. While any channel is missing, the
+    means of targets and residuals stay.
     """
     u = _value(state, model.layout.speed)
     step = model.settings.step
@@ -649,7 +698,13 @@ def _find_reason(slow, model, state):
 
 @part()
 def _decide(missing_channel, slow, model, state):
-    """Status and reason from all statistics, and the largest of these over its limit."""
+    """Status and reason from all statistics, and the largest of these over its limit.
+
+    Invalid are frozen and repeated samples, wrong signs and units, lost wheels, spin, gaps beyond
+    the bridged time, and any statistic but the range from `INVALID` times its limit on; other
+    findings degrade. A missing channel overrides spin, and spin the statistics. A flag is held for
+    ``hold`` rows in which all statistics stay below `CLEAR`.
+    """
     layout = model.layout
     settings = model.settings
     kind, channel, partner, highest = _find_reason(slow, model, state)

@@ -4,7 +4,7 @@
 
 A field is declared in one place, as ``past_x: Annotated[FloatArray, "order channels"]``: the words
 are sizes, or numbers. Fields that are ``int`` or ``float`` are scalars, and a field ``all_values``
-holds all that follow it. A kernel receives the flat array, since handing over eighty arrays one by
+holds all that follow it. A kernel receives the flat array, since passing eighty arrays one by
 one takes longer than a row.
 """
 
@@ -47,6 +47,17 @@ def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any,
     """Views of a flat array from ``begin`` on, and the place behind the last.
 
     Scalars are arrays without dimensions.
+
+    Parameters
+    ----------
+    kind : type
+        Named tuple whose fields are declared as in the module.
+    flat : array
+        float64; integers are views of the same bytes.
+    sizes : any
+        Object whose attributes are the words of the shapes.
+    begin : int
+        Place of the first number.
     """
     arrays = {}
     for name, declared in _fields(kind).items():
@@ -62,14 +73,17 @@ def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any,
 
 
 def allocated(kind: Any, sizes: Any) -> FloatArray:
-    """A flat array of zeros for a named tuple."""
+    """A flat array of zeros for a named tuple.
+
+    Its length follows from views of an array without memory.
+    """
     return np.zeros(views(kind, np.broadcast_to(0.0, 1 << 40), sizes)[1])
 
 
 class Views(types.Type):  # type: ignore[misc]
     """Type of a named tuple in compiled code: where it begins, and sizes.
 
-    Handing over all fields would compile a fifth longer.
+    Passing all fields would compile a fifth longer.
     """
 
     def __init__(self, kind: Any, sizes: Any) -> None:
@@ -80,6 +94,8 @@ class Views(types.Type):  # type: ignore[misc]
 
 @register_model(Views)
 class _Model(models.StructModel):  # type: ignore[misc]
+    """LLVM's representation of `Views`: a pointer and the sizes."""
+
     def __init__(self, manager: Any, view_type: Views) -> None:
         super().__init__(manager, view_type, [("data", types.voidptr), ("sizes", view_type.sizes)])
 
@@ -102,14 +118,20 @@ def _compiled_type(field_type: Any, sizes: Any) -> Any:
 
 @infer_getattr
 class _Attributes(AttributeTemplate):  # type: ignore[misc]
+    """Typing rule of a field of `Views`."""
+
     key = Views
 
     def generic_resolve(self, view_type: Views, name: str) -> Any:
+        """Type of the field of this name."""
         return _compiled_type(_fields(view_type.kind)[name], view_type.sizes)
 
 
 @lower_getattr_generic(Views)  # type: ignore[untyped-decorator]
 def _opened_field(context: Any, builder: Any, view_type: Views, value: Any, name: str) -> Any:
+    """Write the code of reading a field: its place behind the fields before it, then a view or a
+    number. Places are computed from the sizes at run time.
+    """
     proxy = context.make_helper(builder, view_type, value)
     integer = partial(context.get_constant, types.intp)
 

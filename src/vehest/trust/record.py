@@ -35,7 +35,7 @@ class About:
 
 @dataclass(frozen=True)
 class Trust:
-    """Bands, limits and health of a model; None if not learnt."""
+    """Bands, limits and health of a model; None if not calibrated."""
 
     about: About  # whose it is
     bands: Bands | None = None  # calibrated half widths
@@ -153,6 +153,16 @@ def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
 
     ``model`` is the digest of the model in the same folder (`model_digest`). Without it the file
     names no model: the manifest of a calibration does.
+
+    Parameters
+    ----------
+    trust : Trust
+        Fields that earlier versions did not have are left out where they are empty, so that files
+        stay the same.
+    folder : Path
+        Existing; trust.yaml in it is replaced.
+    model : str
+        SHA-256, or empty.
     """
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     del content["about"]["model"]

@@ -1,6 +1,6 @@
 """Relations between the measured channels of a car.
 
-Their coefficients are learnt from drives without any reference.
+Their coefficients are fitted to drives without any reference.
 
 With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r:
 
@@ -101,6 +101,7 @@ class Relation:
     instant: bool = False  # whether it holds for each sample and not only on average
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a term that is unknown, or not available at each instant."""
         usable = (*(FEATURES[:INSTANT_FEATURES] if self.instant else FEATURES), RATE)
         for name, coefficient in self.terms.items():
             if name not in usable:
@@ -110,7 +111,7 @@ class Relation:
     def involves(self, channel: str, speed: str | None) -> int:
         """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all.
 
-        ``speed`` is the channel that u stands for.
+        ``speed`` is the channel that is used as u.
         """
         if channel in (self.target, self.partner):
             return 1
@@ -158,6 +159,18 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
     """Feature -> (T,), of channels as they are measured.
 
     Those that need a channel that is not there are of zeros.
+
+    Parameters
+    ----------
+    samples : mapping
+        Channel -> (T,) [SI], at least one.
+    least_speed : float
+        Smallest |u| that divides [unit of the speed channel].
+
+    Returns
+    -------
+    dict
+        Of all `FEATURES` but ``v r``, which needs a relation (`slide_of`).
     """
     any_samples = next(iter(samples.values()))
     speed = speed_channel(list(samples))
@@ -185,6 +198,15 @@ def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: flo
     """v r, (T,), with v from the residual of the relation of ay, at most the speed.
 
     It is integrated with the leakage of `SLIDE_SECONDS`.
+
+    Parameters
+    ----------
+    features : mapping
+        As of `features_of`, (T,).
+    lateral : Relation
+        Of ay against the yaw rate.
+    rate_hz : float
+        Sampling rate [Hz].
     """
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
     drift = scipy.signal.lfilter(
@@ -265,6 +287,21 @@ def learn_relations(
     """Coefficients of every relation, from drives at one rate [Hz].
 
     NaN and samples below ``least_speed`` are left out.
+
+    Both sides are low-passed by the same filter of `LOW_PASS_SECONDS` before the fit. The
+    coefficient of v r is -1 by kinematics and not fitted. A relation with fewer than `MIN_ROWS`
+    samples is left out.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Healthy drives with all ``channels``.
+    channels : sequence of str
+        Among which relations are looked for.
+    rate_hz : float
+        Sampling rate of all recordings [Hz].
+    least_speed : float
+        See `least_speed_of`.
     """
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
@@ -284,6 +321,7 @@ def learn_relations(
         usable_rows.append(is_usable)
 
     def smoothed(name: str) -> FloatArray:
+        """A column of all recordings, low-passed within each, at the usable samples, (N,)."""
         pairs = [
             (part[name], is_usable) for part, is_usable in zip(parts, usable_rows, strict=True)
         ]
@@ -339,7 +377,22 @@ def _fill_gaps(samples: FloatArray) -> FloatArray:
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:
-    """Least squares, reweighted ten times by Huber's function of residual over median size."""
+    """Least squares, reweighted ten times by Huber's function of residual over median size.
+
+    Columns are scaled to a root mean square of 1, and a ridge of 1e-9 keeps the equations regular.
+
+    Parameters
+    ----------
+    design : array
+        (N, K).
+    target : array
+        (N,).
+
+    Returns
+    -------
+    array
+        Coefficients, (K,).
+    """
     size = np.maximum(np.sqrt(np.mean(np.square(design), axis=0)), 1e-300)
     scaled = design / size
     weight = np.ones(len(target))

@@ -42,6 +42,7 @@ class TyreCheck:
     weights: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        """Raise `DataError` for a friction or weights out of range."""
         check_number("tyre_check.friction", self.friction, 1e-3, 1e2)
         check_numbers("tyre_check.weights", self.weights, 0.0, MAX_WEIGHT)
 
@@ -53,7 +54,10 @@ class TyreCheck:
         return replace(self, weights=(vy, sideslip))
 
     def squared_errors(self, vx: FloatArray, friction: FloatArray) -> FloatArray:
-        """Mean squared errors x of v [m²/s²] by estimated speeds [m/s] and frictions, (T,) each."""
+        """Mean squared errors x of v [m²/s²] by estimated speeds [m/s] and frictions, (T,) each.
+
+        x = (c u ln(μ/μ₀))²; 0 where the friction is NaN or not positive.
+        """
         squared = np.empty(len(vx))
         squared_error_rows(vx, friction, self.friction, squared)
         return squared
@@ -67,7 +71,17 @@ def tyre_check_of(estimator: Estimator) -> TyreCheck | None:
 
 @entry(nogil=True)
 def squared_error_rows(vx, friction, training_friction, squared):  # type: ignore[no-untyped-def]
-    """Write x, ``squared`` (T,) [m²/s²]; 0 where there is no estimate."""
+    """Write x = (c u ln(μ/μ₀))².
+
+    Parameters
+    ----------
+    vx, friction : array
+        Estimated speed [m/s] and friction μ [1], (T,).
+    training_friction : float
+        μ₀ [1].
+    squared : array
+        Output, (T,) [m²/s²]; 0 where there is no estimate.
+    """
     for k in range(len(vx)):
         squared[k] = 0.0
         if friction[k] > 0.0:

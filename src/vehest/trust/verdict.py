@@ -75,6 +75,8 @@ class Monitor:
 
     ``elsewhere``: the car or its tyres are others than those that were calibrated on;
     ``behind_front_end``: rows come through the filter from a faster bus.
+
+    Without health every row is valid; without bands half widths are NaN.
     """
 
     def __init__(
@@ -106,6 +108,11 @@ class Monitor:
         """Health of rows (T, C) as received.
 
         In ``cleaned``, accused channels are taken out and restarts added, in place.
+
+        Returns
+        -------
+        Health
+            Of these rows, which `after` completes.
         """
         if self.packed_health is None:
             return Health(*np.zeros((3, len(received))))
@@ -236,12 +243,23 @@ def isolate_rows(  # type: ignore[no-untyped-def]
 def verdict_rows(  # type: ignore[no-untyped-def]
     vy, marks, flow, measured, required, numbers, status, reason
 ):
-    """Add the findings of guard and watch to ``status, reason`` of health, in place.
+    """Add the findings of guard and watch to status and reason of health, in place.
 
-    Those of the guard are ``flow`` and ``measured``, those of the watch ``vy`` and ``marks``.
+    In this order: a required channel that is missing degrades; a spin degrades a valid row; an
+    estimate beyond the bound, and none at all, are invalid. A reason that is there stays.
 
-    ``required`` are channels that the estimator cannot do without, ``numbers`` those in codes,
-    (C,).
+    Parameters
+    ----------
+    vy, marks : array
+        Of the watch, (T,).
+    flow, measured : array
+        Of the guard, (T,) and (T, C).
+    required : array
+        Channels that the estimator cannot do without, (C,).
+    numbers : array
+        Their numbers in codes, (C,).
+    status, reason : array
+        (T,), changed.
     """
     for k in range(vy.shape[0]):
         status_of_row = int(status[k])
@@ -265,12 +283,21 @@ def verdict_rows(  # type: ignore[no-untyped-def]
 
 @entry(nogil=True)
 def widen_rows(status, reason, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
-    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place.
+    """Widen the bands of estimates that are not valid, in place.
 
-    Wider than `WIDEST` is invalid.
+    Factors are `BAND_FACTORS`. Where v fades from the last estimate, the band reaches at least |v|
+    plus the largest |v| of training. A band of β wider than `WIDEST` makes the row invalid.
 
-    ``farthest`` is the 99.9th percentile of |v| of estimates in training, ``vx`` the speed of the
-    estimate [m/s].
+    Parameters
+    ----------
+    status, reason, marks : array
+        (T,), of which the first two may be changed.
+    vy, vx : array
+        Estimate and its speed, (T,) [m/s].
+    farthest : float
+        The 99.9th percentile of |v| of estimates in training [m/s].
+    bands : array
+        Of v [m/s] and β [rad], (T, 2), changed.
     """
     for k in range(vy.shape[0]):
         wider = BAND_FACTORS[int(status[k])]

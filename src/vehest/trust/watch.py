@@ -45,7 +45,14 @@ class Watched(NamedTuple):
 class Watch:
     """Watches estimates row after row; keeps the state between calls.
 
-    ``warm_up`` is the number of samples after a start for which an estimator may have no estimate.
+    Parameters
+    ----------
+    limits : GuardLimits
+        Of which the top speed and the largest tan β count.
+    warm_up : int
+        Samples after a start for which an estimator may have no estimate.
+    rate_hz : float
+        Of the rows [Hz].
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
@@ -90,6 +97,11 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
     """Bound, bridge and judge estimates, up to the row at which the estimator is lost.
 
     Returns the rows done, and whether it is lost.
+
+    The bound is tan β_max · max(u, 1 m/s), with u the accepted speed, or the remembered one while
+    the car spins or no speed is known; the memory fades with `REMEMBERED_SECONDS`. The estimator is
+    lost once its estimate has been beyond the bound for `LOST_SECONDS`, or is not finite after the
+    warm-up. Without an estimate v fades with `FADE_SECONDS`.
 
     Parameters
     ----------

@@ -1,13 +1,17 @@
 """Dugoff's tyres under pure lateral slip, plain and smooth, and the single track on them, in torch.
 
-State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed,
-road-wheel angle, longitudinal acceleration.
+State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed [m/s],
+road-wheel angle [rad], longitudinal acceleration [m/s²].
 
-    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz
-    (Eq. 2) α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u) F = C tan α f(λ),   λ = μ
-    F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0) f = λ (2
-    - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10) F_zF = m (g l_R
-    - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
+    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz          (Eq. 2)
+    α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u)
+    F = C tan α f(λ),   λ = μ F_z/(2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)      (Eq. 9 at κ = 0)
+    f = λ (2 - λ) where λ ≤ 1, else 1                                              (Eq. 9)
+    f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ                                             (Eq. 10)
+    F_zF = m (g l_R - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
+
+Flow: states and inputs -> slip tangents and axle loads -> `DugoffAxle.force` -> axle forces ->
+`DugoffTrack.transition` (the next state) and `DugoffTrack.observation` (what sensors measure).
 
 Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is
 infinite at α = 0 and its gradient is not a number, though F is as smooth as C tan α there; λ is
@@ -59,11 +63,24 @@ class LoadedCar:
     cg_height: float = 0.52
 
     def __post_init__(self) -> None:
+        """Check all values against `RANGES`."""
         check_parameters(self)
 
     def loads(self, ax: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertical force on the front and on the rear axle under longitudinal accelerations (...)
-        [m/s²], (...) [N] each.
+        """Vertical force on both axles under a steady longitudinal acceleration.
+
+        F_zF = m (g l_R - a_x h)/L and F_zR = m (g l_F + a_x h)/L, each at least `MIN_LOAD_SHARE` of
+        its value at rest, so that no axle lifts off and no slip force changes its sign.
+
+        Parameters
+        ----------
+        ax : Tensor
+            Longitudinal acceleration, positive forwards, (...) [m/s²].
+
+        Returns
+        -------
+        tuple[Tensor, Tensor]
+            Load of the front and of the rear axle, (...) [N] each.
         """
         wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
         transfer = ax * (self.cg_height / wheelbase)
@@ -86,12 +103,26 @@ class DugoffAxle(NamedTuple):
     reduction: Any  # e_r, share of the friction that is lost per m/s of sliding [s/m]
 
     def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
-        """Lateral force of the axle in the wheels' axes, positive to the left, (...) [N];
-        everything broadcasts.
+        """Lateral force of the axle in the wheels' axes.
 
-        It is differentiable everywhere, at a slip of zero too. The tangent is of the slip angle,
-        positive where it makes a force to the left; ``load`` the vertical force [N], ``vx`` the
-        forward speed [m/s]; ``tyres`` are ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+        It is differentiable everywhere, at a slip of zero too. All arguments broadcast.
+
+        Parameters
+        ----------
+        tangent : Tensor
+            tan α, positive where it makes a force to the left [1].
+        load : Tensor
+            Vertical force F_z on the axle [N].
+        vx : Tensor
+            Forward speed u, positive [m/s].
+        tyres : Tyres
+            ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+
+        Returns
+        -------
+        Tensor
+            F = C tan α f(λ), positive to the left, (...) [N]. The friction that sliding leaves is
+            at least `MIN_FRICTION_SHARE` of μ₀.
         """
         slide = tangent.abs()
         half = (
@@ -122,8 +153,19 @@ class DugoffTrack:
     minimum_speed: float = 3.0  # see above [m/s]
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs
-        (..., 3): (...) [N] each.
+        """Axle forces across the body.
+
+        Parameters
+        ----------
+        states : Tensor
+            v [m/s] and r [rad/s], (..., 2).
+        inputs : Tensor
+            u [m/s], δ [rad], a_x [m/s²], (..., 3). A speed below the minimum counts as the minimum.
+
+        Returns
+        -------
+        tuple[Tensor, Tensor]
+            F_F cos δ and F_R, positive to the left, (...) [N] each.
         """
         vx = inputs[..., 0].clamp(min=self.minimum_speed)
         steer = inputs[..., 1]
@@ -137,7 +179,10 @@ class DugoffTrack:
         return of_front, self.rear.force(-course_rear, load_rear, vx, self.tyres)
 
     def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """States one step later, (..., 2) under inputs (..., 3)."""
+        """States one step later, (..., 2) under inputs (..., 3), by forward Euler (Eq. 2).
+
+        Below the minimum speed the result is `rolling`, whatever the states are.
+        """
         front, rear = self.forces(states, inputs)
         car = self.car
         vx = inputs[..., 0]
@@ -155,18 +200,31 @@ class DugoffTrack:
         )
 
     def rolling(self, inputs: Tensor) -> Tensor:
-        """The state of a car whose wheels do not slip, (..., 2) under inputs (..., 3)."""
+        """State of a car whose wheels do not slip: v = l_R u δ/L, r = u δ/L, (..., 2) under
+        inputs (..., 3).
+        """
         turn = (
             inputs[..., 0] * inputs[..., 1] / (self.car.cg_to_front_axle + self.car.cg_to_rear_axle)
         )
         return torch.stack([self.car.cg_to_rear_axle * turn, turn], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 5);
-        Eq. 4.
+        """Measurements that the model expects (Eq. 4).
 
-        Axle forces are those across the body, as the channels hold them; the paper's transducers
-        turn with the wheels.
+        Parameters
+        ----------
+        states : Tensor
+            v [m/s] and r [rad/s], (..., 2).
+        inputs : Tensor
+            u [m/s], δ [rad], a_x [m/s²], (..., 3).
+
+        Returns
+        -------
+        Tensor
+            (..., 5) in the order of `TRACK_MEASUREMENTS`: lateral acceleration [m/s²], yaw rate
+            [rad/s], front and rear axle force [N], sideslip angle [rad]. Axle forces are those
+            across the body, as the channels hold them; the paper's transducers turn with the
+            wheels.
         """
         front, rear = self.forces(states, inputs)
         sideslip = torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed))

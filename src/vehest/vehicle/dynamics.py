@@ -1,6 +1,16 @@
 """Planar cars that differ in what of them is a network: x = (vx, vy, yaw rate, rim speed,
 friction), u = (steering angle, motor current).
 
+All cars share the interface of `Dynamics`: `motion` returns rates and accelerations, from which
+`transition` (Runge-Kutta) and `observation` follow. They differ in who computes the rates:
+
+| class | rates |
+|---|---|
+| `PacejkaCar` | `PlanarCar` on Pacejka's curves |
+| `ResidualCar` | the same plus a network's output |
+| `TyreNetworkCar` | `PlanarCar` on tyre forces of a network |
+| `NeuralCar` | a network's output |
+
 Source: Węgrzynowski et al. 2024, Section III-B.2; sizes, inputs and start values as in its authors'
 code.
 """
@@ -37,6 +47,16 @@ UNSCALED = 0.4  # factor of the forces of a tyre network that does not know the 
 class Perceptron(nn.Sequential):
     """Fully connected layers with sigmoids between them; inputs are divided and outputs multiplied
     by fixed scales, 1 to begin with.
+
+    Parameters
+    ----------
+    *sizes : int
+        Inputs, units of each hidden layer, outputs. No sigmoid follows the last layer.
+
+    Attributes
+    ----------
+    input_scale, output_scale : Tensor
+        (inputs,) and (outputs,); buffers, which are stored with the model and not learnt.
     """
 
     input_scale: Tensor
@@ -69,7 +89,15 @@ class Perceptron(nn.Sequential):
                         )
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weight and offset of each layer, scales included."""
+        """Weight and offset of each layer, scales included.
+
+        Returns
+        -------
+        list[tuple[Tensor, Tensor]]
+            For each layer W, (out, in), and b, (out,). The input scale is divided into the first
+            weight and the output scale multiplied into the last layer, so that a caller computes W
+            x + b and sigmoids alone.
+        """
         linear = [layer for layer in self if isinstance(layer, nn.Linear)]
         pairs: list[tuple[Tensor, Tensor]] = [(layer.weight, layer.bias) for layer in linear]
         pairs[0] = (pairs[0][0] / self.input_scale, pairs[0][1])
@@ -83,8 +111,23 @@ class Perceptron(nn.Sequential):
 def rk4(
     derivative: Callable[[Tensor, Tensor], Tensor], state: Tensor, inputs: Tensor, step: float
 ) -> Tensor:
-    """The state, (..., n), one step [s] later by the classical Runge-Kutta method (Kutta 1901),
-    inputs (..., p) held over it.
+    """Integrate one step by the classical Runge-Kutta method, inputs held over it.
+
+    x⁺ = x + τ/6 (k₁ + 2 k₂ + 2 k₃ + k₄), with k₁ = f(x), k₂ = f(x + τ/2 k₁), k₃ = f(x + τ/2 k₂) and
+    k₄ = f(x + τ k₃).
+
+    Parameters
+    ----------
+    derivative : Callable[[Tensor, Tensor], Tensor]
+        f: states (..., n) and inputs (..., p) to rates (..., n), in units of the state per second.
+    state : Tensor
+        x, (..., n).
+    inputs : Tensor
+        (..., p).
+    step : float
+        τ [s].
+
+    Source: Kutta 1901.
     """
     first = derivative(state, inputs)
     second = derivative(state + 0.5 * step * first, inputs)
@@ -103,23 +146,35 @@ class Dynamics(nn.Module):
         Parameters
         ----------
         state : Tensor
-            (..., 5).
+            (..., 5) in the order of `STATES`: vx, vy [m/s], yaw rate [rad/s], rim speed [m/s],
+            friction [1].
         inputs : Tensor
-            (..., 2).
+            (..., 2): steering angle [rad], positive to the left, and motor current [A].
+
+        Returns
+        -------
+        Motion
+            Rates (..., 4) of all states but the friction; accelerations at the centre of gravity.
         """
 
     def rates(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """dx/dt, (..., 5)."""
+        """dx/dt, (..., 5), of states (..., 5) under inputs (..., 2); that of the friction is 0."""
         moving = self.motion(state, inputs).rates
         return torch.cat([moving, torch.zeros_like(moving[..., :1])], -1)
 
     def transition(self, state: Tensor, inputs: Tensor, step: float) -> Tensor:
-        """The state one step [s] later, by the Runge-Kutta method, (..., 5)."""
+        """The state one step [s] later, by the Runge-Kutta method, (..., 5).
+
+        State (..., 5) and inputs (..., 2) may broadcast against each other.
+        """
         state, inputs = _broadcast(state, inputs)
         return rk4(self.rates, state, inputs, step)
 
     def observation(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """What sensors read: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (..., 4)."""
+        """What sensors read: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (..., 4).
+
+        Yaw rate and rim speed are those of the state itself.
+        """
         state, inputs = _broadcast(state, inputs)
         motion = self.motion(state, inputs)
         return torch.cat([motion.ax.unsqueeze(-1), motion.ay.unsqueeze(-1), state[..., 2:4]], -1)
@@ -134,6 +189,13 @@ class Dynamics(nn.Module):
 class PacejkaCar(Dynamics):
     """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not
     the state's.
+
+    Parameters
+    ----------
+    car : Mapping[str, float], default F1TENTH
+        Values that learning starts from, as `F1TENTH`.
+    with_curvature : bool, default False
+        Whether the curvature E of all curves is learnt too.
     """
 
     def __init__(self, car: Mapping[str, float] = F1TENTH, *, with_curvature: bool = False) -> None:
@@ -149,7 +211,17 @@ class PacejkaCar(Dynamics):
 
 
 class ResidualCar(PacejkaCar):
-    """PCR: the same, and a network that adds to its rates."""
+    """PCR: the same, and a network that adds to its rates.
+
+    The network receives vx, vy, yaw rate, rim speed, steering angle and current, and adds to all
+    four rates. Accelerations follow from the corrected rates by kinematics, a_x = vx' - vy r and
+    a_y = vy' + vx r, so that they stay consistent with the motion.
+
+    Parameters
+    ----------
+    hidden : Sequence[int], default (256, 256)
+        Units of each hidden layer.
+    """
 
     def __init__(
         self, car: Mapping[str, float] = F1TENTH, *, hidden: Sequence[int] = (256, 256)
@@ -167,7 +239,15 @@ class ResidualCar(PacejkaCar):
 
 
 class NeuralCar(Dynamics):
-    """NN: the rates are a network's (Eq. 4)."""
+    """NN: the rates are a network's (Eq. 4).
+
+    It has no physical parameters, and its inputs are those of `ResidualCar`'s network.
+
+    Parameters
+    ----------
+    hidden : Sequence[int], default (256, 256)
+        Units of each hidden layer.
+    """
 
     def __init__(self, hidden: Sequence[int] = (256, 256)) -> None:
         super().__init__()
@@ -181,8 +261,9 @@ class NeuralCar(Dynamics):
 class TyreNetworkCar(Dynamics):
     """NNTF and NNT: single track with a network for the tyres (Eqs. 6 and 5).
 
-    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network sees vx, vy, yaw rate, rim speed,
-    friction, steering angle and slips. NNT: forces are 0.4 o, and it sees the motor's current too.
+    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network receives vx, vy, yaw rate, rim
+    speed, friction, steering angle and slips. NNT: forces are 0.4 o, and it receives the motor's
+    current too.
 
     Parameters
     ----------
@@ -203,7 +284,23 @@ class TyreNetworkCar(Dynamics):
         self.network = Perceptron(9 if friction_scaled else 10, *hidden, 4)
 
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
-        """Forces of both axles [N]."""
+        """Forces of both axles in the wheels' axes [N].
+
+        Parameters
+        ----------
+        state : Tensor
+            (..., 5), see `Dynamics.motion`.
+        inputs : Tensor
+            (..., 2).
+        slips : Slips
+            Of these states.
+
+        Returns
+        -------
+        TyreForces
+            NNTF: lateral forces oppose the slip angle, since softplus is positive; longitudinal
+            ones may have either sign. NNT: the network's outputs, with any sign.
+        """
         steer, current = inputs.unbind(-1)
         features = [*state.unbind(-1), steer, slips.front, slips.rear, slips.ratio]
         if not self.friction_scaled:
@@ -230,6 +327,12 @@ class TyreNetworkCar(Dynamics):
 def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
     """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and fixed ones as
     `FIXED_PARAMETERS`; 0 and 1 where a car has none.
+
+    Returns
+    -------
+    tuple[Tensor, tuple[float, ...]]
+        (len(LEARNT) + len(PACEJKA),) in SI units, and mass [kg], wheelbase [m] and wheel radius
+        [m].
     """
     car = getattr(dynamics, "car", None)
     tyres = getattr(dynamics, "tyres", None)
@@ -253,5 +356,6 @@ def _kinematic(state: Tensor, rates: Tensor) -> Motion:
 
 
 def _broadcast(state: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Expand leading dimensions of a state and of inputs to their common shape."""
     shape = torch.broadcast_shapes(state.shape[:-1], inputs.shape[:-1])
     return state.expand(*shape, state.shape[-1]), inputs.expand(*shape, inputs.shape[-1])

@@ -31,7 +31,10 @@ RANGES: Mapping[str, Range] = {
 
 
 def check_parameters(parameters: Any) -> None:
-    """Raise `ValueError` for a field of a car's parameters that is outside of `RANGES`."""
+    """Raise `ValueError` for a field of a car's parameters that is outside of `RANGES`.
+
+    A NaN counts as not positive.
+    """
     for entry in fields(parameters):
         value = getattr(parameters, entry.name)
         if not value > 0:
@@ -43,8 +46,12 @@ def check_parameters(parameters: Any) -> None:
 
 @dataclass(frozen=True)
 class SingleTrackParameters:
-    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number
-    outside of `RANGES`.
+    """A car as a single track: each axle one tyre on the centre line.
+
+    Raises
+    ------
+    ValueError
+        A number outside of `RANGES`.
     """
 
     mass: float  # [kg]
@@ -55,6 +62,7 @@ class SingleTrackParameters:
     cornering_stiffness_rear: float  # the same of the rear axle [N/rad]
 
     def __post_init__(self) -> None:
+        """Check all values against `RANGES`."""
         check_parameters(self)
 
 

@@ -57,6 +57,13 @@ class PlanarCar(nn.Module):
     ----------
     car : Mapping[str, float], default F1TENTH
         Values by name, as `F1TENTH`.
+
+    Attributes
+    ----------
+    mass, wheelbase, wheel_radius : float
+        [kg], [m], [m]; not learnt.
+    learnt : PositiveParameters
+        The values of `LEARNT`, in SI units.
     """
 
     def __init__(self, car: Mapping[str, float] = F1TENTH) -> None:
@@ -72,7 +79,19 @@ class PlanarCar(nn.Module):
         return self.wheelbase - self.learnt["cg_to_rear_axle"]
 
     def slips(self, state: Tensor, inputs: Tensor) -> Slips:
-        """How the tyres slide; as in the authors' code."""
+        """How the tyres slide; as in the authors' code.
+
+        α_F = atan((vy + l_F r)/vx) - δ, α_R = atan((vy - l_R r)/vx), κ = (ω - vx)/vx with the rim
+        speed ω; `SLIP_SPEED_OFFSET` is added to every vx in a denominator. Slip angles are positive
+        where a wheel slides to the left, hence the lateral forces of a tyre have the opposite sign.
+
+        Parameters
+        ----------
+        state : Tensor
+            vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more).
+        inputs : Tensor
+            Steering angle [rad] first, (..., 2).
+        """
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
         vx_safe = vx + SLIP_SPEED_OFFSET
         return Slips(
@@ -87,10 +106,22 @@ class PlanarCar(nn.Module):
         return weight * self.learnt["cg_to_rear_axle"], weight * self.to_front_axle
 
     def motion(self, state: Tensor, inputs: Tensor, forces: TyreForces) -> Motion:
-        """Rates under given tyre forces.
+        """Rates under given tyre forces (Eq. 2, see the module).
 
-        The state is vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4
-        or more); inputs are steering angle [rad] and motor current [A], (..., 2).
+        Parameters
+        ----------
+        state : Tensor
+            vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more).
+        inputs : Tensor
+            Steering angle [rad] and motor current [A], (..., 2).
+        forces : TyreForces
+            In the wheels' axes [N].
+
+        Returns
+        -------
+        Motion
+            Rates (..., 4) and accelerations at the centre of gravity. Drag and Coulomb friction
+            have no sign at standstill, where they are 0.
         """
         p = self.learnt
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)

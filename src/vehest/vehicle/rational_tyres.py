@@ -24,7 +24,9 @@ class AxleForce(NamedTuple):
 
 
 def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:
-    """Force and derivatives; tensors, arrays or numbers that broadcast, and compiled code.
+    """Force of an axle and its derivatives, in closed form.
+
+    The code uses operators alone, so that one definition serves torch, NumPy and compiled kernels.
 
     Parameters
     ----------
@@ -36,6 +38,13 @@ def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:
         Cornering stiffness at friction 1 [N/rad].
     friction : Any
         Between tyre and road, μ [1].
+
+    Returns
+    -------
+    AxleForce
+        Values of the shape to which the arguments, tensors, arrays or numbers, broadcast.
+
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 3 and 4.
     """
     bend = slip * slip / (c1 * (friction + 1.0))
     share = 1.0 / (1.0 + bend)

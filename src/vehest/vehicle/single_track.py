@@ -30,15 +30,34 @@ class LateralModel(NamedTuple):
     D: FloatArray  # (...)
 
     def in_steps(self, step: float) -> LateralModel:
-        """Forward Euler, x⁺ = (I + τA) x + τB δ.
+        """Discretise by forward Euler, x⁺ = (I + τA) x + τB δ; C and D stay.
 
         It is stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2.
+
+        Parameters
+        ----------
+        step : float
+            τ [s].
         """
         return self._replace(A=np.eye(2) + step * self.A, B=step * self.B)
 
 
 def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
-    """The model at forward speeds u, positive (...) [m/s]; it is continuous."""
+    """Continuous model at forward speeds.
+
+    Parameters
+    ----------
+    car : SingleTrackParameters
+        Masses, lengths and cornering stiffnesses of whole axles.
+    vx : FloatArray
+        Forward speed u, positive, of any shape (...) [m/s]; at 0 the model has infinite entries.
+
+    Returns
+    -------
+    LateralModel
+        Matrices with the leading dimensions (...), for the state (β [rad], r [rad/s]) and the input
+        δ [rad].
+    """
     u = np.asarray(vx, np.float64)
     front = car.cornering_stiffness_front
     rear = car.cornering_stiffness_rear

@@ -42,8 +42,19 @@ class TyreTrack:
     step: float  # Δt [s]
 
     def parameters(self, states: Tensor) -> list[Tensor]:
-        """Tyre parameters in the order of `TYRE_PARAMETERS`, of states (..., n): five of shape
-        (...).
+        """Tyre parameters of states, in the order of `TYRE_PARAMETERS`.
+
+        Parameters
+        ----------
+        states : Tensor
+            (..., n); columns from `MOTION` on are logarithms of adapted parameters over nominal
+            ones.
+
+        Returns
+        -------
+        list[Tensor]
+            c₁ [rad²] and c₂ [N/rad] of the front axle, of the rear axle, friction [1]: five of
+            shape (...). Those that are not adapted have their nominal values.
         """
         values = [states.new_full(states.shape[:-1], value) for value in self.nominal]
         for column, index in enumerate(self.adapted, len(MOTION)):
@@ -51,7 +62,15 @@ class TyreTrack:
         return values
 
     def axles(self, states: Tensor, inputs: Tensor) -> tuple[AxleForce, AxleForce]:
-        """Forces of the front and the rear axle, of states (..., n) and inputs (..., 2)."""
+        """Axle forces of states (..., n) under inputs (u [m/s], δ [rad]), (..., 2).
+
+        α_F = δ - β - a_F r/u, α_R = -β + a_R r/u. The speed must be positive.
+
+        Returns
+        -------
+        tuple[AxleForce, AxleForce]
+            Force and derivatives of the front and of the rear axle, positive to the left.
+        """
         c1_front, c2_front, c1_rear, c2_rear, friction = self.parameters(states)
         sideslip = states[..., 0]
         turn = states[..., 1] / inputs[..., 0]
@@ -62,7 +81,11 @@ class TyreTrack:
         )
 
     def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """States one step later, (..., n) under inputs (..., 2)."""
+        """States one step later, (..., n) under inputs (..., 2) (Eqs. 22 to 25, 47, 48).
+
+        β and r move by their rates; the rates are replaced by those that the forces give, without
+        the step's length; adapted logarithms stay.
+        """
         front, rear = self.axles(states, inputs)
         car = self.car
         rates = [
@@ -74,17 +97,35 @@ class TyreTrack:
         return torch.cat([moved, torch.stack(rates, -1), states[..., 4:]], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n), (..., 2); Eqs. 38 to
-        40.
+        """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n) under inputs (...,
+        2): (..., 2).
+
+        a_y = u (β' + r) (Eqs. 38 to 40).
         """
         return torch.stack([states[..., 1], inputs[..., 0] * (states[..., 2] + states[..., 1])], -1)
 
     def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: float) -> Tensor:
-        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n), of states (..., n) and inputs (..., 2).
+        """Covariance of the process noise of one step, Q = Δt B Λ Bᵀ (Eqs. 41 to 45).
 
-        The steering angle changes the next state by the first column of B (Eqs. 52, 60). Standard
-        deviations: ``steer`` of it for a second's step [rad √s], ``tyres`` of the logarithms of the
-        adapted parameters [1/√s].
+        The steering angle changes the next state by the first column of B (Eqs. 52, 60): rates of
+        sideslip and yaw by the slope of the front axle's force. Logarithms of adapted parameters
+        wander independently of each other.
+
+        Parameters
+        ----------
+        states : Tensor
+            (..., n), where the slope is taken.
+        inputs : Tensor
+            u [m/s] and δ [rad], (..., 2).
+        steer : float
+            Standard deviation of the steering angle for a second's step [rad/√s].
+        tyres : float
+            Standard deviation of the adapted logarithms [1/√s].
+
+        Returns
+        -------
+        Tensor
+            (..., n, n), symmetric, of rank 1 in the first four states.
         """
         front, _ = self.axles(states, inputs)
         slope = torch.zeros_like(states)

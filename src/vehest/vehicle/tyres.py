@@ -34,6 +34,11 @@ class TyreForces(NamedTuple):
 class PositiveParameters(nn.Module):
     """Named positive numbers, learnt from values as their logarithms.
 
+    Parameters
+    ----------
+    values : Mapping[str, float]
+        Start values by name, positive; each becomes the parameter ``log_NAME``, a scalar.
+
     Source: Węgrzynowski et al. 2024, Section III-B.4.
     """
 
@@ -43,7 +48,7 @@ class PositiveParameters(nn.Module):
             self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(math.log(value))))
 
     def __getitem__(self, name: str) -> Tensor:
-        """The value of a parameter."""
+        """Value of a parameter, positive, scalar; gradients pass to its logarithm."""
         logarithm: Tensor = getattr(self, f"log_{name}")
         return logarithm.exp()
 
@@ -53,8 +58,21 @@ def magic_formula(
 ) -> Tensor:
     """Pacejka's curve for a peak of 1: sin(C atan(B s - E (B s - atan(B s)))).
 
-    The slip s is an angle [rad] or a ratio, the stiffness B [1/rad] or [1]; a curvature E of 0 is
-    left out.
+    Parameters
+    ----------
+    slip : Tensor
+        s, an angle [rad] or a ratio [1], (...).
+    stiffness : Tensor
+        B [1/rad] or [1].
+    shape : Tensor
+        C [1].
+    curvature : Tensor | float, default 0.0
+        E [1]; 0: the paper's curve without it.
+
+    Returns
+    -------
+    Tensor
+        (...), with the sign of the slip near zero; multiplied by the peak force it is a force.
 
     Source: Pacejka & Bakker 1992.
     """
@@ -86,7 +104,20 @@ class PacejkaTyres(nn.Module):
         self.curvature = nn.Parameter(torch.zeros(3)) if with_curvature else None
 
     def forward(self, slips: Slips, loads: tuple[Tensor, Tensor]) -> TyreForces:
-        """Forces of both axles under loads on the front and the rear axle [N]."""
+        """Forces of both axles.
+
+        Parameters
+        ----------
+        slips : Slips
+            (...), slip angles positive to the left.
+        loads : tuple[Tensor, Tensor]
+            Vertical force on the front and on the rear axle [N].
+
+        Returns
+        -------
+        TyreForces
+            In the wheels' axes, (...) [N]; lateral forces oppose the slip angles.
+        """
         p = self.parameters_of
         mu = p["friction"]
         ex, ef, er = (0.0, 0.0, 0.0) if self.curvature is None else self.curvature

@@ -77,7 +77,7 @@ def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, l
 
 
 def group_of(recording: str) -> str:
-    """The group of manoeuvres that a recording's name tells of; ``other`` if it tells of none."""
+    """The group of manoeuvres that a recording's name states; ``other`` if it states none."""
     return next((group for part, group in GROUPS.items() if part in recording), "other")
 
 

@@ -45,7 +45,7 @@ BODIES = {
     "inertia −10 %": (1.0, 0.9),
     "inertia +10 %": (1.0, 1.1),
 }
-"""What of the car is taken for another than it is -> factors of mass and of yaw inertia."""
+"""What the filter assumes wrongly of the car -> factors of mass and of yaw inertia."""
 WITH_FILTER = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
 TRIALS = 30
 STAGES = 2

@@ -36,7 +36,7 @@ CHANNELS = ("yaw_rate", "vx", "ay", "steer")
 SKIP = 30  # samples, 1.5 s, that are not scored, as in the study's other drives
 MIN_SPEED = 2.0  # m/s, below which errors are not scored
 BOX = {"ay": (-4.0, 4.0), "steer": (-6.0, 4.0), "tyres": (-8.0, 2.0)}
-"""Powers of ten that the search may take: σ_ay [m/s²], σ_δ [rad √s], wander of the logarithms of
+"""Powers of ten that the search may take: σ_ay [m/s²], σ_δ [rad/√s], wander of the logarithms of
 tyre parameters [1/√s].
 """
 DEVIATION = (
@@ -56,7 +56,7 @@ class Levels:
     """Noise levels that are tuned."""
 
     ay: float  # σ_ay [m/s²]
-    steer: float  # σ_δ [rad √s]
+    steer: float  # σ_δ [rad/√s]
     tyres: float = 1e-3  # wander of the logarithms of tyre parameters [1/√s]
 
 

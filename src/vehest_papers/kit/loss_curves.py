@@ -4,6 +4,7 @@ figure.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,6 +19,7 @@ NAME = "loss_curves"
 LOSSES = {"train_loss": "#9aa7b5", "validation_loss": "#0b4f9c"}
 COLUMNS = ("candidate", "seed", "phase", "epoch", *LOSSES)
 PANELS_A_ROW = 4
+TITLE_WIDTH = 30  # characters of a line of a panel's title
 
 
 def loss_curves(models: Mapping[str, Sequence[EvaluatedModel]]) -> pd.DataFrame:
@@ -70,7 +72,7 @@ def loss_figure(losses: pd.DataFrame, caption: str) -> Figure:
                 epochs = 1 + np.flatnonzero(validated)
                 scaled = _scaled(losses_of_epochs[validated])
                 axes.plot(epochs, scaled, color=colour, label=label)
-            axes.set_title(candidate, fontsize=6.0)
+            axes.set_title(textwrap.fill(candidate, TITLE_WIDTH), fontsize=6.0)
             axes.set_yticks([0.0, 1.0])
         panels[0, 0].legend(loc="upper right")
         panels[-1, 0].set_xlabel("epoch")

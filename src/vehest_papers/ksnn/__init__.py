@@ -4,8 +4,8 @@
 Parts ``pair_NN_stop`` and ``pair_NN_converged`` are pairs of cars with the test sets ``own``,
 ``other`` and ``third``; ``scheme_1`` and ``scheme_2`` have the test sets ``c2`` and ``f2``. Any
 part may be missing. What is not trained yet is named in the report, and claims on it are not
-assessed. Table ``blocks`` holds the errors by block, ``training`` how far candidates were trained,
-which ``doubled_NN`` checks.
+assessed. Table ``blocks`` contains the errors by block, ``training`` how far candidates were
+trained, which ``doubled_NN`` checks.
 """
 
 from vehest_papers.ksnn.document import documents

@@ -41,7 +41,7 @@ class Behaviour:
     """Errors of the candidates of a scheme on the other car under special conditions."""
 
     low_yaw_rate: SegmentErrors  # categories, where |ω| lies below it
-    corrected: SegmentErrors  # categories, the mean bias of a_y taken off
+    corrected: SegmentErrors  # categories, the mean bias of a_y removed
 
     @classmethod
     def of(cls, scheme: Scheme) -> Behaviour:
@@ -122,7 +122,7 @@ def mean_biases(scheme: Scheme) -> dict[str, float]:
 def without_biases(
     scheme: Scheme, category: str, biases: Mapping[str, float], test: str
 ) -> list[Segments]:
-    """Segments of each seed of a category with the mean bias taken off a_y (Section IX-A), which
+    """Segments of each seed of a category with the mean bias of a_y removed (Section IX-A), which
     takes the reference.
 
     Nothing is trained again: a network that can hold an offset (with biases, GRU, LSTM) has learnt

@@ -1,7 +1,7 @@
 """Sensor noise read off a real recording: the way the levels of ``race`` were found.
 
-What shakes the body above 10 Hz is counted as noise: engine, road and sensors cannot be told apart
-in a recording. Read the Ferrari recording again with::
+What shakes the body above 10 Hz is counted as noise: engine, road and sensors cannot be
+distinguished in a recording. Read the Ferrari recording again with::
 
     from vehest_papers.proving_ground.noise_reading import read_off
     print(read_off(recording.channels, recording.rate_hz))

@@ -27,6 +27,7 @@ from vehest.alignment.proposals.columns import (
     largest,
     si_factor,
     slow_of,
+    unchanging,
     without_axes,
 )
 from vehest.alignment.proposals.fitting import (
@@ -62,11 +63,13 @@ from vehest.alignment.proposals.wheels import (
 )
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.errors import abbreviated
 
 MAX_STANDSTILL_SPEED = 0.5  # m/s; a car whose speed never exceeds it did not move
 SCORE_MARGIN = 4.0  # below the best triple, within which an agreement with ax decides
 AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's score
 MAX_AX_CANDIDATES = 40
+MAX_LISTED = 8
 SPEED_GAIN_RANGE = (0.97, 1.08)  # of ay over d(vy)/dt + vx·yaw_rate, with a right speed
 SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # where d(vy)/dt is not known
 MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)  # beyond, a unit may be wrong (`scales`)
@@ -138,7 +141,7 @@ def propose(
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     usable = candidates(columns, clock_hz)
-    wheels = find_wheels(usable)
+    wheels, wheel_notes = find_wheels(usable)
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
     is_standing = _is_standing(usable)
@@ -150,7 +153,7 @@ def propose(
     search = None if is_standing else _best_search(usable, turnings, clock_hz)
     motion = search.motion if search else None
     proposals = _assign(usable, search, wheels)
-    proposals = _with_pose(proposals, usable, motion)
+    proposals = _with_pose(proposals.with_notes(*wheel_notes), usable, motion)
     if is_standing:
         standstill = f"speed below {MAX_STANDSTILL_SPEED:g} m/s"
         proposals = proposals.with_notes(
@@ -165,6 +168,11 @@ def propose(
         _with_signs_of_majority(proposals),
         {column.name: column.values for column in (*usable, *wheels.values())},
     )
+    if constant := unchanging(columns):
+        proposals = proposals.with_notes(
+            f"constant, or of few values, and left out: {abbreviated(constant, MAX_LISTED)}; "
+            "check these sensors"
+        )
     assigned = {proposal.column for proposal in proposals.channels}
     assigned |= {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, *_ in columns if name not in assigned)
@@ -216,6 +224,9 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
 
 
 def _is_standing(columns: Sequence[Candidate]) -> bool:
+    """Whether columns are named as speeds with units, and none of them ever exceeds
+    MAX_STANDSTILL_SPEED.
+    """
     speeds = [column for column in columns if "vx" in column.hints and column.unit]
     speeds = [column for column in speeds if column.measures("vx")]
     limit = MAX_STANDSTILL_SPEED
@@ -241,6 +252,7 @@ def _turnings_of_any_axes(
 
 
 def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: float) -> Search:
+    """A search of the remaining columns, given speed, yaw rate and lateral acceleration."""
     chosen = turning.columns.values()
     free = [column for column in columns if column not in chosen and not column.is_wheel_mean]
     return Search(turning, turning.motion(rate_hz), free)
@@ -304,7 +316,17 @@ def _rate_by_ax(search: Search) -> float | None:
 
 
 def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels) -> Proposals:
-    """Proposals whose signs are right if that of the yaw rate's column is."""
+    """Proposals whose signs are right if that of the yaw rate's column is.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        All columns, the mean of the wheels among them.
+    search : Search or None
+        With the motion; None where no speed and yaw rate were found, so that only names decide.
+    wheels : Wheels
+        Columns that are named for a wheel.
+    """
     channels: dict[str, Proposal] = {}
     radius: float | None = None
     notes: tuple[str, ...] = ()
@@ -696,4 +718,5 @@ def _left_right_clues(
 
 
 def _first_named(columns: Sequence[Candidate], role: str) -> Candidate | None:
+    """The first column whose name suggests a role; None where none does."""
     return next((column for column in columns if role in column.hints), None)

@@ -25,6 +25,7 @@ MAX_STRAY_SHARE = 0.002
 MIN_CLOCK_SAMPLES = 1000  # samples
 HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
+MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -91,15 +92,60 @@ class Candidate:
 
     def measures(self, channel: str) -> bool:
         """Whether the header's unit, if there is one, is of a channel's quantity."""
-        try:
-            return not self.unit or si_factor(self.unit, channel) > 0.0
-        except DataError:
-            return False
+        return not self.unit or is_unit_of(self.unit, channel)
 
 
 def si_factor(unit: str, channel: str) -> float:
-    """Factor from a unit to that of a channel."""
+    """Factor from a unit to that of a channel.
+
+    Parameters
+    ----------
+    unit : str
+        As vehest spells it.
+    channel : str
+        A channel, whose SI unit is the target.
+
+    Raises
+    ------
+    DataError
+        The unit is unknown, or of another quantity.
+    """
     return factor_to_si(unit, CHANNELS[channel].unit)
+
+
+def unchanging(columns: Sequence[tuple[str, str, FloatArray, str]]) -> list[str]:
+    """Columns that are named like a channel of the motion, in a unit of it, and take too few values
+    to be one.
+
+    Parameters
+    ----------
+    columns : sequence of tuple
+        As `candidates` takes them.
+
+    Returns
+    -------
+    list of str
+        Name of each, with its value or the number of values.
+    """
+    texts = []
+    for name, unit, values, _ in columns:
+        is_motion = any(
+            "wheel_speed" in role or (role in UNITS and (not unit or is_unit_of(unit, role)))
+            for role in hints(name, unit)
+        )
+        levels = np.unique(values[np.isfinite(values)][:MAX_LEVEL_SAMPLES])
+        if is_motion and 0 < len(levels) < MIN_LEVELS:
+            seen = f"{levels[0]:.4g}" if len(levels) == 1 else f"{len(levels)} values"
+            texts.append(f"'{name}' ({seen})")
+    return texts
+
+
+def is_unit_of(unit: str, channel: str) -> bool:
+    """Whether a unit is of a channel's quantity."""
+    try:
+        return si_factor(unit, channel) > 0.0
+    except DataError:
+        return False
 
 
 def candidates(
@@ -107,6 +153,19 @@ def candidates(
 ) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see
     `vehest.alignment.proposals.assign.propose`.
+
+    Parameters
+    ----------
+    columns : sequence of tuple
+        Name, unit (empty if unknown), samples (T,) with NaN for missing ones, and device (``car``,
+        ``reference`` or empty).
+    rate_hz : float
+        Of the samples [Hz].
+
+    Returns
+    -------
+    list of Candidate
+        Missing and stray samples are bridged by lines.
     """
     usable = []
     for name, unit, values, device in columns:
@@ -114,7 +173,7 @@ def candidates(
         if (
             1.0 - is_measured.mean() > MAX_MISSING_SHARE
             or not np.ptp(values[is_measured]) > 0.0
-            or len(np.unique(values[is_measured][:200_000])) < MIN_LEVELS
+            or len(np.unique(values[is_measured][:MAX_LEVEL_SAMPLES])) < MIN_LEVELS
         ):
             continue
         roles = hints(name, unit)
@@ -165,7 +224,21 @@ def _stray(values: FloatArray) -> NDArray[np.bool_]:
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
-    """Low-passed at `SLOW_HZ` and thinned out."""
+    """Low-passed at `SLOW_HZ` and thinned out.
+
+    Parameters
+    ----------
+    values : FloatArray
+        (T,), without gaps.
+    rate_hz : float
+        Sampling rate [Hz]; a slow or short column is not filtered.
+
+    Returns
+    -------
+    FloatArray
+        (S,), at about SLOW_RATE_HZ and at most MAX_SLOW_SAMPLES long; the filter runs both ways and
+        delays nothing.
+    """
     if rate_hz > 4.0 * SLOW_HZ and len(values) > 30:
         sections = signal.butter(2, SLOW_HZ, fs=rate_hz, output="sos")
         values = np.asarray(signal.sosfiltfilt(sections, values), dtype=np.float64)
@@ -174,7 +247,13 @@ def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def correlation(left: FloatArray, right: FloatArray) -> float:
-    """Of two signals about their means; 0 where one does not change."""
+    """Of two signals about their means; 0 where one does not change.
+
+    Parameters
+    ----------
+    left, right : FloatArray
+        Of one length.
+    """
     a = left - left.mean()
     b = right - right.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))

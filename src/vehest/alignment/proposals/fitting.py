@@ -104,7 +104,7 @@ class Angle(NamedTuple):
     channel: str  # ``steer`` or ``handwheel``
     unit: str  # of the column
     length: float  # wheelbase, or that times the steering ratio, by slow cornering [m]
-    largest: float  # angle, straight ahead taken off [rad]
+    largest: float  # angle, less that of straight ahead [rad]
     is_repeatable: bool  # whether both halves of the slow corners give nearly this length
 
 
@@ -199,6 +199,9 @@ def may_be_ax(column: Candidate) -> bool:
 
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:
+    """A column as longitudinal acceleration, by its agreement with d(vx)/dt and its name; None
+    where neither speaks for it.
+    """
     if not may_be_ax(column):
         return None
     best = longitudinal(search.motion, column)
@@ -319,6 +322,9 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
 
 
 def _as_lateral(search: Search, column: Candidate) -> Offer | None:
+    """A column as lateral velocity or sideslip angle, in the unit in which its derivative agrees
+    best with ay - vx·yaw_rate; None where no car could slide like that.
+    """
     motion = search.motion
     is_named_otherwise = STRONG in column.hints.values()
     agreements = [
@@ -386,6 +392,9 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
 
 
 def _score(strength: float, min_strength: float, hint: float) -> float:
+    """Score of an offer: up to 8 for the correlation beyond the least one, plus the hint of the
+    name; without a relation, the hint less one.
+    """
     return 8.0 * (strength - min_strength) / (1.0 - min_strength) + hint if strength else hint - 1.0
 
 
@@ -400,6 +409,7 @@ def _is_plausible(motion: Motion, column: Candidate, fit: Agreement) -> bool:
 
 
 def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
+    """``name``, ``unit`` or both as evidence, in a list; empty where neither speaks for a role."""
     parts = [
         *(["name"] if any(role in column.hints for role in roles) else []),
         *(["unit"] if column.unit else []),
@@ -408,7 +418,22 @@ def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
 
 
 def longitudinal(motion: Motion, column: Candidate, units: Sequence[str] = ()) -> Agreement:
-    """Agreement of a column with d(vx)/dt, in the unit with a gain near 1."""
+    """Agreement of a column with d(vx)/dt, in the unit with a gain near 1.
+
+    Parameters
+    ----------
+    motion : Motion
+        Speed and yaw rate.
+    column : Candidate
+        Column that may be ax.
+    units : sequence of str
+        To try instead of those of the column.
+
+    Returns
+    -------
+    Agreement
+        Rare units are tried where the others are far off, if the name suggests ax.
+    """
     tried = list(units or column.units("ax"))
     rare = RARE_UNITS["ax"] if "ax" in column.hints and not (units or column.unit) else ()
     fits = [agreement(motion, column, "ax", unit, "ax") for unit in tried]
@@ -469,6 +494,18 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
 
     The length in angle = length·yaw_rate/vx + K·ay + offset is the wheelbase, or that times the
     steering ratio.
+
+    Parameters
+    ----------
+    motion : Motion
+        Speed, yaw rate and, where it is known, lateral acceleration.
+    column : Candidate
+        Column that may be an angle of steering.
+
+    Returns
+    -------
+    list of Angle
+        Empty where no unit gives a possible length and range.
     """
     ay = motion.channels.get("ay", motion.turning)
     rows = _calm(motion)
@@ -517,6 +554,7 @@ def _calm(motion: Motion) -> NDArray[np.int64]:
 
 
 def _driven(motion: Motion) -> BoolArray:
+    """Samples at which the car moves at more than a fifth of its top speed, (T,)."""
     return motion.moving & (motion.vx > 0.2 * float(np.quantile(motion.vx, 0.99)))
 
 

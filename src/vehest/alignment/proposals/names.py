@@ -1,5 +1,9 @@
 """Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x``
 and ``_y``, ``other``.
+
+Names are compared in lower case without marks, umlauts and units in brackets; patterns are English
+and German, as loggers of both languages write them. A strong hint is a name of its own, a weak one
+is shared with other quantities.
 """
 
 from __future__ import annotations
@@ -158,7 +162,18 @@ _PAIRS = (
 
 
 def bare(name: str) -> str:
-    """A name in lower-case words without marks, umlauts and brackets with their content."""
+    """A name in lower-case words without marks, umlauts and brackets with their content.
+
+    Parameters
+    ----------
+    name : str
+        Of a column, such as ``Gyro_Z [deg/s]``.
+
+    Returns
+    -------
+    str
+        Such as ``gyro z``; words begin at capitals within a name too.
+    """
     text = (re.sub(r"[\[({<].*$", "", name) or name).translate(_PLAIN)
     text = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     return re.sub(r"[\W_]+", " ", text).strip().lower()
@@ -168,6 +183,19 @@ def bare(name: str) -> str:
 def hints(name: str, unit: str = "") -> dict[str, float]:
     """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it,
     says of what quantity it is.
+
+    Parameters
+    ----------
+    name : str
+        Of a column.
+    unit : str
+        As vehest spells it; empty if unknown.
+
+    Returns
+    -------
+    dict
+        A single entry for a wheel's speed, a brake pressure, or ``other``: a quantity that is no
+        channel, or one along an axis of the world.
     """
     words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
@@ -236,7 +264,13 @@ def _corner(words: str) -> str:
 
 
 def is_pair(longitudinal: str, lateral: str) -> bool:
-    """Whether two names differ by x and y, u and v, or long and lat alone."""
+    """Whether two names differ by x and y, u and v, or long and lat alone.
+
+    Parameters
+    ----------
+    longitudinal, lateral : str
+        Names of columns, in this order.
+    """
     ahead = bare(longitudinal)
     across = bare(lateral)
     return ahead != across and any(

@@ -32,6 +32,19 @@ def find_pose(
 ) -> tuple[tuple[str, str, str], ...]:
     """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty
     where there is none, or no motion.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        All columns.
+    motion : Motion or None
+        Speed and yaw rate that are known.
+
+    Returns
+    -------
+    tuple
+        ``x``, ``y`` and ``yaw`` in this order; units by the header, else those in which the
+        derivatives agree with the motion.
     """
     pose = named_pose(columns)
     if (
@@ -64,7 +77,22 @@ def find_pose(
 
 
 def turning_of(yaw: Candidate, unit: str, motion: Motion) -> float:
-    """Correlation of a yaw angle's derivative with the yaw rate, where it was not wrapped."""
+    """Correlation of a yaw angle's derivative with the yaw rate, where it was not wrapped.
+
+    Parameters
+    ----------
+    yaw : Candidate
+        Column of an angle, wrapped or not.
+    unit : str
+        Of the column.
+    motion : Motion
+        With the yaw rate.
+
+    Returns
+    -------
+    float
+        Negative where the angle counts the other way round than the yaw rate.
+    """
     turned = np.gradient(np.unwrap(yaw.values * factor_to_si(unit, "rad"))) * motion.rate_hz
     is_sound = np.abs(turned) < MAX_YAW_RATE
     return correlation(turned[is_sound], motion["yaw_rate"][is_sound])

@@ -57,14 +57,27 @@ class Proposal:
         return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence)}"
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """For JSON.
+
+        Returns
+        -------
+        dict
+            Field -> value; ``question`` is called ``asked`` (None where there is none),
+            ``alternatives`` ``others``.
+        """
         plain = asdict(self)
         plain["asked"] = plain.pop("question") or None
         plain["others"] = plain.pop("alternatives")
         return plain
 
     def is_impossible(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Which values of the column no vehicle can have, (T,)."""
+        """Which values of the column no vehicle can have, (T,).
+
+        Parameters
+        ----------
+        values : FloatArray
+            (T,), as the column has them; NaN is not impossible.
+        """
         channel = CHANNELS[self.channel]
         samples = (
             self.sign * self.factor * factor_to_si(self.unit, channel.unit) * (values - self.offset)
@@ -127,7 +140,11 @@ class Proposals:
         return replace(self, channels=tuple(channels), wheel_radius=radius).with_notes(*notes)
 
     def mirrored(self) -> Proposals:
-        """The same for a mirrored car: signs of `LATERAL` channels and of pitch reversed."""
+        """The same for a mirrored car: signs of `LATERAL` channels and of pitch reversed.
+
+        A log alone cannot tell a car from its mirror image: all relations between its channels stay
+        true if every lateral sign is reversed.
+        """
         return self.changed(
             {
                 proposal.channel: replace(proposal, sign=-proposal.sign)

@@ -109,6 +109,15 @@ class WrongScale:
 def unit_of_factor(channel: str, unit: str, factor: float) -> str:
     """The unit of a column that is too large by a factor in another one; empty if none explains
     it.
+
+    Parameters
+    ----------
+    channel : str
+        That the column would be.
+    unit : str
+        In which it was read.
+    factor : float
+        By which it is too large in that unit.
     """
     right = si_factor(unit, channel) / factor
     return next(
@@ -190,7 +199,13 @@ def find_wrong_scale(
 
 
 def is_scale_wrong(turning: Turning) -> bool:
-    """Whether the gain of ay to vx·yaw_rate is far from 1, by regression either way."""
+    """Whether the gain of ay to vx·yaw_rate is far from 1, by regression either way.
+
+    Parameters
+    ----------
+    turning : Turning
+        Columns with their units; without ay there is nothing to be wrong.
+    """
     if "ay" not in turning.columns:
         return False
     spread = -math.log(max(abs(turning.correlation), 1e-9))
@@ -221,6 +236,9 @@ def _checks(
     by_name: Mapping[str, Candidate],
     wheels: Wheels,
 ) -> Iterator[_Check]:
+    """Sizes that tell which of speed, yaw rate and ay is wrong: relations to other channels,
+    lengths by slow corners, and the wheels' radius or speed.
+    """
     samples = {
         name: by_name[proposal.column].values
         * proposal.sign
@@ -262,6 +280,7 @@ def _checks(
 
 
 def _implausibility(turning: Turning, factors: Mapping[str, float]) -> float:
+    """Cost of sizes of speed, yaw rate and ay that no car has, were they too large by factors."""
     return IMPLAUSIBLE_COST * sum(
         not is_plausible(column.size / factors.get(name, 1.0), name, turning.units[name])
         for name, column in turning.columns.items()

@@ -64,6 +64,8 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
+# of the steps from sample to sample; two sensors differ by as much as their noise
+MAX_COPY_DIFFERENCE = 0.05
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
@@ -88,7 +90,19 @@ class Turning:
         return {"vx": ahead, "yaw_rate": 1, "ay": -ahead if self.correlation < 0.0 else ahead}
 
     def motion(self, rate_hz: float) -> Motion:
-        """The motion by these columns."""
+        """The motion by these columns.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the samples [Hz].
+
+        Returns
+        -------
+        Motion
+            In SI units, with signs by which the car drives ahead and ay is +vx·yaw_rate; a sign of
+            the yaw rate that is wrong stays, and is that of ay too.
+        """
         signs = self.signs
         channels = {
             name: column.values * signs[name] * si_factor(self.units[name], name)
@@ -153,7 +167,19 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing."""
+    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing.
+
+    Parameters
+    ----------
+    columns : sequence of Candidate
+        All columns.
+
+    Returns
+    -------
+    Turning or None
+        Units by the header, else the first in which the size is plausible; ``decided`` if the
+        header has both.
+    """
     columns_by_channel = {}
     units = {}
     for channel in ("vx", "yaw_rate"):
@@ -240,7 +266,17 @@ def is_evident(ay: Candidate, scale: float) -> bool:
 
 
 def is_plausible(size: float, channel: str, unit: str) -> bool:
-    """Whether a car has a speed, yaw rate or acceleration of a size."""
+    """Whether a car has a speed, yaw rate or acceleration of a size.
+
+    Parameters
+    ----------
+    size : float
+        99th percentile of the magnitude, in ``unit``.
+    channel : str
+        ``vx``, ``yaw_rate`` or ``ay``.
+    unit : str
+        Of the size.
+    """
     low, high = RANGES[channel]
     return low <= size * si_factor(unit, channel) <= high
 
@@ -360,8 +396,12 @@ def repeated(search: Search) -> Iterator[Proposal]:
             ):
                 # named as a speed, and one but for its scale, as a motor's speed is
                 scaled.append(column)
-        for repeat in repeats:
+        for repeat in list(repeats):
             search.free.remove(repeat.column)
+            if _is_copy(repeat, first, channel):
+                repeats.remove(repeat)
+                evidence = f"'{repeat.column.name}' holds the same samples in {repeat.unit}"
+                yield Proposal(first.column.name, channel, first.unit, first.sign, (evidence,))
         family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
         if repeats:
             yield from _separated(family, channel)
@@ -389,6 +429,12 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
     """With the speed as vx_ref where it is named as a reference, or like the lateral velocity.
 
     Wheels supply the car's own speed.
+
+    Parameters
+    ----------
+    channels : dict
+        Channel -> its proposal; without a lateral velocity, or with a vx_ref, it is returned as it
+        is.
     """
     speed = channels.get("vx")
     lateral = channels.get("vy_ref")
@@ -407,6 +453,16 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
     return {name: proposal for name, proposal in channels.items() if name != "vx"} | {
         "vx_ref": reference
     }
+
+
+def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
+    """Whether a column holds the samples of another one, but for unit, sign and rounding."""
+    if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
+        return False
+    copy, samples = (
+        each.column.values * each.sign * si_factor(each.unit, channel) for each in (repeat, first)
+    )
+    return rms(copy - samples) < MAX_COPY_DIFFERENCE * rms(np.diff(samples))
 
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:

@@ -11,7 +11,14 @@ from itertools import product
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
+from vehest.alignment.proposals.columns import (
+    Candidate,
+    correlation,
+    is_unit_of,
+    largest,
+    si_factor,
+    slow_of,
+)
 from vehest.alignment.proposals.names import WEAK
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.alignment.proposals.turning import RANGES
@@ -24,9 +31,15 @@ MIN_MODEL_RADIUS = 0.02  # of models, which are not fast
 MAX_MODEL_SPEED = 20.0
 MAX_SPEED = 110.0  # m/s
 MIN_TOP_SPEED = 1.0
-AT_RIM = ("km/h", "m/s")
-UNITS = (*AT_RIM, "rpm", "rad/s")
+UNIT_PENALTIES = {  # of units tried where the header is silent; a rare one only if no other fits
+    **dict.fromkeys(("km/h", "m/s", "rpm", "rad/s"), 0.0),
+    "mph": 0.2,
+    **dict.fromkeys(("cm/s", "mm/s", "ft/s", "0.01*km/h", "rev/s", "deg/s"), 1.0),
+}
 MIN_COST_MARGIN = 0.25
+IMPLAUSIBLE = 3.0  # cost of a unit that makes an impossible speed or radius
+MAX_RIM_MISMATCH = 0.3  # of a speed at the rim to that of the car, as a logarithm
+PREFIX = "wheel_speed_"
 # a speedometer over the wheels' speed at the rim: none reads too little, many too much
 SPEEDOMETER_GAIN_RANGE = (
     0.98,
@@ -36,19 +49,50 @@ SPEEDOMETER_GAIN_RANGE = (
 Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 
 
-def find_wheels(columns: Sequence[Candidate]) -> Wheels:
-    """Columns that are named for a wheel each; of several for one, the first."""
+def find_wheels(columns: Sequence[Candidate]) -> tuple[Wheels, list[str]]:
+    """Columns that are named for a wheel each, of several for one the first; notes of those that
+    are left out for their unit.
+    """
     wheels: dict[str, Candidate] = {}
+    left_out: dict[str, list[str]] = {}
     for column in columns:
-        for role in column.hints:
-            if role.startswith("wheel_speed_") and column.unit in ("", *UNITS):
-                wheels.setdefault(role.removeprefix("wheel_speed_"), column)
-    return wheels
+        if not column.is_wheel:
+            continue
+        role = next(iter(column.hints))
+        unit = _header_unit(wheels)
+        problem = ""
+        if not column.measures("vx") and not column.measures(role):
+            problem = "the unit is of no speed"
+        elif unit and column.unit not in ("", unit):
+            problem = f"another wheel is in {unit}"
+        if problem:
+            left_out.setdefault(problem, []).append(f"{role}: {{column: '{column.name}'")
+        else:
+            wheels.setdefault(role.removeprefix(PREFIX), column)
+    notes = [
+        f"named like wheel speeds and left out, since {problem}: to add one, write "
+        + ", ".join(f"{entry}, unit: rad/s, factor: …}}" for entry in entries)
+        + " below channels in the data set"
+        for problem, entries in left_out.items()
+    ]
+    return wheels, notes
 
 
 def turning_left(wheels: Wheels, motion: Motion) -> float:
     """Correlation of the yaw rate with the excess of the right wheels' speed; 0 where one side is
     missing.
+
+    Parameters
+    ----------
+    wheels : Wheels
+        Corner -> column.
+    motion : Motion
+        With the yaw rate.
+
+    Returns
+    -------
+    float
+        Of the axle that decides more clearly; positive where the yaw rate is positive to the left.
     """
     rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     axles = [
@@ -64,6 +108,11 @@ def speed_of_wheels(
 ) -> list[Candidate]:
     """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that
     make ay = vx·yaw_rate.
+
+    Returns
+    -------
+    list of Candidate
+        One, or none.
     """
     if not wheels or any("vx" in column.hints for column in columns):
         return []
@@ -71,7 +120,7 @@ def speed_of_wheels(
     rate, ay = (_named(columns, channel) for channel in ("yaw_rate", "ay"))
     ranked = []
     for unit, rate_unit, ay_unit in product(
-        _units(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]
+        _units_of(wheels), rate.units("yaw_rate") if rate else [""], ay.units("ay") if ay else [""]
     ):
         implausible = False
         scale = None
@@ -85,10 +134,12 @@ def speed_of_wheels(
                 float(np.std(ay.slow)) * si_factor(ay_unit, "ay") / size if size > 0.0 else math.nan
             )
         cost, radius = _cost(unit, scale, mean)
-        ranked.append((cost + 3.0 * implausible, unit, radius))
+        ranked.append((cost + _penalty(wheels, unit) + IMPLAUSIBLE * implausible, unit, radius))
     _, unit, radius = min(ranked)
     speed = mean * (
-        si_factor(unit, "vx") if unit in AT_RIM else radius * si_factor(unit, "wheel_speed_fl")
+        si_factor(unit, "vx")
+        if is_unit_of(unit, "vx")
+        else radius * si_factor(unit, "wheel_speed_fl")
     )
     return [
         Candidate(
@@ -107,11 +158,29 @@ def wheel_proposals(
 ) -> tuple[list[Proposal], float | None]:
     """A channel each, and the rolling radius by which they make the speed, if it has no column; of
     it, the motion's may be made.
+
+    Parameters
+    ----------
+    wheels : Wheels
+        Corner -> column, at least one.
+    motion : Motion or None
+        Whose speed decides the unit; None where it is not known.
+    has_speed : bool
+        Whether a column is the speed.
+    is_wheel_mean : bool
+        Whether the motion's speed was made of the wheels.
+
+    Returns
+    -------
+    tuple
+        Proposals in rad/s or rpm, a speed at the rim brought to rad/s by NOMINAL_RADIUS; and the
+        radius [m], None where there is a column of the speed.
     """
     mean = _mean(wheels)
-    units = _units(wheels)
+    units = _units_of(wheels)
     evidence = ["name"]
     radius = NOMINAL_RADIUS
+    is_weak = False
     if motion is None:
         unit, question = (
             ("rad/s", "unit: there is no speed to compare it with")
@@ -120,36 +189,41 @@ def wheel_proposals(
         )
     else:
         scale = rms(motion.vx) / (rms(mean) or 1.0)
-        ranked = sorted((*_cost(unit, scale, mean), unit) for unit in units)
-        cost, radius, unit = ranked[0]
-        question = (
-            f"unit: {ranked[1][2]} fits equally well"
-            if len(ranked) > 1 and ranked[1][0] - cost < MIN_COST_MARGIN
-            else ""
+        costs = [(unit, *_cost(unit, scale, mean)) for unit in units]
+        ranked = sorted(
+            (cost + _penalty(wheels, unit), radius, unit) for unit, cost, radius in costs
         )
-        if unit in AT_RIM and not is_wheel_mean:
+        cost, radius, unit = ranked[0]
+        question = ""
+        if cost >= IMPLAUSIBLE:
+            question = f"unit: in {unit} it does not agree with the speed"
+            is_weak = len(units) > 1
+        elif len(ranked) > 1 and ranked[1][0] - cost < MIN_COST_MARGIN:
+            question = f"unit: {ranked[1][2]} fits equally well"
+        if is_unit_of(unit, "vx") and not is_wheel_mean:
             radius = NOMINAL_RADIUS * scale / si_factor(unit, "vx")
         source = "ay/yaw_rate" if is_wheel_mean else "the speed"
         evidence += [
             f"circumferential speed in {unit}, compared with {source}"
-            if unit in AT_RIM
+            if is_unit_of(unit, "vx")
             else f"in {unit} with a radius of {radius:.3g} m, compared with {source}"
         ]
     factor = 1.0
-    if unit in AT_RIM:
+    if is_unit_of(unit, "vx"):
         factor = float(f"{si_factor(unit, 'vx') / NOMINAL_RADIUS:.7g}")
         unit = "rad/s"
-    alternatives = UNITS if question else ()
+    alternatives = tuple(UNIT_PENALTIES) if question else ()
     proposals = [
         Proposal(
             column.name,
-            f"wheel_speed_{corner}",
+            f"{PREFIX}{corner}",
             unit,
             1,
             tuple(evidence),
             question,
             factor=factor,
             alternatives=alternatives,
+            is_weak=is_weak,
         )
         for corner, column in sorted(wheels.items())
     ]
@@ -161,7 +235,7 @@ def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -
     at the rim.
     """
     pairs = [
-        (wheel.slow, proposals.by_channel.get(f"wheel_speed_{corner}"))
+        (wheel.slow, proposals.by_channel.get(f"{PREFIX}{corner}"))
         for corner, wheel in wheels.items()
     ]
     at_rim = [
@@ -173,17 +247,30 @@ def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -
 
 
 def _mean(wheels: Wheels) -> FloatArray:
+    """Mean of the wheels' columns in the file's unit, (T,)."""
     return np.asarray(
         np.mean([column.values for column in wheels.values()], axis=0), dtype=np.float64
     )
 
 
-def _units(wheels: Wheels) -> Sequence[str]:
-    unit = next(iter(wheels.values())).unit
-    return [unit] if unit else UNITS
+def _header_unit(wheels: Wheels) -> str:
+    """The first unit that a header states; empty where none does."""
+    return next((column.unit for column in wheels.values() if column.unit), "")
+
+
+def _units_of(wheels: Wheels) -> Sequence[str]:
+    """The header's unit, or those to try."""
+    unit = _header_unit(wheels)
+    return [unit] if unit else tuple(UNIT_PENALTIES)
+
+
+def _penalty(wheels: Wheels, unit: str) -> float:
+    """What a unit that no header states costs against the likelier ones."""
+    return 0.0 if _header_unit(wheels) else UNIT_PENALTIES[unit]
 
 
 def _named(columns: Sequence[Candidate], channel: str) -> Candidate | None:
+    """The column whose name suggests a channel most clearly; None where none does."""
     named = [column for column in columns if channel in column.hints and column.measures(channel)]
     return max(named, key=lambda column: column.hints[channel], default=None)
 
@@ -193,20 +280,20 @@ def _cost(unit: str, scale: float | None, mean: FloatArray) -> tuple[float, floa
     with it.
     """
     top = largest(mean)
-    if unit in AT_RIM:
+    if is_unit_of(unit, "vx"):
         factor = si_factor(unit, "vx")
         mismatch = 0.5 if scale is None else abs(math.log(scale / factor))
-        if (
-            scale is not None
-            and SPEEDOMETER_GAIN_RANGE[0] < scale / factor < SPEEDOMETER_GAIN_RANGE[1]
-        ):
+        low, high = SPEEDOMETER_GAIN_RANGE
+        if scale is not None and low < scale / factor < high:
             mismatch = 0.0
-        return mismatch + 3.0 * (not MIN_TOP_SPEED <= top * factor <= MAX_SPEED), NOMINAL_RADIUS
+        is_other_speed = scale is not None and mismatch > MAX_RIM_MISMATCH
+        is_odd = is_other_speed or not MIN_TOP_SPEED <= top * factor <= MAX_SPEED
+        return mismatch + IMPLAUSIBLE * is_odd, NOMINAL_RADIUS
     factor = si_factor(unit, "wheel_speed_fl")
     radius = USUAL_RADIUS if scale is None else scale / factor
     if not math.isfinite(radius) or radius <= 0.0:
         return 10.0, USUAL_RADIUS
     speed = top * factor * radius
     low, high = RADIUS_RANGE if speed > MAX_MODEL_SPEED else (MIN_MODEL_RADIUS, RADIUS_RANGE[1])
-    odd = 3.0 * (not low <= radius <= high) + 3.0 * (not MIN_TOP_SPEED <= speed <= MAX_SPEED)
-    return 0.15 * abs(math.log(radius / USUAL_RADIUS)) + odd, radius
+    n_odd = (not low <= radius <= high) + (not MIN_TOP_SPEED <= speed <= MAX_SPEED)
+    return 0.15 * abs(math.log(radius / USUAL_RADIUS)) + IMPLAUSIBLE * n_odd, radius

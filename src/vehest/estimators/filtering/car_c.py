@@ -27,7 +27,11 @@ from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
 
 
 def car_filter_in_c(car_filter: CarFilter) -> dict[str, Any]:
-    """Dynamics, noise and sigma points of a trained filter, by their names in the template."""
+    """Dynamics, noise and sigma points of a trained filter, by their names in the template.
+
+    Everything is converted to double first, whatever the filter was trained in. Infinite bounds
+    become None, which a template leaves out.
+    """
     model = deepcopy(car_filter).double()
     with torch.no_grad():
         process, observation = model.noise_at()
@@ -88,4 +92,5 @@ def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
 
 
 def _numbers(values: Tensor) -> FloatArray:
+    """Values of a tensor as float64."""
     return values.detach().numpy().astype(np.float64)

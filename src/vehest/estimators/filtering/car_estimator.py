@@ -35,7 +35,7 @@ from vehest.vehicle.dynamics import STATES
 REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")
 MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")
 INPUTS = ("steer", "motor_current")
-# m/s, m/s, rad/s, m/s: standard deviations of a start that nobody hands over
+# m/s, m/s, rad/s, m/s: standard deviations of a start that is not given
 UNKNOWN = (0.5, 0.3, 0.1, 0.1)
 
 
@@ -71,7 +71,20 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
     def _start(
         self, measurement: FloatArray, state: Mapping[str, float] | None
     ) -> tuple[Tensor, Tensor]:
-        """Mean and covariance at the first sample, by ``state`` where it is not None."""
+        """Mean and covariance at the first sample, by ``state`` where it is not None.
+
+        Parameters
+        ----------
+        measurement : array
+            The first one, (4,); rim speed and yaw rate start from it, 0 where they are NaN.
+        state : mapping or None
+            Known states; their variance is that of `CarFilter.initial_covariance` alone.
+
+        Returns
+        -------
+        tuple
+            Mean (5,) and covariance (5, 5) in the filter's precision.
+        """
         dtype = next(self.filter.parameters()).dtype
         initial_state = dict(state or {})
         settings = self.settings
@@ -113,6 +126,9 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
     def _filter(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
     ) -> list[Estimate]:
+        """Estimates of recordings of one length, as one batch; the measured vx, where there is one,
+        turns vy into the sideslip angle.
+        """
         dtype = next(self.filter.parameters()).dtype
         samples = [self._samples(recording) for recording in recordings]
         measurements, inputs = (
@@ -195,7 +211,10 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
 
 
 def _hold_missing(values: FloatArray) -> FloatArray:
-    """The last value where one is missing; 0 before the first."""
+    """The last value where one is missing; 0 before the first.
+
+    Each column of (T, p) by itself.
+    """
     last = np.maximum.accumulate(
         np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None])
     )

@@ -1,4 +1,11 @@
-"""An unscented filter of a planar car whose dynamics and noise can be learnt."""
+"""An unscented filter of a planar car whose dynamics and noise can be learnt.
+
+    `Dynamics` --point_model--> compiled or torch `PointModel`
+    measurements (B, T, 4), inputs (B, T, 2) --filtered: unscented_scan--> states (B, T, 5)
+
+In training, noise that depends on the state is evaluated at the true states of a drive, so that it
+has gradients; in use it is evaluated at the estimate by compiled code (`noise_at`).
+"""
 
 from __future__ import annotations
 
@@ -150,6 +157,12 @@ class CarFilter(nn.Module):
             What `point_model` returned, to use it again.
         gate : Gate | None, default None
             Which measurements are refused; none: all are taken.
+
+        Returns
+        -------
+        NonlinearFiltered
+            Differentiable in dynamics, noise and initial state, unless noise depends on the
+            estimate.
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
@@ -171,7 +184,11 @@ class CarFilter(nn.Module):
         )
 
     def noise_at(self) -> tuple[StepNoise, StepNoise]:
-        """Process and observation noise of filters at work."""
+        """Process and observation noise of filters at work.
+
+        Constant covariances are arrays (1, 5, 5) and (1, 4, 4); those that depend on the state are
+        `CompiledNoise`. The process noise has at least the entropy `MIN_ENTROPY`.
+        """
         if not self.constant:
             return compiled_noise(self.process_noise, MIN_ENTROPY), compiled_noise(
                 self.observation_noise
@@ -187,6 +204,14 @@ class CarFilter(nn.Module):
         The friction, which the true states hold as a constant, and the initial state keep the
         variances that they have, but for a friction that may start anywhere within a spread: it has
         the variance of that.
+
+        Parameters
+        ----------
+        drives : sequence of Drive
+            True states (T, 5), inputs (T, 2) and measurements (T, 4), without gaps.
+        start_spread : float
+            Half width of the uniform distribution of the friction that a training sequence starts
+            from.
 
         Raises
         ------

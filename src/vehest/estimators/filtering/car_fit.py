@@ -78,6 +78,9 @@ def training_phases(
 ) -> list[Phase]:
     """The dynamics by one-step errors, then dynamics and noise, or noise alone, through the filter.
 
+    Errors of states are weighted by `WEIGHTS`. The friction counts through the filter only, with
+    the weight 1; validation judges vx, vy and yaw rate alone.
+
     Parameters
     ----------
     car_filter : CarFilter

@@ -317,6 +317,8 @@ def with_angles(
 ) -> tuple[Tensor, Tensor]:
     """Measurements (B, T, 5) and covariances (B, T, 5, 5) with a network's angles as the last.
 
+    The fifth measurement is NaN beyond the end of a shorter recording.
+
     Parameters
     ----------
     measurements : Tensor

@@ -1,4 +1,11 @@
-"""Identifies Dugoff's tyres on drives, skidpads above all, by a genetic algorithm."""
+"""Identifies Dugoff's tyres on drives, skidpads above all, by a genetic algorithm.
+
+    recordings --axle_motion--> slip angles, forces --thinning--> at most 1,500 samples
+    --differential evolution for each axle, several restarts--> `DugoffFit`
+
+The cost of an axle is the root mean square of C tan α f(λ) - F over that of F. The load follows
+from the measured longitudinal acceleration.
+"""
 
 from __future__ import annotations
 
@@ -55,6 +62,11 @@ def fit_dugoff(
         Of the first restart; the others follow it.
     restarts : int, default 3
         Searches, of which the best counts, of so many ``generations`` each at most.
+
+    Returns
+    -------
+    DugoffFit
+        Of both axles; the spread over restarts shows which parameters the drives determine.
 
     Raises
     ------

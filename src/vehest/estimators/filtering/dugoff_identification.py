@@ -54,6 +54,11 @@ def identify_tyres(
     has_forces : bool
         Whether tyre forces are measured; otherwise they follow from accelerations.
 
+    Returns
+    -------
+    DugoffFit
+        Parameters (2, 3) of `DugoffAxle`, of the front, then of the rear axle.
+
     Raises
     ------
     DataError
@@ -126,6 +131,21 @@ def search_levels(
 ) -> SearchRecord:
     """Levels with the smallest error of sideslip, as powers of ten, (K,).
 
+    Parameters
+    ----------
+    estimator : DugoffFilter
+        With tyres and sensor levels; it is not changed.
+    names : sequence of str
+        Levels that are searched, of `BOXES` and ``process_yaw_rate``.
+    recordings : sequence of Recording
+        Training recordings with ``vy_ref``.
+    training : IdentificationSettings
+        Method, limits, and how errors are combined.
+    seed : int
+        Of Optuna's sampler.
+    context : FitContext
+        Progress and the wish to stop.
+
     Raises
     ------
     DataError
@@ -139,6 +159,7 @@ def search_levels(
             )
 
     def cost(powers: FloatArray) -> float:
+        """Error of sideslip [rad²] with levels at these powers of ten, (K,)."""
         levels = estimator.levels | dict(zip(names, (10.0**powers).tolist(), strict=True))
         return estimator.mean_squared_error(
             recordings, training.skip_seconds, levels, training.error, limit=training.error_limit

@@ -23,7 +23,11 @@ class GatedFilter(Estimator):
     )
 
     def gate_in_use(self) -> Gate | None:
-        """The gate of estimates."""
+        """The gate of estimates.
+
+        It opens again after a contradiction of half a second, see `Gate`; None where no gate is
+        set.
+        """
         return Gate.of(self.gate, self.rate_hz)
 
     @property

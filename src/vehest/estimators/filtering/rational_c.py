@@ -20,7 +20,17 @@ from vehest.vehicle.tyre_track import TYRE_PARAMETERS
 def rational_c_values(
     model: RationalModel, levels: Mapping[str, float], *, is_linear: bool
 ) -> dict[str, Any]:
-    """Values of a model and its noise levels, by their names in the template."""
+    """Values of a model and its noise levels, by their names in the template.
+
+    Parameters
+    ----------
+    model : RationalModel
+        At the curves that the filter starts with.
+    levels : mapping
+        Noise levels by name, `LEVELS`.
+    is_linear : bool
+        Whether tyres are linear, so that the template has no bend.
+    """
     adapted = [_tyre_state(name) for name in model.adapted]
     n = 4 + len(adapted)
     return {
@@ -62,7 +72,10 @@ def _tyre_state(name: str) -> dict[str, str]:
 
 
 def _square_root(covariance: FloatArray) -> FloatArray:
-    """Lower triangular L with L Lᵀ = covariance, which need not be definite."""
+    """Lower triangular L with L Lᵀ = covariance, which need not be definite.
+
+    By eigenvalues, of which negative ones count as 0, and a QR decomposition.
+    """
     eigenvalues, vectors = np.linalg.eigh(covariance)
     upper = np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T)[1]
     return np.ascontiguousarray(upper.T)

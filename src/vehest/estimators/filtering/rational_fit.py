@@ -72,10 +72,21 @@ def fit_axle_curves(
 
     Parameters
     ----------
+    recordings : sequence of Recording
+        With a reference of sideslip, see `axle_motion`.
+    car : SingleTrackParameters
+        Mass, inertia and places of the axles.
     minimum_speed : float
         Slower samples do not count [m/s].
+    kind : str
+        ``linear`` (c₂ alone) or ``rational``.
     deviation : float
         Standard deviation of the logarithms that is added to that of the fit.
+
+    Raises
+    ------
+    DataError
+        A channel is missing, hardly any samples are left, or forces run against slip angles.
     """
     motion = axle_motion(recordings, car, minimum_speed)
     fit = fit_motion(motion, kind)
@@ -199,6 +210,20 @@ def mean_squared_error(
     """Mean squared error of sideslip [rad²] over samples at ``minimum_speed`` [m/s] or more.
 
     The first ``skip`` samples of each drive do not count.
+
+    Parameters
+    ----------
+    filter_samples : callable
+        Filter of samples (T, 4) by levels.
+    drives : sequence
+        Samples, with the speed as the second column, and reference (T,); NaN in it does not count.
+    levels : mapping
+        Noise levels by name.
+
+    Returns
+    -------
+    float
+        [rad²]; 0 where no sample counts.
     """
     total = 0.0
     count = 0

@@ -41,7 +41,7 @@ from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")
-"""Noise levels: of the gyroscope [rad/s], the accelerometer [m/s²], the steering angle [rad √s],
+"""Noise levels: of the gyroscope [rad/s], the accelerometer [m/s²], the steering angle [rad/√s],
 and the drift of tyre parameters [1/√s].
 """
 CURVES = TYRE_PARAMETERS[:4]
@@ -172,6 +172,11 @@ def filter_extended(
         How often in a row yaw rate and ay were refused before; updated.
     crossfall : float
         Level of the drift of b [m/s² √s⁻¹].
+
+    Returns
+    -------
+    FilteredStates
+        (T, n); n counts the state of a crossfall where there is one. ``first`` is not changed.
     """
     mean = first.mean.copy()
     covariance = first.covariance.copy()
@@ -220,6 +225,10 @@ def filter_unscented(
     Arguments as those of `filter_extended`.
 
     Tyre parameters that stay keep their variance (Schmidt's consider states).
+
+    It follows the same rules as the compiled extended filter: rolling below the minimum speed, a
+    restart where the sideslip or its deviation is too large, bounds of all states, tyre parameters
+    that stay below a lateral acceleration. It runs in Python, sample by sample, and has no gate.
     """
     car = model.car
     track = model.track()

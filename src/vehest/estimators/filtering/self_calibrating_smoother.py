@@ -1,4 +1,10 @@
-"""Smoothing of a whole drive by the self-calibrating filter."""
+"""Smoothing of a whole drive by the self-calibrating filter.
+
+    samples --_filter_pass--> filtered states of the likeliest filter --_backward_pass--> smoothed
+    smoothed bank, network, steady cornering --weights at the end--> vy, variance
+
+It needs the whole drive, so that an estimate of it is offline.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +70,19 @@ def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArr
 def _filter_pass(
     estimator: Any, samples: FloatArray, state: kernel.State, likeliest: int
 ) -> FilterPass:
-    """The bank's recursion, one sample after another, with the states of its likeliest filter."""
+    """The bank's recursion, one sample after another, with the states of its likeliest filter.
+
+    Parameters
+    ----------
+    estimator : SelfCalibrating
+        Its numbers and network.
+    samples : array
+        (T, C).
+    state : State
+        Before the first sample; it is not changed.
+    likeliest : int
+        Index of the filter in the bank.
+    """
     state = kernel.State(*(part.copy() for part in state))
     rows = estimator.with_ax(samples).copy()
     means = np.empty((len(rows), kernel.STATES))
@@ -85,9 +103,27 @@ def _filter_pass(
 
 
 def _backward_pass(estimator: Any, filtered: FilterPass, before: FloatArray) -> FloatArray:
-    """v at the inertial unit, b, and the variance of v at the reference point, smoothed, (T, 3).
+    """Smooth the states of one filter from the last sample to the first.
 
-    ``before`` is the sample before the first, (4,).
+        x_{k-1} += G (x_k - x⁻_k),  P_{k-1} += G (P_k - P⁻_k) Gᵀ,  G = P_{k-1} Fᵀ (P⁻_k)⁻¹
+
+    with the linearised transition F of the kernel, rebuilt from the samples. Decays and noise are
+    those of the forward pass.
+
+    Parameters
+    ----------
+    estimator : SelfCalibrating
+        Its numbers, priors and noise.
+    filtered : FilterPass
+        The forward pass.
+    before : array
+        Yaw rate, u, ay, ax before the first sample, (4,).
+
+    Returns
+    -------
+    array
+        v at the inertial unit [m/s], b [m], and the variance of v at the reference point [m²/s²],
+        (T, 3).
     """
     n = estimator.numbers()
     decay = estimator.decay

@@ -1,6 +1,9 @@
 """Base of filters of sideslip angle and yaw rate over a single track.
 
-Settings, the model of a recording, estimates.
+    samples (T, 4), `FilterState` --filter_samples--> `FilteredStates` --run--> vy, r, covariances
+
+A subclass filters (`filter_samples`) and starts (`first_gaussian`). Between calls the last sample
+is kept and filtered again without its measurements, since its inputs lead to the next one.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
 MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
-# rad and rad/s, standard deviation of a state that a protocol hands over
+# rad and rad/s, standard deviation of a state that a protocol passes
 EXACT_STATE_DEVIATION = 1e-6
 
 
@@ -98,7 +101,7 @@ class SideslipFilter(GatedFilter, Recursive):
     ) -> Gaussian[FloatArray]:
         """β and r before the first sample.
 
-        0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over.
+        0 with standard deviations (n ≥ 2), further states too, or a known initial state.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
@@ -126,6 +129,18 @@ class SideslipFilter(GatedFilter, Recursive):
         """Filter samples of ``channels``, (T, 4).
 
         ``first`` is the state before the first measurement; ``refused``: see `Gate`.
+
+        Parameters
+        ----------
+        samples : array
+            Yaw rate [rad/s], vx [m/s], ay [m/s²] and road-wheel angle [rad]; NaN in the first and
+            third was not measured.
+        first : Gaussian
+            Mean (n,) and covariance (n, n).
+        gate : Gate, optional
+            Which measurements are refused.
+        refused : array, optional
+            Counters of the gate, (2,), changed in place.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'"
@@ -144,7 +159,10 @@ class SideslipFilter(GatedFilter, Recursive):
         )
 
     def run(self, samples: FloatArray, state: FilterState) -> tuple[dict[str, Any], FilterState]:
-        """Lateral velocity [m/s], yaw rate [rad/s], covariances, innovations, other quantities."""
+        """Lateral velocity [m/s], yaw rate [rad/s], covariances, innovations, other quantities.
+
+        The covariance of (β, r) becomes that of (v, r) by the slope ∂v/∂β = u (1 + tan² β).
+        """
         rows = samples
         refused = state.refused.copy()
         if state.sample is not None:
@@ -173,8 +191,21 @@ def read_levels(
 ) -> dict[str, float]:
     """Standard deviations of measured channels of all recordings above a frequency, by name.
 
-    The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise.
-    Raises `DataError`: a channel has too many gaps, or no noise.
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Taken together.
+    names : sequence of str
+        Channels.
+    cutoff : float
+        As a fraction of the Nyquist frequency, see `high_passed_level`.
+    min_level : float
+        A level has to exceed it to be noise, in the channel's unit.
+
+    Raises
+    ------
+    DataError
+        A channel has too many gaps, or no noise.
     """
     label = (
         f"recording{'s' if len(recordings) > 1 else ''} "

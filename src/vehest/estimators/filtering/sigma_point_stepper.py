@@ -48,7 +48,7 @@ class SigmaPointEstimator(GatedFilter):
         """
 
     def online(self) -> Stepper:
-        """A stepper that starts from the first sample it sees."""
+        """A stepper that starts from the first sample that it receives."""
         self.require_fitted()
         return SigmaPointStepper(self)
 
@@ -76,7 +76,10 @@ class SigmaPointStepper(Stepper):
         self._memory: dict[str, Any] = {}
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """States at the time of the sample, and the variance of the lateral velocity [m²/s²]."""
+        """States at the time of the sample, and the variance of the lateral velocity [m²/s²].
+
+        The filter starts from the first sample; a sample's inputs act until the next one.
+        """
         estimator = self._estimator
         step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
         if self._filter is None:

@@ -26,13 +26,13 @@ from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
 
-# m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+# m/s, rad/s: standard deviations of a motion that is not given, and of a car that rolls
 UNKNOWN_MOTION = (
     0.5,
     0.2,
 )
 ROLLING = np.diag(np.square(UNKNOWN_MOTION))
-EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is handed over
+EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is given
 KAPPA = 1.0  # n + κ = 3
 
 
@@ -43,7 +43,12 @@ class TrackFilter:
     angle and ax.
 
     Where the car is slower than the track's minimum speed, nothing counts as measured, and the
-    state is that of rolling wheels, with the deviations `UNKNOWN`.
+    state is that of rolling wheels, with the deviations `UNKNOWN_MOTION`.
+
+    Parameters
+    ----------
+    track : DugoffTrack
+        Car, tyres and step; it is compiled as the filter's model.
     """
 
     def __init__(self, track: DugoffTrack) -> None:
@@ -107,7 +112,7 @@ class TrackFilter:
     ) -> Gaussian[Tensor]:
         """State before the first measurement.
 
-        Straight ahead and unknown, rolling where the car is slow, or what is handed over.
+        Straight ahead and unknown, rolling where the car is slow, or a known initial state.
 
         Parameters
         ----------
@@ -115,6 +120,11 @@ class TrackFilter:
             At the first sample, (B, 3).
         states : Sequence[Mapping[str, float] | None] | None, default None
             A mapping a sequence of `TRACK_STATES` that are known.
+
+        Returns
+        -------
+        Gaussian
+            Mean (B, 2) and covariance (B, 2, 2), diagonal, in the precision of the inputs.
         """
         slow = (inputs[:, :1] < self.track.minimum_speed).to(inputs.dtype)
         mean = slow * self.track.rolling(inputs)

@@ -1,13 +1,13 @@
 """Fit of axle curves, force over slip angle, to drives whose sideslip angle was measured.
 
-A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small
-steering angles taken for granted (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
+A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, with
+small steering angles assumed (Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
 
     F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,
     α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
 
-The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle
-carries what it carries at rest.
+The paper has its forces from another tool, TRICK, which also provides the vertical ones; here an
+axle carries what it carries at rest.
 """
 
 from __future__ import annotations
@@ -190,6 +190,7 @@ def _motion_of(
     )
 
     def smoothed(samples: FloatArray, derivative: int = 0) -> FloatArray:
+        """A signal or its derivative by a local polynomial; NaN at the ends and around gaps."""
         step = 1.0 / recording.rate_hz
         fitted = signal.savgol_filter(
             samples,
@@ -236,6 +237,13 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
     may differ in size (a sandwich of blocks): residuals of neighbouring samples are hardly
     independent, and to count them so would make intervals far too narrow.
 
+    Parameters
+    ----------
+    motion : AxleMotion
+        Slip angles and forces.
+    kind : str
+        ``linear`` or ``rational``.
+
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang
     & Zeger, Biometrika 73 (1), 1986.
     """
@@ -255,6 +263,26 @@ def _fitted(
     """Parameters of one axle, their covariance and the rms of what is left.
 
     Logarithms are fitted, so that all stay positive.
+
+    Parameters
+    ----------
+    kind : str
+        ``linear`` or ``rational``.
+    slip, force : array
+        (N,) [rad] and [N].
+    block : array
+        Number of the block of time of each sample, (N,).
+
+    Returns
+    -------
+    tuple
+        Parameters (P,), their covariance (P, P) in the parameters' units, and the root mean square
+        of residual forces [N].
+
+    Raises
+    ------
+    DataError
+        The axle never slips, or forces run against slip angles.
     """
     names = PARAMETERS[kind]
     low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
@@ -282,6 +310,7 @@ def _fitted(
     spread = math.sqrt(float(np.mean((force - stiffness * slip) ** 2)))
 
     def misfit(log_parameters: FloatArray, weight: float) -> FloatArray:
+        """Weighted residuals of forces, and that of the prior of ln c₁ where c₁ is fitted."""
         residuals = weight * (axle_force(kind, np.exp(log_parameters), slip) - force)
         return (
             np.append(

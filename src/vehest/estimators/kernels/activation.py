@@ -20,25 +20,29 @@ _F = numba.float32
 
 
 def tanh(x: Any) -> Any:
-    """tanh(x).
+    """tanh(x) of a number or a vector.
 
-    In compiled float32 code a rational function, whose loops become vector instructions.
+    In compiled float32 code it is `rational_tanh`, whose loops become vector instructions; in
+    float64 it is the library's, lane by lane.
     """
     return each(math.tanh, x)
 
 
 def sigmoid(x: Any) -> Any:
-    """1 / (1 + exp(-x)), computed as (1 + tanh(x/2)) / 2."""
+    """1 / (1 + exp(-x)), computed as (1 + tanh(x/2)) / 2.
+
+    This form does not overflow for any x.
+    """
     return 0.5 + 0.5 * tanh(0.5 * x)
 
 
 def softplus(x: Any) -> Any:
-    """log(1 + exp(x))."""
+    """log(1 + exp(x)) as max(x, 0) + log(1 + exp(-|x|)), which does not overflow."""
     return max(x, x * 0) + math.log1p(math.exp(-abs(x)))
 
 
 def arctan(x: Any) -> Any:
-    """The principal arc tangent."""
+    """The principal arc tangent [rad]; in compiled float32 code a polynomial."""
     return math.atan(x)
 
 
@@ -62,6 +66,7 @@ _rational_tanh = numba.njit(inline="always")(rational_tanh)
 
 @overload(tanh)
 def _compiled_tanh(x):
+    """Choose the rational function for float32, otherwise the library's."""
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _rational_tanh(x)
     return (lambda x: each(math.tanh, x)) if isinstance(x, Lanes) else (lambda x: math.tanh(x))
@@ -69,6 +74,7 @@ def _compiled_tanh(x):
 
 @overload(sigmoid)
 def _compiled_sigmoid(x):
+    """Logistic function by the tanh of its precision."""
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _F(0.5) + _F(0.5) * _rational_tanh(_F(0.5) * x)
     return lambda x: 0.5 + 0.5 * tanh(0.5 * x)
@@ -110,7 +116,11 @@ def _compiled_softplus(x):
 
 @overload(arctan)
 def _compiled_arctan(x):
-    """Abramowitz & Stegun, equation 4.4.49, and π/2 - arctan(1/x) beyond 1."""
+    """Abramowitz & Stegun, equation 4.4.49, and π/2 - arctan(1/x) beyond 1.
+
+    The polynomial in y² is evaluated at y = min(|x|, 1)/max(|x|, 1), so that both branches share
+    it.
+    """
     if x != types.float32:
         return lambda x: math.atan(x)
 

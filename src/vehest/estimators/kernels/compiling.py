@@ -47,6 +47,9 @@ def has_to_compile(location: str) -> bool:
     """Whether an entry, ``module:function``, compiles on this machine before it first runs.
 
     Later runs load the result.
+
+    A cache file counts if it is not older than the source. It is False where numba does not compile
+    at all, or has no folder for its cache.
     """
     name, _, entry_name = location.partition(":")
     if not name:

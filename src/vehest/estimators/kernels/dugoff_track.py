@@ -37,7 +37,19 @@ SMOOTH = MAX_FORCE_RATIO["smooth"]
 
 
 class CompiledDugoffTrack(PointModel):
-    """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
+    """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
+
+    Parameters
+    ----------
+    track : DugoffTrack
+        Its numbers are copied: later changes have no effect.
+
+    Attributes
+    ----------
+    car : tuple
+        Numbers (7,): m, I_zz, l_F, l_R, h, Δt, minimum speed; axles (2, 3): C, μ₀, e_r of the front
+        and the rear one; whether tyres are smooth.
+    """
 
     is_compiled = True
     scratch_rows = 4
@@ -94,7 +106,23 @@ def _input_terms(inputs, b, car):
 
 @piece
 def _axle(tangent, load, vx, axle, smooth):
-    """Force and its derivative by the tangent of the slip angle."""
+    """Force of an axle and its derivative by the tangent of the slip angle (Eqs. 9 and 10).
+
+    Parameters
+    ----------
+    tangent, load, vx : vector
+        tan α, positive where it makes a force to the left; F_z [N]; u [m/s].
+    axle : array
+        C [N/rad], μ₀ [1], e_r [s/m], (3,).
+    smooth : bool
+        Eq. 10 instead of Eq. 9.
+
+    Returns
+    -------
+    tuple
+        F = C tan α f(λ) [N] and dF/d tan α [N]. Where λ reaches its largest value the tyre is
+        linear, F = C tan α.
+    """
     stiffness, friction, reduction = axle
     unity = axle.dtype.type(1.0)
     min_share = axle.dtype.type(MIN_FRICTION_SHARE)
@@ -167,6 +195,19 @@ def _saved_slopes(inputs, entry, s, b):
 
 @compiled
 def _transition(points, inputs, track, out, first, end):
+    """Write states one step later at all points; see the module.
+
+    Parameters
+    ----------
+    points : array
+        v [m/s] and r [rad/s], (S, 2, B).
+    inputs : array
+        u, δ, a_x, then rows for saved derivatives where gradients are computed, (3 or 3 + 4 S, B).
+    track : tuple
+        See `CompiledDugoffTrack`.
+    out : array
+        (S, 2, B), written for the sequences from ``first`` to ``end``.
+    """
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
@@ -184,6 +225,11 @@ def _transition(points, inputs, track, out, first, end):
 
 @compiled
 def _observation(points, inputs, track, out, first, end):
+    """Write expected measurements at all points, (S, 4 or 5, B): a_y, r, F_F cos δ, F_R, and
+    perhaps β.
+
+    Arguments as those of `_transition`.
+    """
     car = track[0]
     m = out.shape[1]
     for b in range(first, end, width(points)):
@@ -201,6 +247,11 @@ def _observation(points, inputs, track, out, first, end):
 
 @compiled
 def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):
+    """Write gradients by the points, given those by the states one step later (``upstream``, (S, 2,
+    B)).
+
+    Equations: see the module. Wheels that roll have no gradient, since the state does not count.
+    """
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
@@ -219,6 +270,12 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
 
 @compiled
 def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):
+    """Write gradients by the points, given those by the expected measurements (``upstream``, (S, m,
+    B)).
+
+    F̄_i = (ā_y/m + F̄_i,measured) F_i' for both axles i;  v̄ = F̄_F + F̄_R + β̄ u/(u² + v²);
+    r̄ = r̄_measured + l_F F̄_F - l_R F̄_R.
+    """
     car = track[0]
     m = upstream.shape[1]
     mass, _, front_arm, rear_arm, _, _, minimum_speed = car

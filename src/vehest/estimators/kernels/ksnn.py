@@ -73,6 +73,9 @@ def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int
 def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
     """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6
     Q).
+
+    A row is [γ₁, γ₂, β₁, β₂, w₁, b of f₁, w₁, b of f₂, (w₂, b₂, w₃) of each neuron of f₁, then of
+    f₂]. The two biases of a feedback function are added; a missing one is 0.
     """
     p = parameters
     gamma = parameters["gamma"]
@@ -119,6 +122,9 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
     """The recursion of a network with parameters in the order of `shapes_of`.
 
     Its last local model is centred at a yaw rate [rad/s].
+
+    The slots are found by packing the identity matrix: each parameter's column shows the entry of
+    the rows that it is added to.
     """
     views = {}
     first = 0
@@ -145,7 +151,14 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
 
 @entry(nogil=True)
 def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):
-    """See `vehest.estimators.kernels.recursion.Recursion`."""
+    """Predictions of KS-NN members, and perhaps gradients and steps of Adam.
+
+    See `vehest.estimators.kernels.recursion.Recursion` for the arguments. For each member and
+    batch: parameters are added into the rows ``theta``; blocks of windows, as many as a vector has
+    lanes, run forward over N samples and, where gradients are wanted, backward; lanes without a
+    window have the slope 0. ``constants`` are slots (K,), P, Q, N, the sampling interval τ [s], and
+    the local models per rad/s of yaw rate.
+    """
     slots, n_local, n_hidden, n_window, step, per_width = constants
     lanes = width(series)
     neurons = 4 * n_hidden
@@ -198,6 +211,17 @@ def _forward(car, room, k, v, u):
     """v and û after step k in all lanes.
 
     Leaves ``saved`` rows and neurons' ``outputs`` for `_backward`.
+
+    Parameters
+    ----------
+    car : tuple
+        Rows ``theta``, P, Q, τ [s], and local models per yaw rate [s/rad].
+    room : tuple
+        Windows (N, 4, lanes), saved rows (N, `SAVED_ROWS`, lanes), and outputs of neurons.
+    k : int
+        Sample of the window.
+    v, u : vector
+        v and û before the step [m/s].
     """
     theta, n_local, n_hidden, step, per_width = car
     windows, saved, outputs = room
@@ -266,7 +290,10 @@ def _forward(car, room, k, v, u):
 
 @part(_nrt=False)
 def _model(position, n_local):
-    """First active local model of each lane."""
+    """First active local model of each lane.
+
+    The active models of a lane are this one and the next; φ is zero for all others.
+    """
     model = position * 0
     for p in range(1, n_local - 1):
         model = choose(position >= p, p, model)
@@ -275,7 +302,10 @@ def _model(position, n_local):
 
 @part(_nrt=False)
 def _chosen(theta, column, model, n_local, row):
-    """w₂, b₂, w₃ of one neuron of the lanes' active models."""
+    """w₂, b₂, w₃ of one neuron of the lanes' active models.
+
+    ``column`` is the neuron's first entry in the rows of the first active model.
+    """
     w2 = model * 0 + theta[column]
     b2 = model * 0 + theta[column + 1]
     w3 = model * 0 + theta[column + 2]
@@ -293,6 +323,9 @@ def _backward(car, room, k, v_bar, u_bar, sums):
     """Adjoint of step k.
 
     v̄ and û̄ before it from those after it; adds the gradients of parameters to ``sums``.
+
+    Equations: see the module. ``sums`` has a vector for each entry of ``theta``, so that no lane
+    waits for another.
     """
     theta, n_local, n_hidden, step, per_width = car
     windows, saved, outputs = room

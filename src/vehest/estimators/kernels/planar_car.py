@@ -13,9 +13,9 @@ in order, stage by stage.
 
 Points lie side by side in columns, so that what is computed of each runs along rows; columns are as
 many as fill whole vectors, and those beyond the points repeat the last one and have no gradient. A
-network sees a point a row, its units side by side: its matrix products are as fast for a few points
-as for many. The adjoint computes stages again instead of storing them. Blocks of sequences are
-small enough for a core's own cache; matrix products stay on their thread.
+network receives a point a row, its units side by side: its matrix products are as fast for a few
+points as for many. The adjoint computes stages again instead of storing them. Blocks of sequences
+are small enough for a core's own cache; matrix products stay on their thread.
 
 In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three
 layers, then their weights transposed; learnt numbers in the order of `LEARNT` and `PACEJKA`; fixed
@@ -130,6 +130,10 @@ def is_compilable(dynamics: Dynamics) -> bool:
 
 
 def _kind_of(dynamics: Dynamics) -> int | None:
+    """Number of a car's compiled code; None where there is none.
+
+    None are networks without exactly two hidden layers, curves with E terms, and other classes.
+    """
     network = getattr(dynamics, "network", None)
     if isinstance(network, Perceptron) and len(network) != 5:
         return None
@@ -219,7 +223,11 @@ def _network(layers, f, h1, h2, o):
 
 @piece
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):
-    """Writes ``f_bar``, and adds to the gradients when learning."""
+    """Writes ``f_bar``, and adds to the gradients when learning.
+
+    ``o_bar`` is (4, P) and ``f_bar`` (P, F). ō W₃ -> h̄₂, times σ', W₂ -> h̄₁, times σ', W₁ -> f̄;
+    gradients of weights are products of a layer's values and the gradients above it.
+    """
     _, _, _, _, W3, _, W1, W2, _ = layers
     h2_bar = np.empty_like(h2)
     h1_bar = np.empty_like(h1)
@@ -644,8 +652,8 @@ def _gather_points(points, inputs, first, end):
 
 @piece
 def _room(points, x, car):
-    """For what the network sees of so many points, slips, both hidden layers, its outputs, forces,
-    and rates without what it adds.
+    """Memory for the network's features of so many points, slips, both hidden layers, its outputs,
+    forces, and rates without what it adds.
     """
     (T1, _, T2) = car[0][:3]
     columns = x.shape[1]
@@ -684,6 +692,19 @@ def _stages(x0, u, car, rooms):
 
 @compiled
 def _transition(points, inputs, car, out, start, stop):
+    """Write states one step later at all points by the Runge-Kutta method, (S, 5, B).
+
+    Parameters
+    ----------
+    points : array
+        vx, vy [m/s], yaw rate [rad/s], rim speed [m/s], friction [1], (S, 5, B).
+    inputs : array
+        Steering angle [rad] and motor current [A], (2, B).
+    car : tuple
+        See the module.
+    out : array
+        (S, 5, B), written for the sequences from ``start`` to ``stop``.
+    """
     count, n, _ = points.shape
     sixth = points.dtype.type(car[2][3] / 6)
     two = points.dtype.type(2)
@@ -703,6 +724,10 @@ def _transition(points, inputs, car, out, start, stop):
 
 @compiled
 def _observation(points, inputs, car, out, start, stop):
+    """Write expected measurements at all points: ax, ay [m/s²], yaw rate, rim speed, (S, 4, B).
+
+    Arguments as those of `_transition`.
+    """
     count = points.shape[0]
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
@@ -718,6 +743,13 @@ def _observation(points, inputs, car, out, start, stop):
 
 @compiled
 def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):
+    """Write gradients by the points, and add those by the parameters.
+
+    The four stages are computed again, each with a room of its own. From the last to the first,
+    k̄_i = w_i x̄⁺ + c_i J_{i+1}ᵀ k̄_{i+1} with w = Δt (1/6, 1/3, 1/3, 1/6) and c = Δt (1/2, 1/2, 1,
+    -); x̄ = x̄⁺ + Σ J_iᵀ k̄_i. ``gradients`` are those of the layers and of theta, and whether they
+    are wanted.
+    """
     learning = gradients[7]
     count, n, _ = points.shape
     step = car[2][3]
@@ -764,6 +796,11 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
 
 @compiled
 def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):
+    """Write gradients by the points, and add those by the parameters, from those by the
+    measurements.
+
+    Yaw rate and rim speed pass to the state directly, accelerations through `_motion_adjoint`.
+    """
     learning = gradients[7]
     count = points.shape[0]
     size = _block_of(stop - start, count)

@@ -48,7 +48,8 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
         minimum speed [m/s]; and the lateral acceleration |u r| below which the states from the
         fifth on stay [m/s²].
     variances
-        Of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (n - 1,).
+        Of yaw rate, ay, and, a second, of the steering angle and the states from the fifth on,
+        (n - 1,).
     bounds
         Largest absolute value of each state, (n,).
     start_tyres
@@ -59,7 +60,7 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
         measurements the model may be unstable; and variances of the first four states of a car that
         rolls, (4,).
     gate
-        Its deviations squared, inf: none; its patience in samples; and how often on end yaw rate
+        Its deviations squared, inf: none; its patience in samples; and how often in a row yaw rate
         and ay were refused before the first sample, (2,), after the last one on return.
     state
         Mean (n,) and covariance (n, n) at the first sample before its measurement; at the last
@@ -134,6 +135,11 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
 def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):
     """f: mean one step later, in place; writes the rows of A for β' and r', returns the front
     axle's force and slopes.
+
+    With c = 1/(M u) and slopes F' = ∂F/∂α:
+
+        ∂β'/∂β = -(F_F' + F_R') c,   ∂β'/∂r = (a_R F_R' - a_F F_F') c/u - 1
+        ∂r'/∂β = (a_R F_R' - a_F F_F')/J,   ∂r'/∂r = -(a_F² F_F' + a_R² F_R')/(J u)
     """
     mass, inertia, front_arm, rear_arm = car
     turn = mean[1] / speed

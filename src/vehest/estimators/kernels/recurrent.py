@@ -37,7 +37,12 @@ BLOCK = 4  # inputs whose weights' gradients are summed together
 
 @entry(nogil=True)
 def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):
-    """See `vehest.estimators.kernels.recursion.Recursion`."""
+    """See `vehest.estimators.kernels.recursion.Recursion`.
+
+    ``constants`` are the number of gates (`GRU` or `LSTM`), H, N, and mean and scale of the output.
+    The state, (2 H, lanes), is hidden state and cell in the forward pass and their gradients in the
+    backward pass; gradients by the weights are summed once all arguments' adjoints are saved.
+    """
     gates, states, n_window, mean, scale = constants
     lanes = width(series)
     channels = series.shape[1]

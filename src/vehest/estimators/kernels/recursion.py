@@ -55,7 +55,19 @@ class Recursion(NamedTuple):
     def gradient(
         self, flat: Floats, series: Floats, starts: NDArray[np.int64], weights: Floats
     ) -> Floats:
-        """Derivatives of the `values`, summed with weights (M, B), by the parameters, (M, K)."""
+        """Derivatives of the `values`, summed with weights (M, B), by the parameters, (M, K).
+
+        Parameters
+        ----------
+        flat : Floats
+            Parameters, (M, K).
+        series : Floats
+            Measurements as the network takes them, (T, C).
+        starts : NDArray[np.int64]
+            First row of each window, (M, B).
+        weights : Floats
+            Gradient of a loss by each prediction, (M, B).
+        """
         gradient = np.empty_like(flat)
         self._over(flat, series, starts, weights, starts.shape[1], gradient, np.empty(0))
         return gradient
@@ -115,13 +127,17 @@ class Recursion(NamedTuple):
         losses: Floats,
         adam: Any = None,
     ) -> Floats:
-        """Values, (M, B), by all threads."""
+        """Values, (M, B), by all threads.
+
+        Members are rows of every array but ``series``; each thread works on a range of them.
+        """
         values = np.empty(starts.shape, flat.dtype)
         constants = self.constants(flat.dtype.type)
         if adam is None:
             adam = (flat, flat, flat, flat, *[0.0] * 6)
 
         def work(m: int, end: int) -> None:
+            """Run the loop over the members from ``m`` to ``end``."""
             adam_rows = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
             parts = (
                 starts[m:end],
@@ -159,6 +175,9 @@ def slopes_of(values, targets, first, squared, scratch):
     """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``.
 
     0 in lanes without a window.
+
+    It is 2 (v - target)/B where squared errors are minimised (``squared``), else the weight that
+    ``targets`` has.
     """
     count = values.size
     for lane in range(scratch.size):

@@ -87,7 +87,7 @@ def losses_of(
     targets : Tensor
         (N,).
     rows : Tensor
-        Which of them each member sees, int64 (M, B).
+        Which of them each member is trained on, int64 (M, B).
     parameters : Sequence[Tensor]
         See `outputs_of`; likewise ``seeds`` and ``dropout``.
     criterion : Criterion
@@ -100,10 +100,15 @@ def losses_of(
 
 
 class _Outputs(torch.autograd.Function):
+    """Autograd function of `outputs_of`: hidden layers of all members are stored for the
+    adjoint.
+    """
+
     @staticmethod
     def forward(
         ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], dropped_parts: int, *parameters: Tensor
     ) -> Tensor:
+        """Outputs of all members, each from its own inputs or the common ones."""
         x = inputs.contiguous().numpy()
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
         members = len(weights[0])
@@ -130,6 +135,7 @@ class _Outputs(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of weights and biases; inputs and seeds have none."""
         x, weights, layers, dropped_parts = ctx.forward_values
         up = upstream[0].contiguous().numpy()
         gradients = [np.empty_like(weight) for weight in weights]
@@ -153,6 +159,10 @@ class _Outputs(torch.autograd.Function):
 
 
 class _Losses(torch.autograd.Function):
+    """Autograd function of `losses_of`: gradients are computed in the forward pass, since each
+    member's loss has one number, and scaled in the backward pass.
+    """
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -164,6 +174,10 @@ class _Losses(torch.autograd.Function):
         criterion: Criterion,
         *parameters: Tensor,
     ) -> Tensor:
+        """Losses (M,), and gradients of all parameters for an upstream gradient of 1.
+
+        Hidden layers are allocated once for each thread and reused by its members.
+        """
         x, y, chosen, drawn = (tensor.numpy() for tensor in (table, targets, rows, seeds))
         weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
         gradients = [np.empty_like(weight) for weight in weights]
@@ -198,6 +212,7 @@ class _Losses(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Multiply each member's gradients by the upstream gradient of its loss."""
         scaled = (
             torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1)))
             for gradient in ctx.forward_values
@@ -239,6 +254,11 @@ def gaussian_likelihood(outputs, targets, gradient):
 
 @compiled
 def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out):
+    """Write both hidden layers (B, H₁), (B, H₂) and the outputs (B, O) of one member; see the
+    module.
+
+    Masks follow from ``seed`` and the number of the layer; ``dropped_parts`` 0: none.
+    """
     np.dot(x, w1, first)
     _activate(first, b1, seed, 0, dropped_parts)
     np.dot(first, w2, second)
@@ -253,6 +273,12 @@ def _forward(x, w1, b1, w2, b2, w3, b3, seed, dropped_parts, first, second, out)
 def _backward(
     x, w2, w3, dropped_parts, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar
 ):
+    """Write gradients of weights and biases of one member, given those of the outputs, ``up`` (B,
+    O).
+
+    W̄₃ = h₂ᵀ ō,  ā₂ = gate(ō W₃ᵀ),  W̄₂ = h₁ᵀ ā₂,  ā₁ = gate(ā₂ W₂ᵀ),  W̄₁ = xᵀ ā₁; biases are sums
+    of these over samples. Hidden layers are those that `_forward` wrote.
+    """
     np.dot(second.T, up, w3_bar)
     _summed(up, b3_bar)
     second_bar = np.empty_like(second)

@@ -10,6 +10,10 @@ accelerometer [m/s²], roll leakage of ay, distance [m] and compliance [rad s²/
 and the axle's correlated error in units of its size. Candidates for v are the bank, the network
 that comes with vehest, and steady cornering.
 
+Order of sums: over filters vector by vector, and within a vector in any order (`lanes.total`); over
+states in order of their index. A drive in parts gives the numbers of the drive as a whole, since
+`State` has everything that is carried on. There is no gradient.
+
 Source: equations in `vehest.estimators.self_calibrating`.
 """
 
@@ -81,6 +85,22 @@ def _rear_slip(f, lags, turning, n):
 
     φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a; a_m is the grip limit that the longitudinal
     acceleration leaves.
+
+    Parameters
+    ----------
+    f : array
+        Rows of one vector of filters, (`BANK_ROWS` · lanes,); the first row of `SHARED` is scratch.
+    lags : array
+        Low-passed signals, (16,).
+    turning : float
+        Derivative of the low-passed yaw rate [rad/s²].
+    n : namedtuple
+        Numbers of the estimator.
+
+    Returns
+    -------
+    tuple of vectors
+        φ [m/s²], dφ/da [1], and |a| - a_m where positive, else 0 [m/s²].
     """
     lanes = width(f)
     grip = load(f, GRIP * lanes)
@@ -99,7 +119,26 @@ def _rear_slip(f, lags, turning, n):
 
 @part()
 def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):
-    """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
+    """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors.
+
+    The covariance moves by F P Fᵀ with F = ∂x⁺/∂x written out entry by entry, A P first, then times
+    Aᵀ; only its upper triangle is stored. Process noise: ``noise_vy``² + (``noise_delay`` (uω)')²
+    for v, ``noise_vx``² for u, each times Δt, and what the other states need to keep their prior's
+    variance.
+
+    Parameters
+    ----------
+    f : array
+        Rows of one vector of filters, changed in place.
+    n : namedtuple
+        Numbers of the estimator.
+    decay, prior, spread : array
+        Factor a sample, mean and standard deviation of the states at the start, (8,).
+    ay, ax, turn, yaw_rate : float
+        Means of this and the last sample: accelerations [m/s²], u ω [m/s²], ω [rad/s].
+    unsteady : float
+        Change of the yaw rate times the speed [m/s³].
+    """
     lanes = width(f)
     v = load(f, V * lanes)
     v_v = load(f, AT[V, V])
@@ -150,6 +189,16 @@ def _axle(f, n, lags, turning, speed, size, states):
 
     The low-passed v is v - τ dv/dt. Returns the residual, its variance, and the cost of a sample
     for the acceleration beyond the grip limit, half the square in deviations.
+
+    Parameters
+    ----------
+    f : array
+        Rows of one vector of filters; derivatives and covariances with the states are written to
+        it.
+    speed, size : float
+        u [m/s], and the axle's error size s [m/s].
+    states : int
+        Number of states, 8.
     """
     lanes = width(f)
     offset = load(f, OFFSET_Y * lanes)
@@ -186,6 +235,10 @@ def _update(f, residual, variance, gate, learns, states):
     Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: all
     parameters where the filter does not learn, b where the axle slides. Returns half the square of
     the normalised residual.
+
+    P⁺_ic = P_ic - K_i S_c with the covariances S_c of the measurement with state c and K_i =
+    S_i/variance. Of a state that stays, mean and variance do, and so do the covariances of fixed
+    parameters with each other; its other covariances are updated.
     """
     lanes = width(f)
     limit = gate * root(variance)
@@ -286,7 +339,21 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):
 
 @part()
 def _judge(values, moments, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
-    """Candidates' weights by their residuals of v' = (1 - κ) ay - ω u and of u' = ax + ω v."""
+    """Candidates' weights by their residuals of v' = (1 - κ) ay - ω u and of u' = ax + ω v.
+
+    The score of a candidate is the weighted sum of the logarithms of its mean squared residuals; a
+    leakage of at most ``largest_leakage`` is regressed out of that of v'. It counts by t/(t + T)
+    with the driving time t and ``decision_time`` T, so that the odds at the start decide at first.
+
+    Parameters
+    ----------
+    values : array
+        v of the candidates at the inertial unit, (3,) [m/s].
+    moments, weights : array
+        (3, 8) and (3,), changed in place.
+    moving : bool
+        Whether the car is fast enough, so that the sample counts.
+    """
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
     if moving:

@@ -34,11 +34,21 @@ def threads_for_members() -> Iterator[None]:
 
 
 def over_members(work: Callable[[int, int], None], members: int, pieces: int = PIECES) -> None:
-    """Call ``work(first, end)`` on stretches of the members (or whatever else can be worked on one
+    """Call ``work(first, end)`` on ranges of the members (or whatever else can be worked on one
     by one), ``pieces`` for each thread.
 
     They run side by side on as many threads as torch is allowed; what is computed does not depend
     on the number.
+
+    Parameters
+    ----------
+    work : callable
+        Works on the members from ``first`` to ``end``; it must release Python's lock to gain from
+        threads.
+    members : int
+        How many there are; one alone is worked on by the calling thread.
+    pieces : int
+        Ranges for each thread.
     """
     threads = 1
     if members > 1:
@@ -66,6 +76,7 @@ def over_members(work: Callable[[int, int], None], members: int, pieces: int = P
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
+    """A pool of threads, kept for later calls."""
     return ThreadPoolExecutor(threads, thread_name_prefix="vehest-members")
 
 

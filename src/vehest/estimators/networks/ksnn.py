@@ -33,10 +33,6 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         Structure.
     yaw_rate_max : float, default 1.0
         Centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
-
-    Shapes:
-        measurements: (..., N, 4), channels yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
-        returns: (...) lateral velocity [m/s] one step after the window.
     """
 
     yaw_rate_max: Tensor
@@ -60,7 +56,11 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw initial weights near the kinematic observer: γ ≈ 0.98, β ≈ 1, small feedback."""
+        """Draw initial weights near the kinematic observer: γ ≈ 0.98, β ≈ 1, small feedback.
+
+        Weights are drawn in float64 and rounded, so that a seed gives the same ones in both
+        precisions.
+        """
         with torch.no_grad():
             for name, parameter in self.named_parameters():
                 noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64).to(
@@ -94,6 +94,9 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         """Weights φ of the local models (Fig. 3), (...) -> (..., P).
 
         Beyond the last centre the last one alone.
+
+        φ_p is a triangle of height 1 around the centre of model p, so that two neighbours share
+        each yaw rate and their weights add up to 1.
         """
         position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(
             max=self.settings.n_local - 1
@@ -117,7 +120,18 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
         return value
 
     def forward(self, measurements: Tensor) -> Tensor:
-        """Run the recursion from v = 0, û = u_m over the window (Fig. 1)."""
+        """Run the recursion from v = 0, û = u_m over the window (Fig. 1).
+
+        Parameters
+        ----------
+        measurements : Tensor
+            Windows (..., N, 4) of yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
+
+        Returns
+        -------
+        Tensor
+            Lateral velocity one step after each window, (...) [m/s].
+        """
         yaw_rate, speed, ay, ax = measurements.unbind(-1)
         weights = self.activations(yaw_rate)
         v = torch.zeros_like(speed[..., 0])

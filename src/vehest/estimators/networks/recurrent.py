@@ -83,7 +83,10 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
         """Hidden state after the window, (..., N, C) -> (..., H)."""
 
     def forward(self, prepared_windows: Tensor) -> Tensor:
-        """Lateral velocity from the hidden state after the window."""
+        """Lateral velocity from the hidden state after the window.
+
+        From standardised windows, (..., N, C), to (...) [m/s].
+        """
         output = (self.last_state(prepared_windows) * self.output_weight).sum(-1) + self.output_bias
         return output * self.output_scale + self.output_mean
 

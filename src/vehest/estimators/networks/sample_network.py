@@ -1,6 +1,9 @@
 """Base of networks that map the measurements of one instant to a sideslip angle.
 
 Inputs, the network, its samples, its weights.
+
+    recordings --learnt_samples--> inputs (N, C), sideslip (N,) --scale, samples--> `Samples`
+    `Samples` --sample_phase, `losses_of`--> trained `SampleNetwork` --outputs--> (M, T, O)
 """
 
 from __future__ import annotations
@@ -72,6 +75,17 @@ class SampleNetworkEstimator(Network):
     ) -> tuple[SampleNetwork, Samples, Samples]:
         """A new network with initial weights, one seed a member, and samples of training and
         validation as it takes them.
+
+        Parameters
+        ----------
+        data : FitData
+            Training and validation recordings with ``vy_ref``.
+        training : any
+            Settings, of which the precision is used.
+        seeds : sequence of int
+            One a member of the network.
+        minimum_speed : float
+            Slower samples are left out [m/s].
         """
         raw, judged = (
             learnt_samples(part, self.network_inputs, self.name, minimum_speed)
@@ -95,6 +109,23 @@ class SampleNetworkEstimator(Network):
         """Train members, each of a seed, on samples in random order.
 
         Squared errors are in rad², other losses in the network's units.
+
+        Parameters
+        ----------
+        data : FitData
+            Recordings at the estimator's rate.
+        training : SampleSettings
+            Step size, batch, limit of the loss.
+        criterion : Criterion
+            Loss of one member; a limit replaces it by `robust_criterion`.
+        context : FitContext
+            Checkpoints, progress, the wish to stop.
+        index : int
+            Place of this estimator among those of the fit.
+        seeds : sequence of int
+            One a member of the network.
+        minimum_speed : float
+            Slower samples are left out [m/s].
         """
         network, train, validation = self.prepare_network(data, training, seeds, minimum_speed)
         unit = network.unit**2 if criterion is squared_error else 1.0
@@ -122,8 +153,8 @@ class SampleNetwork(nn.Module):
 
     Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0
     and a deviation of 1; a constant one becomes 0. Targets are divided by their root mean square in
-    training. Both are kept with the weights and are not parameters. A network says O numbers of a
-    sample.
+    training. Both are kept with the weights and are not parameters. A network returns O numbers
+    for a sample.
 
     Source: Bertipaglia et al. 2024, Section III-A.
     """
@@ -179,7 +210,8 @@ class SampleNetwork(nn.Module):
     def scaled(self, inputs: Tensor) -> Tensor:
         """Inputs as the network takes them, (..., C), of measured ones in SI units.
 
-        Those of training lie in 0 … 1.
+        With ``range`` those of training lie in 0 … 1. A channel that was constant in training has
+        the largest float32 as its span, so that it stays near 0 whatever it becomes.
         """
         return (inputs - self.input_low) / self.input_span
 
@@ -221,7 +253,10 @@ class SampleNetwork(nn.Module):
         } | {"steepest": STEEPEST}
 
     def validation_losses(self, samples: Samples, criterion: Criterion) -> Tensor:
-        """Losses on samples without dropout, (M,)."""
+        """Losses on samples without dropout, (M,).
+
+        Samples are evaluated in parts of `SAMPLES_TOGETHER`; the mean is over all of them.
+        """
         total = np.zeros(self.members)
         with torch.no_grad():
             for first in range(0, len(samples.targets), SAMPLES_TOGETHER):

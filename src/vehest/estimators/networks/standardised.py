@@ -1,4 +1,4 @@
-"""Networks that see standardised measurements and predict standardised velocities."""
+"""Networks that receive standardised measurements and predict standardised velocities."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from vehest.data.recording import Recording
 
 
 class StandardisedNetwork(nn.Module):
-    """Base of networks that see standardised measurements and predict standardised velocities.
+    """Base of networks that read standardised measurements and predict standardised velocities.
 
     Means and standard deviations are those of the training recordings; they are kept with the
-    weights and are not parameters. `prepared` standardises what ``forward`` sees; what it predicts
-    goes back to SI units by ``output * self.output_scale + self.output_mean``. The shape of what is
-    predicted of one instant is ``outputs``.
+    weights and are not parameters. `prepared` standardises the inputs of ``forward``; what it
+    predicts goes back to SI units by ``output * self.output_scale + self.output_mean``. The shape
+    of what is predicted of one instant is ``outputs``.
     """
 
     input_mean: Tensor
@@ -37,7 +37,16 @@ class StandardisedNetwork(nn.Module):
         channels: Sequence[str],
         references: Sequence[str] = ("vy_ref",),
     ) -> None:
-        """Take means and standard deviations from recordings."""
+        """Take means and standard deviations from recordings.
+
+        Parameters
+        ----------
+        train : sequence of Recording
+            Taken together, sample by sample.
+        channels, references : sequence of str
+            Inputs (C of them), and what is predicted. A deviation is at least 1e-6, in the
+            channel's unit.
+        """
         parts = (
             (self.input_mean, self.input_scale, channels),
             (self.output_mean, self.output_scale, references),

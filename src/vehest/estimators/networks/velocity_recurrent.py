@@ -1,6 +1,13 @@
 """Base of recurrent networks that estimate a car's velocities from all samples so far.
 
 It trains them on sequences, estimates, and runs them online.
+
+    recordings --`_Drives`--> tensors (N, C) --cut, padded--> `_Batch` --`VelocityNetwork`--> loss
+    recording --run, SAMPLES_TOGETHER at a time, the state carried on--> velocities
+
+Without ``truncate_steps`` an epoch has sequences of one length at random places. With it, drives
+are cut whole, and a step of the optimiser follows each stretch of a batch, whose hidden state the
+next one continues.
 """
 
 from __future__ import annotations
@@ -99,6 +106,9 @@ class SequenceSettings(Group):
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
+        """Raise `ConfigurationError` for sequences that are not longer than what is dropped of
+        them.
+        """
         super().__post_init__()
         for name, dropped in (
             ("sequence_steps", self.dropped_steps),
@@ -174,14 +184,29 @@ class VelocityNetwork(StandardisedNetwork):
 
     @abstractmethod
     def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
-        """`forward` on standardised quantities."""
+        """`forward` on standardised quantities.
+
+        Parameters
+        ----------
+        inputs : Tensor
+            (B, T, C).
+        state : State
+            Before the first sample.
+        mask : Tensor or None
+            (B, T, H).
+
+        Returns
+        -------
+        tuple
+            Standardised velocities (B, T, O), and the state after the last sample.
+        """
 
 
 class RecurrentVelocityEstimator(HiddenStateEstimator):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity
-    to start from; the network sees it only if it is among ``inputs``. The loss is that of
+    to start from; the network receives it only if it is among ``inputs``. The loss is that of
     Węgrzynowski et al. 2024: squared errors, each output with its weight, over sequences without
     their first samples.
     """
@@ -295,7 +320,15 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
-        """Velocities [m/s, rad/s]."""
+        """Velocities [m/s, rad/s].
+
+        Parameters
+        ----------
+        samples : array
+            Of ``channels``, (T, C).
+        state : tuple of Tensor
+            As `first_state` or an earlier call returned it.
+        """
         inputs = torch.from_numpy(samples.take(self._columns, 1)).to(self.network.input_mean.dtype)[
             None
         ]
@@ -389,6 +422,8 @@ class _Drives:
         """All drives, cut whole at random places into pieces of ``steps`` samples and less.
 
         First row and length of each, (N, 2).
+
+        The first piece of a drive may be shorter than ``steps``, and so may the last.
         """
         spans = []
         offset = 0
@@ -439,7 +474,17 @@ def _phase(
     train: _Drives,
     validation: _Drives,
 ) -> Phase:
-    """Weighted squared errors over sequences at random places of the drives."""
+    """Weighted squared errors over sequences at random places of the drives.
+
+    The loss of a batch is the mean, over its counted samples, of Σ_o w_o ρ(v̂_o - v_o), with the
+    weights of the settings and `robust_squares` ρ. Dropout masks, mirroring and places are drawn
+    with the batches.
+
+    Raises
+    ------
+    DataError
+        No training recording is as long as a sequence, or one for validation is too short.
+    """
     steps = training.sequence_steps
     truncated = training.truncate_steps
     dtype = train.inputs.dtype
@@ -462,6 +507,9 @@ def _phase(
     carried: list[State] = []
 
     def errors(batch: _Batch, dropped: int) -> Tensor:
+        """Weighted squared errors (B, T - dropped); remembers the last state for the next
+        stretch.
+        """
         outputs, state = network(
             batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask
         )
@@ -472,6 +520,9 @@ def _phase(
         return weighted
 
     def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:
+        """Dropout's factors of the hidden state (B, T, H), with a mean of 1; None without
+        dropout.
+        """
         if not settings.dropout:
             return None
         is_active = (
@@ -481,6 +532,7 @@ def _phase(
         return is_active.to(dtype) / (1.0 - settings.dropout)
 
     def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
+        """A batch in which each sequence is mirrored with the probability of the settings."""
         if not training.mirrored:
             return batch
         turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
@@ -488,6 +540,7 @@ def _phase(
         return batch.scaled(inputs, outputs)
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
+        """Batches of sequences of one length, each starting from measured velocities."""
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):
             yield mirrored(
                 train.cut(chosen, torch.arange(steps), mask_of(len(chosen), steps, generator)),
@@ -495,6 +548,9 @@ def _phase(
             )
 
     def stretches(generator: torch.Generator) -> Iterator[_Batch]:
+        """Batches of pieces, each yielded in parts of ``truncated`` samples that continue each
+        other.
+        """
         pieces = train.pieces(steps, generator)
         for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(
             training.batch_size
@@ -510,11 +566,13 @@ def _phase(
                 yield batch.stretch(first, first + truncated)
 
     def loss(batch: _Batch) -> Tensor:
+        """Mean weighted squared error over the samples that count."""
         if batch.counted is None:
             return errors(batch, training.dropped_steps).mean()
         return (errors(batch, 0) * batch.counted).sum() / batch.counted.sum().clamp(min=1.0)
 
     def validate() -> float:
+        """Mean weighted squared error over all validation sequences."""
         samples = torch.cat(
             [errors(batch, training.settling_steps).reshape(-1) for batch in judged]
         )

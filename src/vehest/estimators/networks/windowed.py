@@ -1,4 +1,11 @@
-"""Base of networks over windows of past samples: fitting, estimating, running online, saving."""
+"""Base of networks over windows of past samples: fitting, estimating, running online, saving.
+
+    recordings --windows_of--> windows, targets --train_members--> weights
+    recording (T, C) --predict on all windows--> vy; the first N samples have no estimate
+
+A window's prediction belongs to the sample after it, hence ``horizon_steps`` is 1: offline it is
+written to that sample, online it is returned one interval ahead.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +56,7 @@ class WindowedEstimator(Network):
     window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
-        """A network that knows the ranges of the training recordings.
+        """A network with the ranges of the training recordings.
 
         Means and deviations if it is a `StandardisedNetwork`.
         """
@@ -137,7 +144,11 @@ class WindowedEstimator(Network):
     def estimate_recording(
         self, recording: Recording, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        """Estimate a checked recording; raises `ConfigurationError` for an initial state."""
+        """Estimate a checked recording; raises `ConfigurationError` for an initial state.
+
+        The first ``window`` samples are NaN; so is all of a recording that is not longer than a
+        window.
+        """
         if initial_state is not None:
             raise ConfigurationError(
                 f"estimator '{self.name}' has no state to start from: it reads a window of samples "
@@ -198,7 +209,13 @@ class WindowStepper(Stepper):
 
 
 def _check_state(network: nn.Module) -> None:
-    """Refuse a network whose state members cannot have, or model files cannot hold."""
+    """Refuse a network whose state members cannot have, or model files cannot hold.
+
+    Raises
+    ------
+    ConfigurationError
+        It has no parameters, running statistics, or a persistent buffer that is no floating point.
+    """
     kind = type(network).__name__
     if not any(parameter.requires_grad for parameter in network.parameters()):
         raise ConfigurationError(f"{kind} has no parameters to train")

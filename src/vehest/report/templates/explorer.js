@@ -349,15 +349,20 @@ class Explorer {
     const known = this.candidates.filter((own) => own.health && own.drawn);
     if (!known.length) return [];
     const colours = ["", colourOf("degraded"), colourOf("invalid")];
-    const lane = 22;
+    const lane = 32; // of which the upper half has the estimator's name
     const draw = (plot) => {
       const { ctx } = plot;
       const [from, to] = [this.indexAt(this.view[0]), this.indexAt(this.view[1])];
       const ratio = devicePixelRatio;
       known.forEach((own, i) => {
-        const top = plot.bbox.top + (i + 0.25) * (plot.bbox.height / known.length);
-        const height = (0.5 * plot.bbox.height) / known.length;
-        ctx.fillStyle = colourOf("rule");
+        const top = plot.bbox.top + (i + 0.55) * (plot.bbox.height / known.length);
+        const height = (0.35 * plot.bbox.height) / known.length;
+        ctx.font = `${12 * ratio}px system-ui, sans-serif`;
+        ctx.textBaseline = "bottom";
+        ctx.textAlign = "left";
+        ctx.fillStyle = isDark() ? own.dark : own.colour;
+        ctx.fillText(own.label, plot.bbox.left, top - 1 * ratio, plot.bbox.width);
+        ctx.fillStyle = colourOf("soft");
         ctx.fillRect(plot.bbox.left, top + height / 2, plot.bbox.width, ratio);
         for (let k = from; k <= to; k++) {
           const status = own.health[k];
@@ -369,19 +374,11 @@ class Explorer {
           ctx.fillRect(left, top, Math.max(plot.valToPos(this.time[end], "x", true) - left, 1.5 * ratio), height);
           k = end;
         }
-        ctx.fillStyle = isDark() ? own.dark : own.colour;
-        ctx.fillRect(plot.bbox.left - 12 * ratio, top, 6 * ratio, height);
       });
     };
     const lines = known.map((own) => ({ label: own.label, colour: "transparent", values: own.health, health: true, width: 0 }));
     const y = { values: () => [], grid: { show: false }, ticks: { show: false } };
     const keys = HEALTH.map((word) => element("span", { className: `key ${word}`, textContent: word }));
-    keys.push(element("span", { textContent: known.length > 1 ? "from top:" : "of" }));
-    for (const candidate of known) {
-      const laneKey = element("span", { className: "lane", textContent: candidate.label });
-      laneKey.style.setProperty("--lane", isDark() ? candidate.dark : candidate.colour);
-      keys.push(laneKey);
-    }
     const options = { draw: [draw], scales: { y: { range: [-1, 3] } }, y, keys };
     return [{ title: "sensor health", height: lane * known.length + 12, lines, options }];
   }

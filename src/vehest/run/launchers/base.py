@@ -45,10 +45,17 @@ class RunOptions:
 
 
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
-    """A command's launcher.
+    """The launcher that a command's options name.
 
-    Without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or
-    `MissingError`.
+    Without ``jobs`` it runs as many groups at a time as cores; ``messages`` prints what a cluster
+    reports. Machines of a cluster may share the output root.
+
+    Raises
+    ------
+    ConfigurationError
+        Options that do not belong together, or an unknown launcher.
+    MissingError
+        The launcher's package is not installed, or there is no SLURM here.
     """
     name = options.launcher
     address = options.address

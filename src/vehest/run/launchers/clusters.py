@@ -84,7 +84,19 @@ def new_mark(output: Path) -> Path:
 
 
 def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
-    """What a machine is sent of a group."""
+    """What a machine is sent of a group.
+
+    Parameters
+    ----------
+    position : int
+        Of the group among those that are launched.
+    group : Group
+        What is to be done.
+    output : Path
+        Output root of the driver.
+    mark : Path
+        Folder by which a machine recognises that it shares the root.
+    """
     return TaskSpec(
         position,
         group,
@@ -98,6 +110,20 @@ def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
     """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where
     machines share the output root.
+
+    Parameters
+    ----------
+    spec : TaskSpec
+        What the driver sent.
+    copies : mapping or None
+        Folder of an artefact -> its files.
+    should_stop : callable
+        Asked between batches.
+
+    Returns
+    -------
+    Done
+        With the files of new artefacts, where the root is not shared.
 
     Raises
     ------
@@ -143,7 +169,10 @@ def versions_here() -> dict[str, str]:
 
 
 def inputs_of(group: Group) -> set[Path]:
-    """Folders of artefacts that a group reads, or of which it has some already."""
+    """Folders of artefacts that a group reads, or of which it has some already.
+
+    Recordings, references, models that trainings start from, and artefacts that exist already.
+    """
     data = [job.data for job in group.jobs]
     if group.evaluation is not None:
         data += [group.evaluation.data, group.evaluation.references]
@@ -175,7 +204,12 @@ def pack(folders: set[Path]) -> Files:
 def unpack(packed: Files) -> None:
     """Put artefacts in their places, each whole or not at all, unless they are there.
 
-    Raises `DataError` or `MissingError`.
+    Raises
+    ------
+    DataError
+        A copy is damaged.
+    MissingError
+        A folder cannot be written to, or the disk is full.
     """
     for folder, files in packed.items():
         if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
@@ -249,6 +283,9 @@ class RayLauncher:
             self._ray.shutdown()
 
     def _connect(self) -> None:
+        """Connect to the cluster, or start a Ray of one's own, and print how many machines it has;
+        the handler of SIGTERM, which Ray replaces, is restored.
+        """
         os.environ.update(ENVIRONMENT | os.environ)
         import ray
 
@@ -281,6 +318,9 @@ class RayLauncher:
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _begin(self, position: int, group: Group) -> Any:
+        """Send a group as a task, with copies of its inputs where machines do not share the output
+        root.
+        """
         spec = task_of(position, group, self._output, self._mark)
         copies = []
         if self._stored is not None:
@@ -332,11 +372,22 @@ def _run(spec: TaskSpec, *copies: Files) -> Done:
 
 
 def _line(error: BaseException) -> str:
+    """First line of an error, at most 200 characters."""
     return (str(error) or type(error).__name__).splitlines()[0][:200]
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
     """What jobs ask the queue for.
+
+    Parameters
+    ----------
+    words : sequence of str
+        NAME=VALUE each, of ``--slurm``.
+
+    Returns
+    -------
+    dict
+        Parameters of submitit; 2 GB, one core and an hour by default.
 
     Raises
     ------
@@ -362,6 +413,7 @@ def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _positive(name: str, text: str) -> float:
+    """A positive, finite number from its text; raises `ConfigurationError` otherwise."""
     with suppress(ValueError):
         if 0.0 < float(text) < float("inf"):
             return float(text)
@@ -461,6 +513,7 @@ class SlurmLauncher:
                 shutil.rmtree(self._executor.folder, ignore_errors=True)
 
     def _begin(self, groups: Sequence[Group], positions: Sequence[int]) -> Sequence[Any]:
+        """Submit groups as one array of jobs."""
         specs = [
             task_of(position, groups[position], self._output, self._executor.folder)
             for position in positions

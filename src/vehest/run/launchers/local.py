@@ -64,6 +64,20 @@ class LocalLauncher:
         """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin
         of a group is reported.
 
+        Parameters
+        ----------
+        groups : sequence of Group
+            Run in their order.
+        stop : StopSignals or TimeLimit
+            Ends running groups after their batch.
+        report : callable
+            Takes a group's position and its progress.
+
+        Yields
+        ------
+        Done
+            One a group, in the order in which they end.
+
         Raises
         ------
         MissingError
@@ -82,6 +96,8 @@ def launch(
 
     Parameters
     ----------
+    tasks : sequence of Task
+        Picklable where there are several processes.
     jobs : int
         Processes; 1 runs everything in this one.
     stop : StopSignals or TimeLimit
@@ -90,6 +106,12 @@ def launch(
     report : Reporter
         Called with the task's position and its progress (None when it starts), or what it waits
         for.
+
+    Yields
+    ------
+    Done
+        Position and outcome, a `Failure` where the task raised. Tasks that were not begun when
+        ``stop`` came yield nothing.
     """
     if min(jobs, len(tasks)) > 1 and not stop.requested():
         yield from _launch_in_processes(tasks, min(jobs, len(tasks)), stop, report)
@@ -104,7 +126,10 @@ def launch(
 
 
 def default_jobs() -> int:
-    """Cores that this process may use."""
+    """Cores that this process may use.
+
+    A restricted affinity is respected where the system tells it; else all cores count.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -121,6 +146,7 @@ def guarded(
 def _launch_in_processes(
     tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
 ) -> Iterator[Done]:
+    """Run tasks in worker processes, each of which runs one after another until none is left."""
     waiting = deque(enumerate(tasks))
     workers: dict[Connection, _Worker] = {}
     with stop.deferred():
@@ -262,6 +288,7 @@ def _serve(connection: Connection, limits: Limits) -> None:
 
 
 def _end_with_parent() -> None:
+    """End this process when its parent has ended, also by a kill."""
     parent = parent_process()
     assert parent is not None
     parent.join()

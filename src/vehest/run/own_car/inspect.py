@@ -183,10 +183,9 @@ def inspect(
         )
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
-        unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(
             f"'{longest.file}': no column is recognised as a channel, by name or by motion, of "
-            f"{names}{unread}; "
+            f"{names}{unread(longest)}; "
             "name the columns of speed, yaw rate and lateral acceleration accordingly, with units"
         )
     computed = [
@@ -234,6 +233,11 @@ def inspect(
         rate,
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
+
+
+def unread(log: Log) -> str:
+    """What of a log was not read, as the end of a sentence."""
+    return f"; not read: {'; '.join(log.skipped[:MAX_LISTED])}" if log.skipped else ""
 
 
 def paths_of(name: str) -> tuple[Path, Path, Path]:

@@ -18,7 +18,7 @@ from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.recording import Kind
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
-from vehest.run.own_car.inspect import IMU_PLACE, VEHICLE, Examined
+from vehest.run.own_car.inspect import IMU_PLACE, VEHICLE, Examined, unread
 from vehest.run.printing import echo
 from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import STATED_UNITS
@@ -37,7 +37,7 @@ class Question:
     key: str
     text: str  # for people
     proposed: str  # answer that Enter takes; empty where nothing is proposed
-    candidates: tuple[str, ...] = ()  # other answers
+    candidates: tuple[str, ...] = ()  # alternatives
     evidence: tuple[str, ...] = ()  # for the proposal
     hint: str = "a number"  # form of an answer
 
@@ -71,6 +71,7 @@ def ask(
     Parameters
     ----------
     examined : Examined
+        The logs and what is proposed for their columns, as `inspect` returns it.
     answers : sequence of str
         ``KEY=ANSWER`` each.
     interactive : bool
@@ -128,7 +129,7 @@ def ask(
         )
         raise ConfigurationError(
             "no channel is supported by two pieces of evidence; confirm those that are right: "
-            f"{takes}"
+            f"{takes}{unread(examined.log)}"
         )
     return examined, tuple(left)
 

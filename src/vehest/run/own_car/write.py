@@ -160,6 +160,7 @@ def write(
     Parameters
     ----------
     examined : Examined
+        The logs and what is proposed for their columns, with the answers in it.
     left : sequence of Question
         Questions that were answered as proposed.
     added : sequence of str

@@ -75,6 +75,11 @@ class Car:
         friction : float
             Scale of the tyres' friction. It scales forces and slip angles alike, because a tyre's
             cornering stiffness hardly depends on it.
+
+        Returns
+        -------
+        float
+            Positive to the left: wheelbase times curvature, plus the measured excess angle.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -82,7 +87,19 @@ class Car:
     def sideslip_for(
         self, curvature: float, lateral_acceleration: float, friction: float = 1.0
     ) -> float:
-        """Sideslip [rad] at the centre of gravity in the turn of `steer_for`."""
+        """Sideslip [rad] at the centre of gravity in the turn of `steer_for`.
+
+        Parameters
+        ----------
+        curvature, lateral_acceleration, friction : float
+            As of `steer_for`.
+
+        Returns
+        -------
+        float
+            Positive where the car points to the right of its path, as in a slow left turn; at high
+            lateral acceleration the slip of the rear axle makes it negative.
+        """
         slip = self._at(self.rear_slip, lateral_acceleration, friction)
         return (self.wheelbase * self.front_share) * curvature - math.copysign(
             friction * slip, lateral_acceleration
@@ -99,12 +116,22 @@ class Car:
             Positive to the left [rad/s].
         steer, sideslip : float
             Road-wheel angle and sideslip, positive to the left [rad].
+
+        Returns
+        -------
+        float
+            Positive against the motion. The part of the turn is yaw rate times speed, times how far
+            the front wheels (weighted by their share of the load) and the car itself point off the
+            path.
         """
         return self.drag * speed**2 + yaw_rate * speed * (
             self.front_share * math.sin(steer) - math.sin(sideslip)
         )
 
     def _at(self, values: tuple[float, ...], lateral_acceleration: float, friction: float) -> float:
+        """Linear interpolation over lateral acceleration, scaled by friction; held at the grip
+        beyond it.
+        """
         grid = self.lateral_acceleration
         lateral = min(abs(lateral_acceleration) / friction, grid[-1])
         after = min(max(bisect_right(grid, lateral), 1), len(grid) - 1)
@@ -113,8 +140,26 @@ class Car:
 
 
 def car_of(plant: MultiBodyPlant) -> Car:
-    """The car as its driver knows it; measured once a process for each vehicle and step; raises
-    `ConfigurationError`.
+    """The car as its driver knows it; measured once a process for each vehicle and step.
+
+    Parameters
+    ----------
+    plant : MultiBodyPlant
+        The car and its integration step. Both, and the vehicle's ``driver`` values, identify the
+        result in the cache of this process.
+
+    Returns
+    -------
+    Car
+        Grip, excess steer and rear slip are read off a slow ramp of the steering angle
+        (`ramp_steer`) at TEST_SPEED, or at half of the top speed; ``driver`` of the vehicle
+        replaces single values.
+
+    Raises
+    ------
+    ConfigurationError
+        A value under ``driver`` is unknown, not finite or not positive, or the car's largest steady
+        lateral acceleration is below 1 m/s².
     """
     driver_values = dict(plant.vehicle.driver)
     key = json.dumps(
@@ -137,6 +182,9 @@ _DRIVER_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
 
 
 def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car:
+    """The Car of a plant: parameters of the vehicle, the measured ramp, and the ``driver`` values
+    that replace defaults.
+    """
     vehicle = plant.vehicle
     parameters = plant.parameters
     unknown = sorted(set(driver_values) - set(_DRIVER_VALUES))
@@ -181,12 +229,16 @@ def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car
 
 
 def _ratio(load: float, torque: float) -> float:
+    """Load share over torque share of an axle: the acceleration, per grip, at which it would slip;
+    infinite for an axle that is not driven.
+    """
     return load / torque if torque > 0.0 else math.inf
 
 
 def _driver_value(
     driver_values: Mapping[str, Any], name: str, default: float, vehicle_name: str
 ) -> float:
+    """One of the driver's values, or its default; refuses what is not finite and positive."""
     value = float(driver_values.get(name, default))
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(

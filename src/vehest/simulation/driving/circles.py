@@ -57,7 +57,23 @@ class SteadyCircle(Manoeuvre):
         return 30.0 + self.hold_time + 2.0 * 9.81 / self.ay_rate
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the radius, the side and the habits of this seed."""
+        """A driver with the radius, the side and the habits of this seed.
+
+        Parameters
+        ----------
+        car : Car
+            Its grip times the severity is the final lateral acceleration, limited by the top speed.
+        surface : Surface
+            The lowest friction of an open area with this seed scales the grip.
+        seed : int
+            Of the drive.
+
+        Returns
+        -------
+        Controller
+            Straight run-in, a clothoid, then the circle; the speed follows a lateral acceleration
+            that grows at ``ay_rate``.
+        """
         draw = Draws(seed)
         radius = draw(self.radius)
         severity = draw(self.severity)
@@ -126,7 +142,17 @@ class BrakingInTurn(Manoeuvre):
         return 60.0 + as_range(self.turn_time)[1]
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the radius, the speed, the brakes and the habits of this seed."""
+        """A driver with the radius, the speed, the brakes and the habits of this seed.
+
+        Parameters
+        ----------
+        car : Car
+            Its grip times the severity decides the speed, up to FASTEST_SHARE of the top speed.
+        surface : Surface
+            The mean friction of an open area with this seed scales the grip.
+        seed : int
+            Of the drive.
+        """
         draw = Draws(seed)
         radius = draw(self.radius)
         severity = draw(self.severity)
@@ -168,7 +194,11 @@ class TurnBraker(LineDriver):
         self._until_speed = manoeuvre.until_speed
 
     def command(self, time: float, observation: Observation) -> Command:
-        """Around the circle, then braking, with the steering held or not."""
+        """Around the circle, then braking, with the steering held or not.
+
+        The deceleration builds up linearly within BRAKE_BUILD_UP. With the steering held there is
+        no line to be off: the lateral error is NaN from then on.
+        """
         decision = super().command(time, observation)
         if time < self._brakes_at:
             return decision

@@ -59,6 +59,16 @@ class DoubleLaneChange(Manoeuvre):
     def gates(self, width: float) -> tuple[Gate, ...]:
         """Gates for a car of a width [m], along the x axis from the first gate on, with the other
         lane on the left.
+
+        Parameters
+        ----------
+        width : float
+            Over all, without mirrors [m]; widths of the lanes depend on it as in the standard.
+
+        Returns
+        -------
+        tuple of Gate
+            Entry, side and exit lane, of ISO 3888-1 or ISO 3888-2 as ``layout`` says.
         """
         first = 1.1 * width + 0.25
         last = 1.3 * width + 0.25
@@ -113,7 +123,11 @@ class Slalom(Manoeuvre):
         return 30.0 + self.cones * self.spacing / 2.0
 
     def gates(self, width: float) -> tuple[Gate, ...]:
-        """Cones along the x axis from the first one on, which is passed on its left."""
+        """Cones along the x axis from the first one on, which is passed on its left.
+
+        ``width`` [m] plays no part: a cone bounds the line on one side only, alternately left and
+        right.
+        """
         places = [cone * self.spacing for cone in range(self.cones)]
         sides = ((0.0, math.inf), (-math.inf, 0.0))
         return tuple(Gate(place, place, *sides[cone % 2]) for cone, place in enumerate(places))
@@ -130,6 +144,9 @@ def _between_cones(
     surface: Surface,
     seed: int,
 ) -> Controller:
+    """A driver along the smoothest line through gates, at the drawn speed, or at the speed at which
+    the line's sharpest bend takes ``severity`` of the grip.
+    """
     draw = Draws(seed)
     severity = draw(manoeuvre.severity)
     side = draw.side(manoeuvre.side)

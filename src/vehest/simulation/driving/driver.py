@@ -162,6 +162,16 @@ def draw_style(
         Amplitude of the share's variation along the drive.
     line_offset : float
         Amplitude of the line's lateral offset [m].
+
+    Returns
+    -------
+    DrivingStyle
+        From a random stream of its own (spawn key 0); the phases are drawn after the share.
+
+    Raises
+    ------
+    ConfigurationError
+        Share and ripple together leave the range from 0 to 1, as `DrivingStyle` checks.
     """
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
@@ -253,9 +263,25 @@ def speed_profile(
     used_grip : FloatArray
         (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving
         ``car.driving_share``.
+    spacing : float
+        Between samples along the line [m].
+    car : Car
+        Power per mass [W/kg], drag [1/m], top speed [m/s].
+    driver : Driver
+        Shares of the grip.
+    highest_speed : FloatArray | float, default inf
+        (N,) or one for all [m/s].
     bank, grade : FloatArray | float, default 0.0
         Of the road, positive with its left side higher, and downhill [rad]; gravity helps or
         hinders.
+
+    Returns
+    -------
+    FloatArray
+        (N,) [m/s]. The first pass, backwards, limits braking, the second, forwards, acceleration;
+        in both, lateral and longitudinal acceleration share one circle. Banking raises the lateral
+        limit in a corner to its lower side; at least a tenth of the grip is left where it is
+        adverse.
     """
     lateral = np.maximum(used_grip - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used_grip)
     cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))
@@ -317,6 +343,18 @@ class Hands:
     def at(self, time: float, load: float) -> float:
         """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip
         [m/s²].
+
+        Parameters
+        ----------
+        time : float
+            [s].
+        load : float
+            Lateral acceleration over grip; from 1 on the corrections have their full size.
+
+        Returns
+        -------
+        float
+            Positive to the left [m/s²]; a sum of 24 sines of equal amplitude.
         """
         unit = math.sqrt(2.0 / len(self._waves)) * sum(
             math.sin(rate * time + phase) for rate, phase in self._waves
@@ -329,6 +367,12 @@ class Follower:
 
     Parameters
     ----------
+    plan : Plan
+        Line, speed and road over the distance along the way.
+    car : Car
+        The car as its driver knows it.
+    driver : Driver
+        Habits: preview, lags and gains.
     progress : float, default 0.0
         Where on the plan the car starts [m].
     speed_at : Callable[[float], tuple[float, float]] | None, default None
@@ -366,7 +410,14 @@ class Follower:
 
     @property
     def start(self) -> tuple[float, float, float, float]:
-        """Place [m], heading [rad] and speed [m/s] at which the car starts."""
+        """Place [m], heading [rad] and speed [m/s] at which the car starts.
+
+        Returns
+        -------
+        tuple of float
+            x, y, heading and speed on the plan at ``progress``; with ``speed_at`` the speed of long
+            before the first sample.
+        """
         cell, share = self._cell(self.progress)
         x, y, heading, speed = (
             _between(values, cell, share)
@@ -375,7 +426,25 @@ class Follower:
         return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
 
     def command(self, time: float, observation: Observation) -> Command:
-        """The command at a time [s] for an observation of the car."""
+        """The command at a time [s] for an observation of the car.
+
+        Steering: the steady turn of the curvature ahead, plus a correction of the lateral error
+        expected one preview away, minus damping of the yaw rate, plus countersteer beyond the
+        sideslip of the turn. Acceleration: that of the plan, feedback of the speed error, and
+        resistance; limited by power and by what the friction circle has to spare.
+
+        Parameters
+        ----------
+        time : float
+            Since the first sample [s].
+        observation : Observation
+            Place, velocity and steering angle now.
+
+        Returns
+        -------
+        Command
+            With the road at the car (friction, bank, grade, heading) and the lateral error.
+        """
         car = self.car
         driver = self.driver
         speed = observation.speed
@@ -488,6 +557,11 @@ def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: floa
         Time constant of the steering.
     target_steer, steer : float
         Requested and present road-wheel angle [rad].
+
+    Returns
+    -------
+    float
+        Positive to the left.
     """
     target_steer = max(-car.largest_steer, min(car.largest_steer, target_steer))
     return max(
@@ -496,6 +570,7 @@ def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: floa
 
 
 def _between(values: list[float], before: int, share: float) -> float:
+    """Linear interpolation between a sample and the next one, at a share of the way."""
     low = values[before]
     return low + share * (values[before + 1] - low)
 

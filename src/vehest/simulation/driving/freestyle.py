@@ -72,7 +72,17 @@ class Freestyle(Manoeuvre):
     def controller(  # type: ignore[override]
         self, car: PlanarCar, surface: Surface, seed: int
     ) -> FreestyleDriver:
-        """The driver of this seed."""
+        """The driver of this seed.
+
+        Parameters
+        ----------
+        car : PlanarCar
+            Of the planar plant, whose limits of steering and current the driver keeps.
+        surface : Surface
+            Friction of the open area.
+        seed : int
+            Of the drive; it draws the duration and every later decision.
+        """
         return FreestyleDriver(self, car, OpenArea(surface, seed), Draws(seed))
 
 
@@ -94,7 +104,22 @@ class FreestyleDriver:
         self._saves = False
 
     def inputs(self, time: float, observation: Observation) -> Inputs:
-        """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
+        """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second.
+
+        Parameters
+        ----------
+        time : float
+            [s], ascending from call to call.
+        observation : Observation
+            Motion of the car; below MIN_SPEED the sideslip counts as zero.
+
+        Returns
+        -------
+        Inputs
+            Wanted road-wheel angle [rad, positive to the left], motor current [A, negative brakes]
+            and the scale of friction at the distance driven so far. While a slide beyond the
+            allowed sideslip lasts, the driver countersteers and gives no gas.
+        """
         self._progress += observation.speed / COMMAND_RATE_HZ
         sideslip = (
             math.atan2(observation.vy, observation.vx) if observation.speed > MIN_SPEED else 0.0

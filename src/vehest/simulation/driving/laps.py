@@ -87,7 +87,23 @@ class Laps(Manoeuvre):
         return words
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the style and the habits of this seed."""
+        """A driver with the style and the habits of this seed.
+
+        Parameters
+        ----------
+        car : Car
+            The car as its driver knows it.
+        surface : Surface
+            Scales the course's own friction.
+        seed : int
+            Of style, habits, traffic, corrections and patches.
+
+        Returns
+        -------
+        Controller
+            A LapDriver. With ``laps``, its plan has two laps more than are recorded: one before, on
+            which the car starts, and one after, so that the preview does not reach the plan's end.
+        """
         course = _course(self.course, self.flat)
         driver = draw_driver(seed)
         low, high = as_range(self.severity)
@@ -181,7 +197,11 @@ class SpeedLaps(Manoeuvre):
         return 2.0 * sum(length / speed for speed in self.speeds) + self.stop_time
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the line and the habits of this seed."""
+        """A driver with the line and the habits of this seed.
+
+        Friction and corners may keep a lap below its speed. After the last lap the car brakes
+        evenly to its stand within ``stop_time``.
+        """
         course = _course(self.course, self.flat)
         driver = draw_driver(seed)
         severity = Draws(seed)(self.severity)
@@ -233,6 +253,9 @@ class FastLap(Manoeuvre):
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver who uses as much of the grip as the mean speed takes; raises
         `ConfigurationError` where the car is too slow for it.
+
+        The share of the grip is found by bisection, in twelve steps between 0.02 and
+        FASTEST_SEVERITY, on the planned lap time.
         """
         course = _course(self.course, self.flat)
         driver = draw_driver(seed)
@@ -278,6 +301,23 @@ class LapDriver(LineDriver):
     At the distance ``end`` [m] the drive is over or, with a ``stop_time`` [s], the car begins to
     stop, to stand after it; it is over at ``end_time`` [s] wherever the car is. The plan has one
     lap more than is recorded.
+
+    Parameters
+    ----------
+    plan, car, driver
+        As of `Follower`.
+    drawn : dict
+        Values that the seed drew, for the provenance.
+    lap : float
+        Length of a lap [m].
+    end : float
+        Distance along the plan [m].
+    stop_time : float or None
+        From the end to the stand [s]; None: the drive ends there.
+    end_time : float
+        [s].
+    hands : Hands or None
+        Corrections of the driver.
     """
 
     def __init__(
@@ -320,6 +360,7 @@ class LapDriver(LineDriver):
 
 
 def _course(name: str, flat: bool) -> Course:
+    """A course by name; with ``flat``, without its bank and grade."""
     course = course_by_name(name)
     level = np.zeros_like(course.arc_length)
     return replace(course, bank=level, grade=level) if flat else course

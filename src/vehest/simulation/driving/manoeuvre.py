@@ -66,6 +66,25 @@ class Manoeuvre(ABC):
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """The controller of this car on this surface, as the seed draws it; raises
         `ConfigurationError` where the car cannot do this.
+
+        Parameters
+        ----------
+        car : Car
+            Size, grip and limits of the car.
+        surface : Surface
+            Friction; patches are drawn by the seed unless the surface has its own.
+        seed : int
+            Of the drive: the same seed gives the same controller.
+
+        Returns
+        -------
+        Controller
+            Made anew for every drive; it keeps state.
+
+        Raises
+        ------
+        ConfigurationError
+            The car cannot do the manoeuvre.
         """
 
     def description(self) -> dict[str, Any]:
@@ -122,6 +141,19 @@ SIDES = {1.0: "left", -1.0: "right"}  # names of the values of Draws.side
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
     """Refuse parameters outside their limits, both ends of a range included, by a
     `ConfigurationError`; None is within.
+
+    Parameters
+    ----------
+    manoeuvre : Any
+        With a ``name``; limits of parameters that it does not have are ignored.
+    **limits : tuple of float
+        Parameter -> lowest and highest allowed value, both inclusive.
+
+    Raises
+    ------
+    ConfigurationError
+        Names the manoeuvre, the parameter, its value and the limits; also where a range's ends are
+        in the wrong order.
     """
     for key, (lowest, highest) in limits.items():
         value = getattr(manoeuvre, key, None)
@@ -134,7 +166,13 @@ def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
 
 
 def as_range(value: Range) -> tuple[float, float]:
-    """Lowest and highest value."""
+    """Lowest and highest value.
+
+    Returns
+    -------
+    tuple of float
+        A plain number twice.
+    """
     low, high = value if isinstance(value, tuple) else (value, value)
     return float(low), float(high)
 
@@ -154,13 +192,28 @@ class Draws:
         return float(self.generator.uniform(*as_range(value)))
 
     def side(self, side: Side) -> float:
-        """1 for the left, -1 for the right."""
+        """1 for the left, -1 for the right.
+
+        Also a fixed side takes one draw, so that later draws stay as they are.
+        """
         drawn = 1.0 if self.generator.uniform() < 0.5 else -1.0
         return {"left": 1.0, "right": -1.0}.get(side, drawn)
 
 
 def draw_driver(seed: int) -> Driver:
-    """Habits of the driver; their spread is assumed."""
+    """Habits of the driver; their spread is assumed.
+
+    Parameters
+    ----------
+    seed : int
+        Of the drive; the habits have a random stream of their own.
+
+    Returns
+    -------
+    Driver
+        Preview, response, lag, damping and countersteer within 10 to 20 % of the defaults,
+        uniformly.
+    """
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
     usual = Driver()
     spread = {
@@ -178,7 +231,19 @@ def draw_driver(seed: int) -> Driver:
 
 
 def plan_along(line: Line, speed: float, surface: Surface, seed: int) -> Plan:
-    """A plan for a level open area: along a line at a constant speed [m/s]."""
+    """A plan for a level open area: along a line at a constant speed [m/s].
+
+    Parameters
+    ----------
+    line : Line
+        Where to drive.
+    speed : float
+        Constant [m/s].
+    surface : Surface
+        Friction over the distance along the line, repeated after OPEN_AREA_LAP.
+    seed : int
+        Draws the surface's patches.
+    """
     level = np.zeros_like(line.distance)
     friction = surface.along(line.distance, seed, OPEN_AREA_LAP)
     return Plan(**vars(line), speed=level + speed, friction=friction, bank=level, grade=level)

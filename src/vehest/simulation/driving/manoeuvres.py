@@ -43,8 +43,24 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 def manoeuvre_from_config(
     configuration: Mapping[str, Any], among: Mapping[str, type[Any]] = MANOEUVRES
 ) -> Any:
-    """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has;
-    else `ConfigurationError`.
+    """A manoeuvre from its ``name`` and any of its parameters.
+
+    Parameters
+    ----------
+    configuration : mapping
+        ``name`` and parameters; a list of two is a range.
+    among : mapping
+        Name -> class, of the manoeuvres that the plant has.
+
+    Returns
+    -------
+    Manoeuvre
+        Whole numbers stay whole numbers, as the provenance shows them.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such manoeuvre; a parameter is unknown, of a wrong type or outside its limits.
     """
     values = dict(configuration)
     name = values.pop("name", None)

@@ -62,7 +62,14 @@ class StepSteer(Manoeuvre):
         return 5.0 + as_range(self.steer_time)[1] + as_range(self.turn_time)[1]
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the speed, the angle and the side of this seed."""
+        """A driver with the speed, the angle and the side of this seed.
+
+        Returns
+        -------
+        Controller
+            The step begins between 1 and 2 s after the first sample; its angle is that of a steady
+            turn with ``severity`` of the grip, on mean friction.
+        """
         draw = Draws(seed)
         speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
         severity, steer_time, turn_time = (
@@ -119,7 +126,14 @@ class Spiral(Manoeuvre):
         return 10.0 + 2.0 * (1.5 * as_range(self.ramp_time)[1] + as_range(self.hold_time)[1])
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the speed, the angle and the side of this seed."""
+        """A driver with the speed, the angle and the side of this seed.
+
+        Returns
+        -------
+        Controller
+            The angle is piecewise linear in time: up within ``ramp_time``, held, and back to zero;
+            then, for two turns, the same to the other side.
+        """
         draw = Draws(seed)
         speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
         severity, ramp, hold = (
@@ -184,7 +198,14 @@ class RandomSteer(Manoeuvre):
         return self.duration
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver with the speed and the noise of this seed."""
+        """A driver with the speed and the noise of this seed.
+
+        Returns
+        -------
+        Controller
+            The angle is a sum of N_SINES sines of equal amplitude with one frequency drawn in each
+            part of the band; it fades in over 1 s around the first sample.
+        """
         draw = Draws(seed)
         speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
         severity = draw(self.severity)
@@ -215,6 +236,21 @@ N_SINES = 24  # of which random steering is made, evenly spread over the band
 class OpenLoop:
     """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the
     speed [m/s], until ``end_time`` [s].
+
+    Parameters
+    ----------
+    car : Car
+        Limits of steering rate, grip and power.
+    area : OpenArea
+        Friction over the distance driven.
+    speed : float
+        Held as far as grip and power allow [m/s].
+    steer_at : callable
+        Time [s] -> road-wheel angle [rad], positive to the left.
+    end_time : float
+        [s].
+    drawn : dict
+        Values that the seed drew.
     """
 
     def __init__(

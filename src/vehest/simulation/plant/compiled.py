@@ -241,6 +241,12 @@ def _relax(lateral_ratio, regime, forces, x, vector, part):
 
 
 def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_ratio_before):
+    """Integrate n_steps steps with constant inputs; arguments and results are those of `advance`.
+
+    Each step: choose the regime, divide the step into parts in which wheel slip is stable, and make
+    one classical Runge-Kutta step per part. With lagging tyres, lateral forces relax half of a part
+    after its first and half after its last stage.
+    """
     p = _unpack(vector, friction)
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     lateral_ratio = np.empty(8)
@@ -294,6 +300,11 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps, lateral_rat
 
 
 def _evaluate(states, regimes, inputs, vector, frictions, lateral_ratios):
+    """Derivatives and forces at given states; arguments and results are those of `evaluate`.
+
+    Forces of the front wheels are turned by the steering angle into the body's axes; the braking
+    forces of stability control are taken off the braked side, half from each axle.
+    """
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     lateral_ratio = np.empty(8)
     n_samples = len(states)
@@ -374,6 +385,9 @@ def _locked(lock: Path | None) -> Iterator[None]:
 
 
 def _digest() -> str:
+    """Twelve hexadecimal digits that change with the equations or the parameters' names, so that a
+    compiled copy of older code is not loaded.
+    """
     sources = (
         inspect.getsource(equations),
         inspect.getsource(regimes),

@@ -33,6 +33,11 @@ def ramp_steer(
         Scale of the tyres' friction.
     direction : float
         1: to the left, -1: to the right.
+
+    Returns
+    -------
+    Motion
+        (T,) at 50 Hz, at most MAX_SECONDS long; the car starts in equilibrium, straight ahead.
     """
     steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
     state = plant.initial_state(0.0, 0.0, 0.0, speed)

@@ -76,6 +76,7 @@ PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, 
 
 
 def _state(place: int, meaning: str) -> Any:
+    """A property that reads one of the library's 29 states, with its meaning as docstring."""
     return property(lambda state: float(state.values[place]), doc=meaning)
 
 
@@ -127,6 +128,9 @@ class MultiBodyPlant:
 
     @cached_property
     def _vector(self) -> FloatArray:
+        """Parameters of the compiled equations in one array, with the relaxation lengths at the
+        end.
+        """
         return np.append(parameter_vector(self.parameters), self.vehicle.relaxation)
 
     @property
@@ -171,6 +175,11 @@ class MultiBodyPlant:
             Heading, positive to the left [rad].
         vx : float
             Forward speed [m/s].
+
+        Returns
+        -------
+        PlantState
+            Springs carry the weight, wheels roll without slip; the regime is SLOW below SLOW_BELOW.
         """
         values = self._at_rest.copy()
         values[[X, Y, YAW, VX]] = x, y, yaw, vx
@@ -194,6 +203,11 @@ class MultiBodyPlant:
             Number of the plant's steps.
         friction : float
             Scale of the tyres' friction, constant over the steps.
+
+        Returns
+        -------
+        PlantState
+            ``n_steps`` times ``step`` [s] later. ``spun`` stays true once the car has slid.
 
         Raises
         ------
@@ -264,11 +278,23 @@ class MultiBodyPlant:
 
         Parameters
         ----------
+        states : sequence of PlantState
+            T states.
+        inputs : FloatArray
+            (T, 5), as of `MultiBodyPlant`.
+        rate_hz : float
+            Of the samples [Hz].
         friction : ArrayLike, default 1.0
             Scale of friction, (T,) or one for all.
         bank, grade : ArrayLike, default 0.0
             Of the road, (T,) or one for all [rad]; kept with the motion, their gravity is in the
             inputs.
+
+        Returns
+        -------
+        Motion
+            Accelerations and tyre forces are evaluated at the states, not differentiated from
+            samples.
         """
         derivatives, forces = self.evaluate(states, inputs, friction)
         values = np.array([state.values for state in states])
@@ -306,11 +332,25 @@ def _writable(values: ArrayLike) -> FloatArray:
 def road_gravity(bank: float, grade: float) -> tuple[float, float]:
     """Acceleration along and across the body that gravity gives on a road [m/s²]; signs of
     Motion.bank and Motion.grade.
+
+    Parameters
+    ----------
+    bank : float
+        Positive with the left side higher [rad].
+    grade : float
+        Positive downhill [rad].
+
+    Returns
+    -------
+    tuple of float
+        Forward and to the left: positive downhill, and negative, to the right, on a road whose left
+        side is higher.
     """
     return GRAVITY * math.sin(grade), -GRAVITY * math.sin(bank)
 
 
 def _describe(values: FloatArray) -> str:
+    """Velocities, yaw rate, roll and steering angle of a state as text, in ISO 8855 signs."""
     return (
         f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} "
         f"rad/s, roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"

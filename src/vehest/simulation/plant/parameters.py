@@ -120,6 +120,12 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
     """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver``
     and ``relaxation`` (front, rear).
 
+    Parameters
+    ----------
+    configuration : mapping
+        As in conf/vehicle; a key whose value is None counts as absent, the relaxation of an axle
+        that is not named as zero.
+
     Raises
     ------
     ConfigurationError
@@ -137,12 +143,29 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
 
 
 def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
-    """The vehicle with a payload [kg], a point mass that its springs carry ``forward`` and ``up``
-    of the centre of gravity [m].
+    """The vehicle with a payload, a point mass that its springs carry.
 
     Unsprung masses are shared anew between the axles, so that body and car keep one centre of
-    gravity in plan. Without a mass it is the same vehicle. Raises `ConfigurationError`: it is
-    negative, or an axle would carry nothing.
+    gravity in plan.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        Without the payload.
+    mass : float
+        [kg]; with 0 the result is the same vehicle.
+    forward, up : float
+        Place of the mass from the centre of gravity [m], positive forward and upward.
+
+    Returns
+    -------
+    Vehicle
+        With masses, lever arms, moments of inertia (parallel axes) and heights as overrides.
+
+    Raises
+    ------
+    ConfigurationError
+        The mass is negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle
@@ -175,6 +198,11 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
     """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh
     one at every call.
+
+    Raises
+    ------
+    ConfigurationError
+        The set has no multi-body values, or an override names no parameter or is no finite number.
     """
     if vehicle.parameter_set not in PUBLISHED_SETS:
         published_sets = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
@@ -215,7 +243,13 @@ def compiled_parameters(vehicle: Vehicle) -> Any:
 
 
 def parameter_vector(parameters: Any) -> FloatArray:
-    """The values of (nested) named tuples one after the other, in the order of their fields."""
+    """The values of (nested) named tuples one after the other, in the order of their fields.
+
+    Returns
+    -------
+    FloatArray
+        (N,), nested tuples in place; `compiled._unpack` is its inverse.
+    """
     values: list[float] = []
     for value in parameters:
         values.extend(parameter_vector(value) if isinstance(value, tuple) else [value])
@@ -225,6 +259,9 @@ def parameter_vector(parameters: Any) -> FloatArray:
 def _override(
     parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str
 ) -> None:
+    """Set values of a library object by name, groups within; refuses unknown names and values that
+    are no finite numbers.
+    """
     for name, value in overrides.items():
         label = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
         if name not in _field_names(type(parameters)):

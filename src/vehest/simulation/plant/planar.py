@@ -69,6 +69,10 @@ def _per_slip(slip, stiffness, shape):
 def _derivative(state, target_steer, target_current, scale, p, forces):
     """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its
     load.
+
+    Loads follow low-passed accelerations (LOAD_AX, LOAD_AY), so that forces do not depend on
+    themselves. Each tyre's slips relax towards their steady values; the torque of motor,
+    differential locks and tyre turns each wheel. Inputs beyond the car's limits are clipped.
     """
     rate = np.empty(N_STATES)
     vx = state[VX]
@@ -198,7 +202,15 @@ class Inputs(NamedTuple):
 
 
 class PlanarPlant:
-    """A car and its equations of motion, integrated by ``step`` [s]."""
+    """A car and its equations of motion, integrated by ``step`` [s].
+
+    Parameters
+    ----------
+    car : PlanarCar
+        Parameters.
+    step : float
+        Of the Runge-Kutta method [s].
+    """
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
         self.car = car
@@ -216,6 +228,14 @@ class PlanarPlant:
     def derivative(self, state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
         """Rate of change of the state, (22,), and each tyre's force along and across the body and
         its load [N], (4, 3).
+
+        Parameters
+        ----------
+        state : FloatArray
+            (22,): place, yaw, vx, vy, yaw rate, four wheel speeds, four slips along, four across,
+            two low-passed accelerations, steering angle, motor current; SI, ISO 8855.
+        inputs : Inputs
+            Wanted steering angle and current, and friction.
         """
         forces = np.empty((4, 3))
         return _derivative(state, *map(float, inputs), self._values, forces), forces
@@ -236,7 +256,22 @@ class PlanarPlant:
     def motion(
         self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float
     ) -> Motion:
-        """Motion from the states (22,) and the inputs at each sample."""
+        """Motion from the states (22,) and the inputs at each sample.
+
+        Parameters
+        ----------
+        states : sequence of FloatArray
+            T states.
+        inputs : sequence of Inputs
+            T inputs that act from each state on.
+        rate_hz : float
+            Of the samples [Hz].
+
+        Returns
+        -------
+        Motion
+            Level road; roll and pitch are proportional to the low-passed accelerations.
+        """
         values = np.array(states)
         car = self.car
         derivatives = [

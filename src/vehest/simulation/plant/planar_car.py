@@ -68,7 +68,7 @@ class PlanarCar:
 
     @property
     def wheelbase(self) -> float:
-        """[m]."""
+        """Distance between the axles [m]."""
         return self.cg_to_front_axle + self.cg_to_rear_axle
 
     @property
@@ -102,8 +102,19 @@ def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
-    """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no
-    parameter or a value makes no sense.
+    """The car with some of its parameters scaled.
+
+    Parameters
+    ----------
+    car : PlanarCar
+        The car of the configuration.
+    factors : mapping
+        Parameter -> scale; parameters that are not named keep their value.
+
+    Raises
+    ------
+    ConfigurationError
+        A name is no parameter, or a scaled value makes no sense.
     """
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
@@ -116,6 +127,9 @@ def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
 
 
 def _checked(name: str, parameters: dict[str, Any]) -> PlanarCar:
+    """A PlanarCar whose values lie within the bounds of their annotations; raises
+    `ConfigurationError` otherwise.
+    """
     return validated(
         PlanarCar, {"name": name, **parameters}, f"vehicle '{name}'", error=ConfigurationError
     )

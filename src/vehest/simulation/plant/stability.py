@@ -68,6 +68,13 @@ class StabilityControl:
             Measured speed [m/s] and yaw rate [rad/s].
         friction : float
             Scale of the tyres' friction that the control assumes.
+
+        Returns
+        -------
+        StabilityState
+            Below ``slowest`` the control is off and its reference follows the measured yaw rate.
+            The yaw moment is limited by friction, and positive where the car should turn further to
+            the left.
         """
         if vx < self.slowest:
             return StabilityState(reference=yaw_rate)
@@ -89,6 +96,12 @@ def stability_control(plant: MultiBodyPlant) -> StabilityControl:
 
     Its largest moment is that of one side's friction under its static load. A side that is braked
     against a spin carries more; the rest is left for cornering.
+
+    Parameters
+    ----------
+    plant : MultiBodyPlant
+        Its tyres' cornering stiffnesses give the understeer gradient, its longitudinal friction and
+        tracks the largest moment.
     """
     parameters = plant.parameters
     cornering_front = abs(parameters.tire.p_ky1)

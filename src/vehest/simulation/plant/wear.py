@@ -25,7 +25,13 @@ class Stint:
     wear_time: PositiveFloat = 1200.0  # [s]
 
     def friction_at(self, time: float) -> float:
-        """The factor at a time after the first sample [s]; before it, that of the first."""
+        """The factor at a time after the first sample [s]; before it, that of the first.
+
+        Returns
+        -------
+        float
+            1 for warm, new tyres; it multiplies the surface's scale.
+        """
         since = max(time, 0.0)
         return (1.0 - self.cold * math.exp(-since / self.warm_time)) * (
             1.0 - self.wear * min(since / self.wear_time, 1.0)

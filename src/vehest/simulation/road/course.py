@@ -51,6 +51,11 @@ def build_course(name: str, layout: Layout) -> Course:
     The corners are kept as they are and must turn by a full circle in total; the course is closed
     by the smallest change, in the sum of squares, of the lengths of its straights.
 
+    Returns
+    -------
+    Course
+        Sampled at most SPACING apart.
+
     Raises
     ------
     ConfigurationError
@@ -100,6 +105,7 @@ def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
 
 
 def _headings_of_straights(segments: Sequence[Segment]) -> FloatArray:
+    """Heading [rad] of each straight, in the order of the segments."""
     headings = []
     heading = 0.0
     for segment in segments:
@@ -110,6 +116,7 @@ def _headings_of_straights(segments: Sequence[Segment]) -> FloatArray:
 
 
 def _trace(name: str, layout: Layout) -> Course:
+    """Sample the segments as they are, whether or not the end meets the start."""
     nodes, curvatures, banks = _nodes(layout.segments)
     n_cells = math.ceil(nodes[-1] / SPACING)
     arc_length = np.linspace(0.0, nodes[-1], n_cells + 1)
@@ -148,6 +155,7 @@ def _grade(heights: Sequence[tuple[float, float]], arc_length: FloatArray) -> Fl
 
 
 def _friction(patches: Sequence[tuple[float, float, float]], arc_length: FloatArray) -> FloatArray:
+    """Scale of friction at each arc length; of overlapping patches the last one holds."""
     friction = np.ones_like(arc_length)
     for begin, end, scale in patches:
         place = arc_length / arc_length[-1]

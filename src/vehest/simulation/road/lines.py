@@ -47,9 +47,23 @@ def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: 
     order of the axis.
 
     It makes the sum of the squares of the curvature, and of its change, as small as the gates
-    allow; in and out it runs straight along the axis, over ``run_in`` before the first gate and the
-    last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends swing out a
-    little where the line turns, is covered by the clearance.
+    allow. It leaves the axis at most 40 m before the first gate, and is back on it a third of
+    ``run_out`` after the last. The length of the car, whose ends swing out a little where the line
+    turns, is covered by the clearance.
+
+    Parameters
+    ----------
+    gates : tuple of Gate
+        In ascending order; a gate without a row on one side is open there.
+    width : float
+        Of the car, over all [m].
+    run_in, run_out : float
+        Length of the line before the first and after the last gate [m].
+
+    Returns
+    -------
+    Line
+        Through the middle of a gate that is no wider than the car and its clearance.
     """
     begin = gates[0].begin - run_in
     end = gates[-1].end + run_out
@@ -92,6 +106,15 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
         (N, N), positive definite with at most three diagonals beside the main one.
     lower, upper : FloatArray
         (N,), infinite where y is free. They may be exceeded by ``_TOLERANCE``.
+
+    Returns
+    -------
+    FloatArray
+        (N,). The iteration ends once constraint and change are below ``_TOLERANCE``, or after
+        ``_MOST_ITERATIONS``.
+
+    Source: Boyd et al., "Distributed Optimization and Statistical Learning via the Alternating
+    Direction Method of Multipliers", 2011, Section 5.2.
     """
     bounded = (np.isfinite(lower) | np.isfinite(upper)).astype(np.float64)
     system = stiffness + _PENALTY * np.diag(bounded)
@@ -137,8 +160,21 @@ def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) 
 
 
 def circle(radius: float, side: float, run_in: float, length: float, transition: float) -> Line:
-    """A straight of ``run_in``, a clothoid of ``transition``, and a circle for the rest of
-    ``length`` [m]; ``side`` 1: left, -1: right.
+    """A straight, a clothoid and an arc of a circle.
+
+    Parameters
+    ----------
+    radius : float
+        Of the circle [m].
+    side : float
+        1: to the left, -1: to the right.
+    run_in, length, transition : float
+        Lengths of the straight, of the arc and of the clothoid between them [m].
+
+    Returns
+    -------
+    Line
+        From the origin along the x axis.
     """
     distance = np.arange(0.0, run_in + transition + length, SPACING)
     curvature = side / radius * np.clip((distance - run_in) / transition, 0.0, 1.0)

@@ -64,6 +64,11 @@ class Surface:
             Draws the patches if the surface has no seed.
         length : float or None
             Of a lap, after which the same patches come again [m]; None: never.
+
+        Returns
+        -------
+        FloatArray
+            (N,), linear over the metre before and the metre after the end of a patch.
         """
         if self.patches is None:
             return np.full(distance.shape, self.friction)

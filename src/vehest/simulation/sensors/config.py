@@ -31,6 +31,13 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
     errors of one (``ay``, ``tilt``, ``reference``), or one kind of error of every sensor but the
     reference (``*.noise``), or all of them (``*``).
 
+    Parameters
+    ----------
+    levels : SensorLevels
+        Levels to start from; they stay unchanged.
+    *names : str
+        What to switch off, in any order.
+
     Raises
     ------
     ConfigurationError
@@ -80,6 +87,7 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
 
 
 def _reference(kind: Any) -> Reference:
+    """A reference by its kind; raises `ConfigurationError` for an unknown one."""
     if str(kind) not in REFERENCES:
         raise ConfigurationError(
             f"sensors: reference '{kind}' is not one of: {', '.join(REFERENCES)}"
@@ -110,6 +118,9 @@ def _changed(
 
 
 def _changed_value(old: Any, change: Any, label: str) -> Any:
+    """One field of a dataclass of levels as a configuration changes it: ``off``, a kind of
+    reference, a mapping of inner changes, a truth value or a number.
+    """
     if is_dataclass(old):
         if change is False or change == OFF:
             return without_errors(old)

@@ -34,6 +34,11 @@ def sensor_signal(
         select.
     name : str
         Of the sensor.
+
+    Returns
+    -------
+    FloatArray
+        (T,). An error of size zero draws nothing, which leaves the streams of the others unchanged.
     """
     value = delayed(true, level.delay * rate_hz)
     if level.gain:
@@ -69,6 +74,19 @@ def delayed(samples: FloatArray, delay: float) -> FloatArray:
 
     Between samples by the cubic through the four nearest (Lagrange): half way between two, a sine
     of a tenth of the sampling rate loses 0.4 % of its amplitude and nothing of its phase.
+
+    Parameters
+    ----------
+    samples : FloatArray
+        (T,), uniform.
+    delay : float
+        In samples, zero or positive; also a fraction.
+
+    Returns
+    -------
+    FloatArray
+        (T,); the very same array without a delay. The newest value is repeated where the cubic
+        needs a sample after the last.
     """
     if delay == 0.0:
         return samples

@@ -285,7 +285,14 @@ NO_ERRORS = (
 
 
 def without_errors(level: Any) -> Any:
-    """A level, or a dataclass of levels, with all its errors off."""
+    """A level, or a dataclass of levels, with all its errors off.
+
+    Returns
+    -------
+    Any
+        Of the same type: numbers are zero and switches false, correlation times stay; a Reference
+        becomes the ideal one.
+    """
     if isinstance(level, Reference):
         return Reference()
     if is_dataclass(level):

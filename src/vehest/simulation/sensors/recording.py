@@ -26,9 +26,19 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
 
     Parameters
     ----------
+    motion : Motion
+        True motion of the centre of gravity, (T,).
+    levels : SensorLevels
+        Sizes of the errors.
     seed : int
         Of the errors; each error of each sensor draws from a stream of its own, so that changing
         one level leaves the rest alone.
+
+    Returns
+    -------
+    dict
+        Channels of speed, steering, inertial unit, wheels, motor (where there is one) and
+        reference.
     """
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
@@ -57,6 +67,18 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
     """Sensors that measured a motion, for provenance; without those of a motor, and a vibration,
     that are not there.
+
+    Parameters
+    ----------
+    levels : SensorLevels
+        Levels that were used.
+    motion : Motion
+        What was measured; it shows whether the car has a motor.
+
+    Returns
+    -------
+    dict
+        Sensor -> error -> size; gains, biases and roll shares that have no effect are left out.
     """
     idle_names = {name for name in OF_MOTOR if getattr(motion, name) is None}
     if levels.vibration == Vibration():
@@ -74,6 +96,7 @@ _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, 
 
 
 def _without_idle(value: Any) -> Any:
+    """A mapping, and those inside it, without entries that have the value of _IDLE."""
     if not isinstance(value, dict):
         return value
     return {
@@ -102,6 +125,13 @@ def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
 
     The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch,
     then roll. Accelerations of the body along its vertical axis are left out.
+
+    Parameters
+    ----------
+    motion : Motion
+        Accelerations in level axes that yaw with the car, and the angles of road and body.
+    tilt : Tilt
+        Which of the angles act.
     """
     grade = motion.grade * tilt.grade
     bank = motion.bank * tilt.bank
@@ -120,6 +150,13 @@ def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
 
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns
     about its own lateral axis.
+
+    Parameters
+    ----------
+    motion : Motion
+        Angles and their rates.
+    tilt : Tilt
+        Whether roll and pitch turn the axes; bank and grade are left out.
     """
     roll = motion.roll * tilt.roll
     pitch = motion.pitch * tilt.pitch

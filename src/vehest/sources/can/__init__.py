@@ -76,14 +76,35 @@ class CanSource(SignalSource):
         self.dbc = Path(self.options.dbc).expanduser()
 
     def inputs(self) -> dict[str, str | Path]:
-        """The logs and the DBC; raises `MissingError` where one of them is not there."""
+        """The logs and the DBC, by their names.
+
+        Raises
+        ------
+        MissingError
+            One of them is not there.
+        """
         require_files([self.dbc], self.name)
         return {**super().inputs(), self.dbc.name: self.dbc}
 
     def signals_of_channels(self) -> tuple[Database, dict[str, ChannelSignal]]:
         """The DBC, and the signal of each channel.
 
-        Raises `MissingError` without DBC or package, `DataError` where a signal is missing.
+        Values that count as not measured are those that the data set declares (raw), those whose
+        name in the DBC says so, and those that J1939 reserves.
+
+        Returns
+        -------
+        database : Database
+            The messages that carry the signals, alone.
+        by_channel : dict
+            Channel -> its signal.
+
+        Raises
+        ------
+        MissingError
+            There is no DBC, or the package that reads it is not installed.
+        DataError
+            The DBC is damaged, or lacks a signal.
         """
         require_files([self.dbc], self.name)
         database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
@@ -134,8 +155,33 @@ def decoded(
     by_channel: Mapping[str, ChannelSignal],
     bus: int | str | None = None,
 ) -> Iterator[tuple[Any, dict[str, float]]]:
-    """Frames of a log with a wanted message, each with its values, channel -> value in the DBC's
-    unit; NaN: invalid; raises `DataError`.
+    """Frames of a log that carry wanted signals, with their values.
+
+    Frames of other messages, or on another bus, are passed over.
+
+    Parameters
+    ----------
+    frames : Frames
+        Frames in the order of the log.
+    database : Database
+        Describes the wanted messages.
+    by_channel : mapping
+        Channel -> its signal.
+    bus : int, str or None
+        See `is_on`.
+
+    Yields
+    ------
+    frame : can.Message
+        With ``timestamp`` [s].
+    values : dict
+        Channel -> value in the DBC's unit, NaN where the frame says that nothing was measured; only
+        of channels whose signals the frame carries.
+
+    Raises
+    ------
+    DataError
+        A frame is shorter than the DBC says.
     """
     channels_of = channels_by_message(by_channel)
     for frame in frames:
@@ -163,7 +209,18 @@ def channels_by_message(by_channel: Mapping[str, ChannelSignal]) -> dict[str, li
 def channel_values(
     values: Mapping[str, float], channels: list[str], by_channel: Mapping[str, ChannelSignal]
 ) -> dict[str, float]:
-    """Values of the channels that a frame carries; NaN where it says that nothing was measured."""
+    """Values of the channels that a frame carries; NaN where it says that nothing was measured.
+
+    Parameters
+    ----------
+    values : mapping
+        Signal -> value in the DBC's unit, of one frame.
+    channels : list of str
+        Channels that the frame's message may carry; those whose signal is not in ``values`` are
+        left out.
+    by_channel : mapping
+        Channel -> its signal.
+    """
     measured = {
         name: values[by_channel[name].signal]
         for name in channels
@@ -176,8 +233,9 @@ def channel_values(
 
 
 def is_on(frame: Any, bus: int | str | None) -> bool:
-    """Whether a frame was on a bus, by its name or its number, which logs count from 1 and python-
-    can from 0.
+    """Whether a frame was on a bus, by its name or its number.
+
+    Logs count buses from 1, and python-can from 0; ``bus`` is as logs count. None is every bus.
     """
     return bus is None or frame.channel == (
         bus - 1 if isinstance(bus, int) and not isinstance(bus, bool) else bus
@@ -187,7 +245,21 @@ def is_on(frame: Any, bus: int | str | None) -> bool:
 def never_occurs(
     file: Path, channel: str, signal: ChannelSignal, count: int, bus: int | str | None
 ) -> str:
-    """Error text for a signal that a log does not hold."""
+    """Error text for a signal that a log does not hold.
+
+    Parameters
+    ----------
+    file : Path
+        The log.
+    channel : str
+        Channel that lacks its signal.
+    signal : ChannelSignal
+        The signal and its message.
+    count : int
+        Samples found: none, or one, which makes no clock.
+    bus : int, str or None
+        The bus that was looked at, None for all.
+    """
     message = signal.message
     often = "occurs once only" if count else "never occurs"
     on = "" if bus is None else f" on bus {bus}"

@@ -45,8 +45,15 @@ class Message:
         return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
-        """Wanted signals that a frame carries, in the DBC's unit, without those that its
-        multiplexer leaves out; raises `DataError`.
+        """Wanted signals that a frame carries, in the DBC's unit.
+
+        Bytes beyond the message's length are ignored. Signals that the frame's multiplexer leaves
+        out are left out here.
+
+        Raises
+        ------
+        DataError
+            The frame is shorter than the DBC says.
         """
         length = self.described.length
         if len(data) < length:
@@ -67,7 +74,7 @@ class Message:
         return decoded
 
     def physical(self, signal: str, raw: int) -> float:
-        """A raw value of a signal in the unit of the DBC."""
+        """A raw value of a signal in the unit of the DBC: scaled and shifted, not named."""
         return float(
             self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False)
         )
@@ -89,7 +96,12 @@ class Message:
         """Range of the values that J1939-71 reserves for errors and for what is not available.
 
         Raw values from 0xFB in the highest byte. Without the attribute that names the protocol,
-        an extended frame counts whose DBC declares a maximum below these values. NaN without any.
+        an extended frame counts whose DBC declares a maximum below these values.
+
+        Returns
+        -------
+        tuple of float
+            Lowest and highest of them in the unit of the DBC, both included; NaN without any.
         """
         described = self.described.get_signal_by_name(signal)
         length = described.length
@@ -123,7 +135,15 @@ class Database:
 def read_dbc(file: Path) -> list[Any]:
     """All messages of a DBC, as cantools holds them.
 
-    Raises `MissingError` without file or cantools, `DataError` where it is damaged.
+    The text is UTF-8, or else Windows-1252. Signals that no message sends are left out.
+
+    Raises
+    ------
+    MissingError
+        There is no such file, or cantools is not installed.
+    DataError
+        It is longer than ``limits.text_bytes``, damaged, declares no message, or a message or
+        signal of impossible length.
     """
     size = regular_file(file).stat().st_size
     check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
@@ -158,7 +178,20 @@ def read_dbc(file: Path) -> list[Any]:
 def read_database(file: Path, selected: Sequence[str]) -> Database:
     """What a DBC says of wanted signals.
 
-    Raises `MissingError` without file or cantools, `DataError` where a signal is unusable.
+    Parameters
+    ----------
+    file : Path
+        The DBC.
+    selected : sequence of str
+        Names of signals, as ``Message.Signal`` where several messages have one of that name.
+
+    Raises
+    ------
+    MissingError
+        There is no such file, or cantools is not installed.
+    DataError
+        The DBC is damaged, lacks a signal or has it several times, or declares one that cannot be
+        decoded; or two messages have one identifier.
     """
     described = read_dbc(file)
     places_of: dict[str, list[tuple[Any, str]]] = {}
@@ -188,12 +221,16 @@ def read_database(file: Path, selected: Sequence[str]) -> Database:
 
 
 def _identifier(message: Any) -> tuple[int, bool]:
+    """Identifier of cantools' message and whether it is extended, which together are unique on a
+    bus.
+    """
     return message.frame_id, message.is_extended_frame
 
 
 def _only_place(
     places_of: Mapping[str, Sequence[tuple[Any, str]]], name: str, file: Path
 ) -> tuple[Any, str]:
+    """The one message and signal of a name; `DataError` where there is none, or more than one."""
     places = places_of.get(name, ())
     if len(places) > 1:
         names = ", ".join(f"{message.name}.{signal}" for message, signal in places[:8])

@@ -1,4 +1,7 @@
-"""Logs of a CAN bus, .asc, .blf and .log of candump, read by python-can in a limited process."""
+"""Logs of a CAN bus, .asc, .blf and .log of candump, read by python-can in a limited process.
+
+file -> frames as arrays (`vehest.sources.readers.can_logs`) -> `Frames`, iterated over as messages
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,7 @@ class Frames:
     buses: list[Any]  # names or numbers
 
     def __iter__(self) -> Iterator[Any]:
+        """Messages of python-can, made `FRAMES_AT_A_TIME` at a time."""
         from can import Message
 
         data = self.arrays["data"].data
@@ -55,9 +59,21 @@ class Frames:
 
 
 def read_frames(file: Path, selected: Collection[tuple[int, bool]] | None = None) -> Frames:
-    """Read the frames of a log whose (identifier, extended) is wanted; None for all.
+    """Read the frames of a log.
 
-    Raises `MissingError` or `DataError`.
+    Parameters
+    ----------
+    file : Path
+        A log whose name ends in one of `SUFFIXES`.
+    selected : collection or None
+        Identifier and whether it is extended of each message that is wanted; None for all.
+
+    Raises
+    ------
+    MissingError
+        There is no such file, or python-can is not installed.
+    DataError
+        It is of another format, damaged, holds no frame, or more than the limits allow.
     """
     if regular_file(file).suffix.lower() not in SUFFIXES:
         raise DataError(

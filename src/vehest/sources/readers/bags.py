@@ -44,13 +44,32 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 def read_topics(
     bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All messages of topics, in the order in which the bag received them; raises
-    `ConfigurationError` or `DataError`.
+    """All messages of topics, in the order in which the bag received them.
 
-    Of each topic are given name, message type and paths of numeric fields; ``layouts`` are
-    definitions of types that ROS 2 Humble does not ship. Arrays are ``TOPIC@received`` [ns of unix
-    time], ``TOPIC@stamped`` [ns] where messages have headers, and ``TOPIC.FIELD``; the summary has
-    the start of the bag.
+    Parameters
+    ----------
+    bag : Path
+        A bag's folder, or one of its files.
+    topics : sequence
+        Of each topic name, message type and paths of numeric fields.
+    layouts : mapping
+        Message type -> its definition, for types that ROS 2 Humble does not ship.
+
+    Returns
+    -------
+    arrays : dict
+        ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers,
+        and ``TOPIC.FIELD``, in the message's unit, shape (N,) each.
+    summary : dict
+        ``start`` of the bag [ns of unix time].
+
+    Raises
+    ------
+    ConfigurationError
+        A message type is unknown, or a field is not in it or is no number.
+    DataError
+        The bag is damaged, holds no messages of a topic, other types or layouts than declared, or
+        more messages than the limits allow.
     """
     types = _types(layouts)
     with _opened(bag) as reader:
@@ -71,7 +90,25 @@ def read_topics(
 def survey_topics(
     bag: Path, ignored: Sequence[str], most_fields: int
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All topics whose messages are of ROS's own types, with their plain numbers."""
+    """All topics whose messages are of ROS's own types, with their plain numbers.
+
+    Parameters
+    ----------
+    bag : Path
+        A bag's folder, or one of its files.
+    ignored : sequence of str
+        Last parts of the names of topics that are passed over.
+    most_fields : int
+        A topic whose messages have more numbers is skipped. Fields of headers and covariances do
+        not count and are not read.
+
+    Returns
+    -------
+    arrays : dict
+        As of `read_topics`.
+    summary : dict
+        ``topics``, name, type and fields of each, and ``skipped``, reasons.
+    """
     types = _types({})
     arrays = Arrays()
     surveyed = []
@@ -161,10 +198,19 @@ def _numbers(types: Any, kind: str, prefix: str = "") -> list[str]:
 
 
 def _part(message: Any, part: str) -> Any:
+    """An element of an array by its number, or a field of a message by its name."""
     return message[int(part)] if part.isdigit() else getattr(message, part)
 
 
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
+    """Function that takes a field out of a message, by its path; numbers in it are places in an
+    array.
+
+    Raises
+    ------
+    ConfigurationError
+        The path is not in the message's type, or leads to text, an array or a message.
+    """
     node = Nodetype.NAME
     detail = kind
     parts = path.split(".")
@@ -188,6 +234,7 @@ def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any
 
 
 def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arrays:
+    """Arrays of topics as of `read_topics`, without the layouts and the bag's start."""
     columns: dict[str, array[Any]] = {}
     takers: dict[str, list[tuple[Callable[[Any], None], Callable[[Any], Any]]]] = {}
     counts = {}

@@ -22,17 +22,29 @@ LATEST = 1e11  # s
 def read_frames(
     file: Path, selected: Collection[Sequence[Any]] | None
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Frames of a log in their order, without error frames and remote frames; raises `DataError`
-    where there is none, or too many.
+    """Frames of a log in their order, without error frames and remote frames.
+
+    Parameters
+    ----------
+    file : Path
+        A log whose ending is ``.blf``, ``.asc`` or ``.log``.
+    selected : collection or None
+        Identifier and whether it is extended of each message that is wanted; None for all.
 
     Returns
     -------
     arrays : dict
         ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length``
         [bytes] and ``bus`` (number in ``buses`` of the summary) of each frame, and ``data``, the
-        bytes of all.
+        bytes of all, one frame behind the other.
     summary : dict
         ``buses``, their names or numbers.
+
+    Raises
+    ------
+    DataError
+        The log is truncated, holds no frame, more than the limits allow, or one at no time of a
+        drive.
     """
     identifiers_read = (
         None

@@ -57,14 +57,30 @@ BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 def read(
     file: Path, requests: Mapping[str, tuple[str, int | str | None]] | None
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Signals with the times of their groups; raises `DataError` for a formula, too much, or a
-    wanted signal that cannot be read.
+    """Signals with the times of their groups.
 
-    ``requests``: key -> name of a signal, and number or name of its group where the name occurs in
-    several; None for every signal of numbers whose group has times. Arrays are ``KEY`` (physical
-    values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; the summary has
-    ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped``
-    (reasons).
+    Parameters
+    ----------
+    file : Path
+        ASAM MDF 2, 3 or 4.
+    requests : mapping or None
+        Key -> name of a signal, and number or name of its group where the name occurs in several;
+        None for every signal of numbers whose group has times.
+
+    Returns
+    -------
+    arrays : dict
+        ``KEY``, physical values in the file's unit, NaN where marked invalid, and ``stamps GROUP``
+        [s], shape (T,) each.
+    summary : dict
+        ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and
+        ``skipped`` (reasons).
+
+    Raises
+    ------
+    DataError
+        The file is no MDF, is damaged, holds a formula or more than the limits allow, or a wanted
+        signal cannot be read.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -127,11 +143,29 @@ def with_signals(
     seconds: list[float],
     signals: list[tuple[str, list[float], str, str, dict[str, str]]],
 ) -> tuple[Arrays, dict[str, Any]]:
-    """``content``: bytes of a measurement of version 4 with a group of signals more; raises
-    `DataError` where it is of another version.
+    """A measurement of version 4 with a group of signals more.
 
-    ``seconds`` are times of the new group [s], ``signals`` name, values, unit, comment and, where
-    values are codes, the text of each.
+    Parameters
+    ----------
+    file : Path
+        The measurement, which is not changed.
+    seconds : list of float
+        Times of the new group, shape (T,) [s].
+    signals : list of tuple
+        Of each signal name, values, shape (T,), unit, comment and, where values are codes, code ->
+        text of each; codes are stored as integers, other values as float64.
+
+    Returns
+    -------
+    arrays : dict
+        ``content``, the bytes of the new file.
+    summary : dict
+        Empty.
+
+    Raises
+    ------
+    DataError
+        The measurement is of another version.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -185,6 +219,9 @@ def forbid_evaluation() -> None:
 
 
 def _refuse_formulas(measurement: Any, file: Path) -> None:
+    """Refuse, by a `DataError`, a file of which any signal, wanted or not, has one of
+    `EVALUATED`.
+    """
     for group in measurement.groups:
         for channel in group.channels:
             for conversion in _conversions(channel.conversion):
@@ -229,6 +266,10 @@ def _channels(measurement: Any) -> Iterator[tuple[int, int, Any]]:
 def _located(
     measurement: Any, requests: Mapping[str, tuple[str, int | str | None]], file: Path
 ) -> dict[str, tuple[int, int]]:
+    """Key -> group and place of its signal; `DataError` where a name is unknown or ambiguous.
+
+    In versions before 4 a signal is also found by its display names.
+    """
     places: dict[str, list[tuple[int, int]]] = {}
     for g, index, channel in _channels(measurement):
         for name in dict.fromkeys(
@@ -248,6 +289,9 @@ def _place_of(
     group: int | str | None,
     file: Path,
 ) -> tuple[int, int]:
+    """Group and place of the one signal of a name, in the group of a number or name if one is
+    given.
+    """
     candidates = places.get(name, [])
     if not candidates:
         signals = [signal for signal in list(places)[:COMPARED] if len(signal) < 200]
@@ -337,6 +381,9 @@ def _group_of(
 
 
 def _require_number(measurement: Any, group: int, index: int, location: str) -> None:
+    """Refuse, by a `DataError`, a signal that is no number, or whose bits lie outside of its
+    records.
+    """
     described = measurement.groups[group]
     channel = described.channels[index]
     dependencies = described.channel_dependencies[index]
@@ -362,6 +409,7 @@ def _require_number(measurement: Any, group: int, index: int, location: str) -> 
 
 
 def _invalidation_bytes(group: Any) -> int:
+    """Bytes of each record that mark invalid samples; 0 before version 4."""
     return int(getattr(group.channel_group, "invalidation_bytes_nr", 0))
 
 
@@ -425,14 +473,17 @@ def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
 
 
 def _group_name(measurement: Any, group: int) -> str:
+    """Name of a group: that of its acquisition, or before version 4 its comment."""
     described = measurement.groups[group].channel_group
     return str(described.acq_name if measurement.version >= "4" else described.comment)
 
 
 def _title(measurement: Any, group: int) -> str:
+    """Number of a group, with its name where it has one, for messages."""
     name = _group_name(measurement, group)
     return f"{group} '{_short_name(name)}'" if name else str(group)
 
 
 def _short_name(name: str) -> str:
+    """A name for messages, printable, cut off after 120 characters."""
     return printable(name if len(name) <= 120 else name[:120] + "…")

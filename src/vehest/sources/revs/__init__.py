@@ -61,7 +61,12 @@ class RevsSource(FileSource):
 
     def ids(self) -> list[str]:
         """Recordings that the data set names, or else those whose files match ``files``, in
-        alphabetical order; raises `MissingError`.
+        alphabetical order.
+
+        Raises
+        ------
+        MissingError
+            The folder is not there, or nothing in it matches.
         """
         suffix = SUFFIXES[self.options.layout]
         if self.options.recordings is not None:
@@ -105,7 +110,19 @@ class RevsSource(FileSource):
         )
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one recording by its name."""
+        """Read one recording by its name, without transforms.
+
+        Provenance has the layout, the lines above the table and the vehicle's parameters, where
+        there are any.
+
+        Raises
+        ------
+        MissingError
+            A file is not there.
+        DataError
+            A table is damaged, lacks a column, contradicts a declared unit, or its clock is not as
+            the option ``clock`` wants it.
+        """
         files = self._files_of(recording_id)
         path = self._path(recording_id)
         options = self.options
@@ -130,6 +147,9 @@ class RevsSource(FileSource):
         return self._recording(recording_id, f"'{path}'", clock, channels, provenance)
 
     def _read_csv(self, file: Path) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        """Columns of the official layout, whose units are compared unless ``units_row`` is
+        ``ignore``.
+        """
         columns = list(dict.fromkeys([self.time.column, *self.column_names]))
         values, units, about = read_csv(
             file, columns, self.gappy_columns, self.options.preamble_lines
@@ -165,6 +185,7 @@ class RevsSource(FileSource):
         return existing_folder(self.dataset.get("path"), self.name)
 
     def _path(self, recording_id: str) -> Path:
+        """File of a recording in the official layout, its folder in the layout of text files."""
         return self._folder() / f"{recording_id}{SUFFIXES[self.options.layout]}"
 
     def _files_of(self, recording_id: str) -> dict[str, Path]:

@@ -28,12 +28,36 @@ LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but br
 def read_csv(
     file: Path, columns: Sequence[str], gappy: Collection[str], preamble_lines: int
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, Any]]:
-    """Columns, the one of time first, from the first row on in which all but the ``gappy`` ones
-    hold a value, (T,) each.
+    """Columns of an official file.
 
-    In the units of the file, with these units and the provenance: lines about the drive, of which
-    there are ``preamble_lines`` above the names, and rows dropped at the head. Raises `DataError`:
-    a column or cell cannot be read.
+    Rows at the head are left out until all columns but the gappy ones hold a value: slow columns
+    begin with blank cells.
+
+    Parameters
+    ----------
+    file : Path
+        The table.
+    columns : sequence of str
+        Wanted columns, the one of time first.
+    gappy : collection of str
+        Columns that may be blank anywhere.
+    preamble_lines : int
+        Lines about the drive above the names.
+
+    Returns
+    -------
+    values : dict
+        Column -> samples in the file's unit, shape (T,).
+    units : dict
+        Unit of every column of the file, as it is written there.
+    about : dict
+        Provenance: the file's name, its lines about the drive, and the rows dropped at the head.
+
+    Raises
+    ------
+    DataError
+        A line or column is not where it belongs, a cell is no number, or a column is blank for more
+        than half of the rows.
     """
     time = columns[0]
     head = read_head(file).split(b"\n")[: preamble_lines + 2]
@@ -83,12 +107,25 @@ def read_csv(
 
 
 def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
-    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``; raises `DataError`
-    where it is no such table.
+    """Parameters of a vehicle by their names.
 
-    A parameter with several values (a curve, such as road-wheel angles over the angle of the
-    steering wheel) has a list of them. Cells below a column's last value are blank; text is kept as
-    text.
+    Parameters
+    ----------
+    file : Path
+        A line of names, one of units, then values, a column a parameter; cells below a column's
+        last value are blank.
+
+    Returns
+    -------
+    dict
+        ``{"mass": {"value": 982.0, "unit": "kg"}}``. A parameter with several values (a curve, such
+        as road-wheel angles over the angle of the steering wheel) has a list of them, one without
+        any has None. A single text is kept as text.
+
+    Raises
+    ------
+    DataError
+        It is no such table, or one of several values is no number.
     """
     text = _decoded(read_head(file))
     try:
@@ -126,6 +163,7 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _value(cells: list[str], location: str) -> Any:
+    """The number, text or list of numbers of a column's cells; None where all are blank."""
     while cells and not cells[-1]:
         cells.pop()
     if len(cells) == 1:
@@ -140,6 +178,7 @@ def _value(cells: list[str], location: str) -> Any:
 
 
 def _decoded(content: bytes) -> str:
+    """Text of UTF-8, with or without a byte order mark, or else of Latin-1."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -147,6 +186,7 @@ def _decoded(content: bytes) -> str:
 
 
 def _number(text: str) -> float | None:
+    """A finite number; None for any other text."""
     try:
         value = float(text)
     except ValueError:

@@ -47,7 +47,7 @@ class Series:
     """A topic's samples with their times."""
 
     topic: Topic
-    times: FloatArray  # the declared delay taken off [s], shape (T,)
+    times: FloatArray  # less the declared delay [s], shape (T,)
     rate_hz: float | None  # of an even clock [Hz]; None where the stamps are the times
     fields: Mapping[str, FloatArray]  # path -> values, shape (T,)
     about: Mapping[str, Any]  # what was made of the stamps, for the provenance
@@ -100,7 +100,15 @@ class RosbagSource(FileSource):
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a bag, a file or a folder.
 
-        Raises as `read_bag` does, and `DataError` for topics of no recording.
+        Raises
+        ------
+        MissingError
+            There is no bag, or rosbags is not installed.
+        ConfigurationError
+            A type, field or layout is wrong, or a topic's messages have no header.
+        DataError
+            The bag is damaged, a topic has too few messages, gaps or no clock, or topics have no
+            time in common.
         """
         requests = [
             [topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()
@@ -159,7 +167,19 @@ class RosbagSource(FileSource):
         return file.name if file.is_dir() else file.stem
 
     def _series(self, topic: Topic, fields: Iterable[str], reading: Reading, path: Path) -> Series:
-        """One topic's samples with their times, in seconds after the bag's first message."""
+        """One topic's samples with their times, in seconds after the bag's first message.
+
+        Stamps of headers or of the bag are cut to ``start`` and ``stop``; gaps of at most
+        ``max_gap`` are bridged; then come the even clock and the moving average, which shortens
+        both ends, and last the declared delay is taken off.
+
+        Raises
+        ------
+        ConfigurationError
+            Times of headers are declared, and messages have none.
+        DataError
+            There are too few messages, gaps that are too long, or stamps that are no clock.
+        """
         location = f"'{path}': topic '{topic.topic}'"
         name = topic.topic
         received = reading.arrays[f"{name}@received"]
@@ -225,6 +245,11 @@ class RosbagSource(FileSource):
     def _reference(
         self, pose: Pose, series: Series, grid: FloatArray, path: Path
     ) -> dict[str, FloatArray]:
+        """Reference channels of poses, on the ticks ``grid`` [s].
+
+        Where the topic has no even clock, poses are brought to the ticks before they are
+        differentiated.
+        """
         location = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
         plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, location)
@@ -237,7 +262,7 @@ class RosbagSource(FileSource):
 
 
 def _averaging(width: int) -> FloatArray:
-    """Weights of a centred moving average over samples.
+    """Weights of a centred moving average over samples, which sum to 1.
 
     Of an even width the outermost two weigh half.
     """

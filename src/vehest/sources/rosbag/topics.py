@@ -23,15 +23,28 @@ PACKED = ".zstd"  # a file that ROS has compressed as a whole
 
 
 def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request: Any) -> Reading:
-    """Topics of a bag; raises `MissingError` without rosbags or bag, `ConfigurationError` for a bad
-    layout, `DataError` for a damaged bag.
+    """Topics of a bag, read in a limited process.
 
-    Args:
-        path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds
-        one bag.
-        function: ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which
-        describe ``request`` and the result.
-        most_bytes: limit of what is unpacked [bytes].
+    Parameters
+    ----------
+    path : Path
+        A bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds one bag.
+    function : str
+        ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which describe the
+        request and the result.
+    most_bytes : int
+        Limit of what is unpacked [bytes].
+    **request : object
+        Further arguments of the function.
+
+    Raises
+    ------
+    MissingError
+        There is no bag, or rosbags is not installed.
+    ConfigurationError
+        A layout, type or field is wrong.
+    DataError
+        The bag is damaged, or is none. Messages name ``path``, wherever it was unpacked.
     """
     require_package("rosbags", "ros", "reading ROS 2 bags")
     bag_files(path)
@@ -46,7 +59,15 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
 def bag_files(path: Path) -> list[Path]:
     """The files that a bag is made of: the archive or file itself, or what its folder holds.
 
-    Raises `MissingError` where there are none.
+    Returns
+    -------
+    list of Path
+        Sorted: metadata, storages and those that ROS has compressed as a whole.
+
+    Raises
+    ------
+    MissingError
+        There is no such path, the folder holds none of them or cannot be read.
     """
     if not path.is_dir():
         return [regular_file(path)]
@@ -71,7 +92,14 @@ def bag_files(path: Path) -> list[Path]:
 
 @contextmanager
 def _unpacked_bag(path: Path, most_bytes: int) -> Iterator[Path]:
-    """The bag itself, or what was packed, in a temporary folder."""
+    """The bag itself, or what was packed, in a temporary folder, which is removed afterwards.
+
+    Raises
+    ------
+    DataError
+        An archive holds no bag or several, a folder has no metadata, or what is packed is damaged
+        or too large.
+    """
     with ExitStack() as stack:
         bag = path
         if path.is_file() and path.suffix.lower() not in STORAGES:
@@ -99,7 +127,15 @@ def _unpacked_bag(path: Path, most_bytes: int) -> Iterator[Path]:
 
 
 def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: int) -> None:
-    """Unpack files that ROS has compressed as a whole, under their names."""
+    """Unpack files that ROS has compressed as a whole, under their names, into ``folder``.
+
+    Raises
+    ------
+    DataError
+        One is damaged, or all together unpack to more than the limit.
+    MissingError
+        There is no room for them.
+    """
     if sys.version_info >= (3, 14):
         from compression import zstd
     else:

@@ -50,7 +50,16 @@ UNITS = {  # of ROS's own types, REP 103
 def survey(path: Path) -> Log:
     """Columns of one file, or of a bag's folder.
 
-    Raises `MissingError` without file or package, `DataError` where it cannot be read.
+    Numbers that stand for a missing sample become NaN, and columns whose own stamps are no clock
+    are left out; both are said in ``skipped``.
+
+    Raises
+    ------
+    MissingError
+        There is no such file, it is empty, or a package that reads it is not installed.
+    DataError
+        It is of a format that is not surveyed, cannot be read, has a stray time stamp, or holds no
+        column of numbers.
     """
     if not path.exists():
         raise missing_file(path)
@@ -102,6 +111,9 @@ def _without_codes(log: Log) -> Log:
 
 
 def _survey(path: Path) -> Log:
+    """The log of a file, by the reader that its ending or, where that tells too little, its content
+    asks for.
+    """
     ending = path.suffix.lower()
     if ending == ".mat":
         table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
@@ -176,6 +188,12 @@ def _survey_mdf(file: Path) -> Log:
 
 
 def _survey_vbo(file: Path) -> Log:
+    """Columns of a VBOX's log, and its runs between pauses, the longest first.
+
+    Slip at points is left out where the offsets of the logger cannot be right. A column counts as
+    the car's where its module is a CAN bus, and as the reference's otherwise; in neither way where
+    no module of the file is one.
+    """
     log = read_log(file)
     units = {**DEGREES, **log.units}
     skipped: tuple[str, ...] = ()

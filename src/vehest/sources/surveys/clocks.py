@@ -25,14 +25,16 @@ COUNTER = re.compile(
     r"?(id|nr|no|number|index))?$"
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
-STATED_UNITS = {**UNITS, "cs": 0.01, "min": 60.0, "h": 3600.0}  # the last where a header says so
+# the last where a header says so
+STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
     "s": "s sec secs second seconds sekunden",
     "ms": "ms msec millis milliseconds",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
-    "cs": "cs 1/100s centiseconds hundredths",
+    "0.1*ms": "100us 100µs 100μs 0.1ms",
+    "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
     "min": "min mins minute minutes",
     "h": "h hr hrs hour hours stunden",
 }
@@ -40,6 +42,8 @@ SPELLINGS = {
     spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
+MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
+MIN_LOG_SECONDS = 5.0
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
@@ -62,11 +66,28 @@ MOST_RESTARTS = 0.01  # of the rows
 def find_clock(
     columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
-    """The column, (N,), that grows evenly, by name or unit before another, or one that is named so
-    and grows; None where none does.
+    """The column that is the clock of a table.
 
-    With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's
-    options by which runs begin.
+    It grows evenly, by name or unit before another, or is named so and grows. One that counts rows,
+    by 1 from 0 or 1 without a name or unit of time, is none.
+
+    Parameters
+    ----------
+    columns : mapping
+        Name -> numbers, shape (N,); one at least.
+    units : mapping
+        Name -> unit as the file writes it, of those that have one.
+
+    Returns
+    -------
+    stamps : Stamps or None
+        The column, its unit and what tells them; None where none is a clock.
+    seconds : FloatArray or None
+        Times of the rows from the first on, shape (N,) [s].
+    runs : tuple of slice
+        Rows of each run, the longest first; one of all without a clock.
+    options : dict
+        Options of the source by which runs begin.
     """
     best = None
     likely = -1
@@ -81,7 +102,9 @@ def find_clock(
         column_step = _step(values, named=named)
         counts_rows = column_step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = (
-            None if column_step is None or counts_rows else _stamps(name, column_step, unit, named)
+            None
+            if column_step is None or counts_rows
+            else _stamps(name, column_step, unit, named, float(np.ptp(values)))
         )
         if column_step is not None and stamps is not None and 2 * bool(unit) + named > likely:
             is_unknown = bool(written.strip("-")) and not unit
@@ -107,11 +130,23 @@ def find_clock(
 
 
 def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
-    """Times, (N,), that go on where a counter wrapped or rows stood out of order, and the options.
+    """Times that go on where a counter wrapped or rows stood out of order.
 
     A counter wraps if each of its steps back is that of one modulus. Rows are out of order if
     sorting makes the times even, and either puts none of them beside another of nearly the same
     time, as two drives would, or moves none far; others that go back begin a run.
+
+    Parameters
+    ----------
+    times : FloatArray
+        Numbers of a column in its unit, shape (N,).
+
+    Returns
+    -------
+    times : FloatArray
+        Shape (N,); as they were where nothing is to be put in order.
+    options : dict
+        ``wraps_at`` or ``sort`` of the column of times; empty where nothing is.
     """
     steps = np.diff(times)
     if not (np.isfinite(times).all() and (steps < 0).any()):
@@ -135,8 +170,22 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
-    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option
-    ``max_gap``, if they pause.
+    """Rows of each run of times, which ends where they restart or pause.
+
+    Parameters
+    ----------
+    seconds : FloatArray
+        Times, shape (N,) [s].
+    step : float
+        Their typical step [s]; a pause is a step above `FEWEST_STEPS` of it, and above `MAX_GAP`.
+
+    Returns
+    -------
+    runs : list of slice
+        Rows of each run, in their order; where pauses end them, none that last less than
+        ``max_gap``.
+    options : dict
+        The option ``max_gap``, if times pause and seldom; else empty.
     """
     steps = np.diff(seconds)
     longest = float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
@@ -152,7 +201,9 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
 
 
 def plain_name(name: str) -> str:
-    """In lower case, without marks, words apart."""
+    """A column's name in lower case, without marks, words apart: ``wheelSpeed_FL`` is ``wheel speed
+    fl``.
+    """
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
     return re.sub(r"[\W_]+", " ", words).strip().lower()
 
@@ -178,16 +229,39 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
     return step if step > 0 and grows else None
 
 
-def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
-    """A column of time in the unit in which a step makes a rate that loggers have.
+def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> Stamps | None:
+    """A column of time, of a step and a length, in the unit that makes a rate that loggers have.
 
-    None where no unit does.
+    Parameters
+    ----------
+    name : str
+        The column.
+    step : float
+        Its typical step, in the column's unit.
+    unit : str
+        Unit that the header states, as `STATED_UNITS` has it; empty where it states none.
+    named : bool
+        Whether the column is named as time.
+    length : float
+        Its largest value less its smallest, in the column's unit.
+
+    Returns
+    -------
+    Stamps or None
+        None where no unit is stated or fits and the column is not named as time, or where its rate
+        would be too high. ``asked`` where the unit that is taken does not fit, or is not the stated
+        one.
     """
     offered = UNITS | ({unit: STATED_UNITS[unit]} if unit else {})
-    fitting = [
-        name for name, factor in offered.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]
-    ]
+    rates = {name: 1.0 / (step * factor) for name, factor in offered.items()}
+    fitting = [name for name, rate in rates.items() if RATES[0] <= rate <= RATES[1]]
+    slow = [name for name, rate in rates.items() if MIN_RATE_HZ <= rate < RATES[0]]
+    is_short = bool(fitting) and length * STATED_UNITS[fitting[0]] < MIN_LOG_SECONDS
+    if unit in slow:
+        fitting = slow
     chosen = unit if unit in fitting or not fitting else fitting[0]
+    if not unit and is_short and slow:
+        chosen, fitting = slow[0], []
     chosen = chosen or ("s" if named else "")
     if not chosen or step * STATED_UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None

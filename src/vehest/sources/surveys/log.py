@@ -66,7 +66,10 @@ class Log:
     repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
 
     def file_row(self, place: int) -> int:
-        """Number in the file, from 1, of a row of the columns, from 0."""
+        """Number in the file, from 1, of a row of the columns, from 0.
+
+        It differs by one and by the rows before it that repeat the names.
+        """
         row = place + 1
         for repeated in self.repeated_names:
             row += repeated <= row

@@ -43,6 +43,7 @@ from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_
 from vehest.sources.tables import (
     ROW_OF_NUMBERS,
     TextLayout,
+    cut_end,
     is_parquet,
     names_of,
     parse_table,
@@ -109,9 +110,16 @@ class Shape:
 
 
 def survey_table(file: Path) -> Log:
-    """What a table holds.
+    """What a table of text, or of Parquet, holds.
 
-    Raises `DataError` where it is no table, has no names, or holds no numbers.
+    The source is ``text_log`` where ``tabular`` cannot read it: with rows below the names, marks of
+    missing samples, or clock times.
+
+    Raises
+    ------
+    DataError
+        It is no table, has no names, holds no numbers or fewer than two rows of them, or is in long
+        format.
     """
     clocks: dict[str, FloatArray] = {}
     options: dict[str, Any] = {}
@@ -216,9 +224,15 @@ def _fault(name: str, times: FloatArray) -> str:
 
 
 def unit_in_name(name: str) -> str:
-    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``.
+    """The unit that a column's name ends in, as it is written there.
 
-    Empty where there is none.
+    It stands in brackets, ``Speed [km/h]``, or behind the last blank or underscore, ``ay_mps2``,
+    where it is a known unit or abbreviation of two letters or more; ``ms`` of a velocity is m/s.
+
+    Returns
+    -------
+    str
+        Empty where there is none.
     """
     bracketed = BRACKETED.match(name.strip())
     if bracketed:
@@ -231,15 +245,21 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """Layout of a table of text, by its beginning.
+    """Layout of a table of text, by its beginning: of all delimiters and decimal marks the pair by
+    which most cells are numbers.
 
-    Raises `DataError` where it is none, or has one column or no line of names.
+    Raises
+    ------
+    DataError
+        The file is no table of text, has one column, no line of names or more columns than the
+        limits allow, or its columns are not signals.
     """
     head = read_head(file, HEAD)
-    encoding, text = _decoded(head, file)
+    is_whole = len(head) < HEAD
+    encoding, text = _decoded(head.rstrip(b"\0") if is_whole else head, file)
     lines = [
         line[:LONGEST_LINE]
-        for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]
+        for line in re.split(r"\r\n|\n|\r", text)[: None if is_whole else -1][:MOST_LINES]
     ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
     require_columns_of_signals(file, lines, tables)
@@ -325,6 +345,7 @@ def _share(row: Sequence[str], decimal: str) -> float:
 
 
 def _is_number(cell: str, decimal: str) -> bool:
+    """Whether a cell, perhaps quoted, is a number; with a decimal comma, no point may be in it."""
     text = cell.strip().strip('"')
     return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (
         decimal == "," and "." in text
@@ -344,10 +365,16 @@ def _are_units(cells: Sequence[str]) -> bool:
 
 
 def _is_unit(text: str) -> bool:
+    """Whether a word is a known unit, of a channel or of time."""
     return plain_unit(text) is not None or text.lower() in SPELLINGS
 
 
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
+    """Encoding and text of the beginning of a file.
+
+    UTF-16 by its mark, then UTF-8, then Shift-JIS if it makes Japanese words, then Windows-1252;
+    Latin-1 where none of them fits. `DataError` where control characters say that it is no text.
+    """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
@@ -398,8 +425,18 @@ def _without_texts(
 def _columns(
     file: Path, shape: Shape, table: pa.Table
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
-    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not
-    read, and why.
+    """Columns of a table, by what they hold.
+
+    Returns
+    -------
+    values : dict
+        Name -> numbers, NaN where a sample is missing, shape (N,).
+    clocks : dict
+        Name -> times of a clock, shape (N,) [s].
+    marks : set of str
+        Texts that mark a missing sample.
+    skipped : list of str
+        What was not read, and why.
     """
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     values: dict[str, FloatArray] = {}
@@ -456,17 +493,22 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
         column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True
     )
     require_memory(file, shape.layout)
-    opened = partial(table_stream, file)
+    n_bytes, left_out = cut_end(file, shape.layout) or (None, "")
+    opened = partial(table_stream, file, n_bytes)
     problem = None
     for convert in (inferred, text):
         lines: list[str] = []
         try:
             layout = with_names(file, shape.layout)
             table = parse_table(opened, layout, convert, lines_of_text=lines)
-            return table, [f"line '{printable(line.strip()[:60])}'" for line in lines]
+            texts = [f"line '{printable(line.strip()[:60])}'" for line in lines]
+            return table, [left_out, *texts] if left_out else texts
         except DAMAGE as error:
             problem = printable(first_line(error))
-    why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
+    why = (
+        "is it truncated, is a line of text or a second table below its rows, or are its columns "
+        "aligned by blanks?"
+    )
     raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 

@@ -32,7 +32,7 @@ MAX_COLUMNS = 8  # of a table in long format, where its beginning does not show 
 def require_columns_of_signals(
     file: Path, lines: Sequence[str], tables: Mapping[str, Mapping[int, list[str]]]
 ) -> None:
-    """Refuse, by a `DataError` with the way out, a text whose columns are not signals.
+    """Refuse a text whose columns are not signals, with the way out.
 
     Parameters
     ----------
@@ -42,6 +42,12 @@ def require_columns_of_signals(
         First lines of the file.
     tables : mapping
         Delimiter -> number of each line that holds something -> its cells.
+
+    Raises
+    ------
+    DataError
+        It holds raw frames of a bus, InfluxDB's line protocol, columns that are aligned by blanks,
+        rows in one pair of quotes, or a value a row (long format).
     """
     filled = [line.strip() for line in lines if line.strip()]
     if filled and all(map(_CANDUMP.match, filled[:20])):
@@ -73,6 +79,9 @@ def require_columns_of_signals(
 
 
 def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
+    """Refuse, by a `DataError`, a table whose names are those of an identifier and of bytes, with
+    bytes or whole numbers below them.
+    """
     for header, row in pairwise(table[:21]):
         cells = dict(zip(map(str.strip, header), map(str.strip, row), strict=False))
         has_id = any(map(_NAMES_FRAME.fullmatch, cells))
@@ -89,6 +98,11 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
 
 
 def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
+    """Refuse, by a `DataError`, a table in which one column names a quantity and another has its
+    value.
+
+    The names must be texts that repeat, each in `MIN_ROWS_OF_SIGNAL` rows on average.
+    """
     for at, header in enumerate(table[:20]):
         rows = [row for row in table[at + 1 :] if len(row) == len(header)]
         for k, value in product(*_places_in_long_format(header)):
@@ -102,7 +116,21 @@ def _require_wide_format(file: Path, table: Sequence[Sequence[str]]) -> None:
 
 
 def require_columns_of_numbers(file: Path, numbers: Sequence[str], texts: Sequence[str]) -> None:
-    """Refuse, by a `DataError` with the way out, columns of numbers and texts in long format."""
+    """Refuse columns of numbers and texts in long format, with the way out.
+
+    Parameters
+    ----------
+    file : Path
+        For messages.
+    numbers, texts : sequence of str
+        Names of the columns that hold numbers, and of the others.
+
+    Raises
+    ------
+    DataError
+        One of the texts is named as a quantity's name is, and one of the numbers as its value, in a
+        table of at most `MAX_COLUMNS` columns.
+    """
     signals, _ = _places_in_long_format(texts)
     _, values = _places_in_long_format(numbers)
     if signals and values and len(numbers) + len(texts) <= MAX_COLUMNS:
@@ -117,6 +145,7 @@ def _places_in_long_format(names: Sequence[str]) -> tuple[list[int], list[int]]:
 
 
 def _in_long_format(file: Path, signal: str, value: str) -> DataError:
+    """The error for a table in long format, by its columns of names and values."""
     signal, value = printable(signal.strip()), printable(value.strip())
     return DataError(
         f"'{file}' is in long format, one value a row: '{signal}' names the quantity, "

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, listed
+from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import BoolArray, Scored
 from vehest.report import figures
 from vehest.report.comparison_figures import Cloud, agreement_figure, clouds_figure
@@ -74,7 +77,30 @@ def signals_of(
     test_set: str,
     lines: Mapping[Name, Line],
 ) -> DriveSignals:
-    """Signals of the rows of a board, of each the seed chosen on validation."""
+    """Signals of the rows of a board, of each the seed chosen on validation.
+
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        The comparison.
+    board : pd.DataFrame
+        Rows of a leaderboard with estimator, variant, seed and title; their order is that of
+        drawing.
+    test_set : str
+        The test set whose estimates are read.
+    lines : mapping
+        (estimator, variant) -> colour, dash and marker.
+
+    Returns
+    -------
+    DriveSignals
+        Estimates of all candidates at the evaluation rate.
+
+    Raises
+    ------
+    DataError
+        An estimate is damaged, or does not cover its range.
+    """
     models = {(*model.name, model.seed): model for model in artefacts.models}
     candidates = {
         (row["estimator"], row["variant"]): (
@@ -117,6 +143,18 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
     """Figure ``zoom_FILE``: the busiest `ZOOM_SECONDS`.
 
     On the page, all traces of the test set, which begin there.
+
+    Parameters
+    ----------
+    signals : DriveSignals
+        At most MAX_IN_ZOOM estimates are drawn, the first ones.
+    file : str
+        End of the figure's name.
+
+    Returns
+    -------
+    Figure
+        With the content of the page's interactive plot (`explorer_of`).
     """
     drive = signals.reference
     start, stop = signals.busiest
@@ -131,7 +169,8 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
         f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
         f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error "
         "(estimate − measured), "
-        f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}.",
+        f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}."
+        f"{_trace_notes(signals)}",
         figures.zoom_figure(
             drive.time[inside],
             drive.ay[inside] if signals.has_ay else None,
@@ -142,6 +181,16 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
         ),
         _explorer(signals),
     )
+
+
+def _trace_notes(signals: DriveSignals) -> str:
+    """A sentence for each family whose traces need an explanation, with their titles."""
+    titles: dict[str, list[str]] = {}
+    for (name, _), (_, title, _) in signals.candidates.items():
+        with suppress(ConfigurationError):  # a family of a package that is not installed here
+            if note := estimator_class(name).trace_note:
+                titles.setdefault(note, []).append(title)
+    return "".join(f" {listed(names)}: {note}." for note, names in titles.items())
 
 
 def _band_of_first(
@@ -261,6 +310,7 @@ def _explorer(signals: DriveSignals) -> str:
 
 
 def _reference_trace(signals: DriveSignals) -> figures.Traces:
+    """The reference as a trace, its sideslip NaN where it is not drawn."""
     drive = signals.reference
     return figures.Traces(
         "measured", REFERENCE, drive.vy_ref, _where_drawn(drive, drive.sideslip_ref)
@@ -268,6 +318,7 @@ def _reference_trace(signals: DriveSignals) -> figures.Traces:
 
 
 def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
+    """Estimates as traces, in the order of the candidates."""
     return [
         figures.Traces(title, line, drive.vy, _where_drawn(drive, drive.sideslip))
         for (_, title, line), drive in zip(
@@ -277,6 +328,7 @@ def _estimate_traces(signals: DriveSignals) -> list[figures.Traces]:
 
 
 def _errors(signals: DriveSignals) -> list[figures.Errors]:
+    """Title, line and sideslip error [deg] at the scored samples, (K,), of each candidate."""
     return [
         (title, line, np.degrees(drive.sideslip_error)[drive.is_sideslip_scored])
         for (_, title, line), drive in zip(
@@ -286,7 +338,11 @@ def _errors(signals: DriveSignals) -> list[figures.Errors]:
 
 
 def _joined(parts: Sequence[Scored], step: float) -> Scored:
-    """Ranges one after another; a single one keeps its times."""
+    """Ranges one after another; a single one keeps its times.
+
+    Times of several ranges are replaced by equal steps from zero; samples of the gaps are NaN and
+    not scored.
+    """
     if len(parts) == 1:
         return parts[0]
     gap = _gap_of(parts)

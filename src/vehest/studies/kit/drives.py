@@ -48,6 +48,22 @@ _FIGURES = (
 def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     """The reference's spread and noise, then the bounds without and with the car by set of inputs,
     of those that were measured.
+
+    Parameters
+    ----------
+    part : PartArtefacts
+        The comparison.
+    test_set : str
+        The test set whose recordings are read.
+    name : str
+        Of the table.
+
+    Returns
+    -------
+    Table
+        v in m/s, β in deg, root mean squares over the scored samples; ``share`` is the square of a
+        floor's v over that of the reference's spread. Floors that cannot be computed from the
+        recorded channels are left out.
     """
     drives = drives_of(part.split.tests[test_set], part.reference, part.protocol)
     spread = reference_spread(drives)
@@ -103,7 +119,19 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
 def regime_table(
     part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], name: str
 ) -> Table | None:
-    """RMSE(β) of candidates by regime; None where metrics have no regimes."""
+    """RMSE(β) of candidates by regime; None where metrics have no regimes.
+
+    Parameters
+    ----------
+    part : PartArtefacts
+        Its metrics have rows for the subsets in REGIMES.
+    test_set : str
+        The test set.
+    chosen : mapping
+        (estimator, variant) -> title and seed.
+    name : str
+        Of the table.
+    """
     metrics = part.metrics
     rows_of_test = metrics[
         (metrics["test_set"] == test_set)
@@ -149,6 +177,7 @@ def regime_table(
 
 
 def _in_words(regime: str) -> str:
+    """A regime as the header of a column; bands of lateral acceleration with their bounds."""
     if regime not in AY_BANDS:
         return regime
     low, high = AY_BANDS[regime]
@@ -165,6 +194,19 @@ def band_blocks(
     """Table ``bands_FILE`` and figure ``reliability_FILE``.
 
     Nothing where no estimator has bands.
+
+    Parameters
+    ----------
+    part : PartArtefacts
+        Its metrics have coverages with the ends of their intervals.
+    test_set : str
+        The test set.
+    chosen : mapping
+        (estimator, variant) -> title and seed; those without bands are left out.
+    lines : mapping
+        (estimator, variant) -> colour and marker.
+    file : str
+        End of the names of table and figure.
     """
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows = []

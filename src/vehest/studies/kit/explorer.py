@@ -39,6 +39,10 @@ def explorer_of(
 
     Parameters
     ----------
+    artefacts : PartArtefacts
+        The comparison; recordings are read at the evaluation rate.
+    test_set : str
+        The test set.
     candidates_drawn : Mapping[Name, tuple[EvaluatedModel, str, Line]]
         (estimator, variant) -> model, title and looks, in the order of the board.
     scored : Mapping[Name, Sequence[Scored]]
@@ -46,6 +50,12 @@ def explorer_of(
     axis : tuple[float, str, int, tuple[float, float]]
         First time [s], label of the time axis, samples between two ranges, and a range that
         deserves a button [s].
+
+    Returns
+    -------
+    str
+        JSON: times, inputs in display units, reference, estimates with bands and health, and the
+        course, integrated from speed and yaw rate where one was measured. Missing values are gaps.
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
@@ -120,7 +130,15 @@ _BANDS = ("vy", "sideslip")
 
 
 def chained(pieces: Sequence[FloatArray], gap: int) -> FloatArray:
-    """Pieces one after another with a gap of NaN between two."""
+    """Pieces one after another with a gap of NaN between two.
+
+    Parameters
+    ----------
+    pieces : sequence of FloatArray
+        One-dimensional, at least one.
+    gap : int
+        Samples between two pieces.
+    """
     between = np.full(gap, np.nan)
     parts: list[FloatArray] = [part for piece in pieces for part in (piece, between)]
     return np.concatenate(parts[:-1])
@@ -136,6 +154,23 @@ def health_over(
     invalid, over all ranges.
 
     None where the model has no health, or reads another rate than that of the evaluation.
+
+    Parameters
+    ----------
+    model : EvaluatedModel
+        Its trust.yaml contains the health, if it was calibrated.
+    pieces : sequence of (Recording, Span)
+        Recordings with the ranges that are scored.
+    artefacts : PartArtefacts
+        For the evaluation rate, warm-up and skipped seconds.
+    gap : int
+        Samples between two ranges, NaN in the result.
+
+    Returns
+    -------
+    FloatArray or None
+        (K,), over the scored samples; the health itself starts with the warm-up. Also None where a
+        recording lacks a channel that the health reads.
     """
     if model.calibration_folder is None or not (model.calibration_folder / TRUST).is_file():
         return None

@@ -57,6 +57,7 @@ class Recommendation:
         return [best_sentence(ranking, self.titles), self._describe_choice(condition)]
 
     def _describe_choice(self, condition: str) -> str:
+        """What is recommended and why, with the expected error; or why nothing is."""
         ranking = self.ranking
         baselines = " and ".join(BASELINE_TITLES[baseline] for baseline in BASELINES)
         if self.model is None:
@@ -91,12 +92,17 @@ class Recommendation:
 
 
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
-    """What to recommend after a test set.
+    """Which estimator to recommend, decided by one test set.
 
     Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
     without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.
     None is recommended where none is significantly better than the zero-sideslip baseline and the
     static map, or where the test cannot rank estimators.
+
+    Returns
+    -------
+    Recommendation
+        Its model is the seed chosen on validation.
 
     Raises
     ------
@@ -119,6 +125,9 @@ def plain_text(markdown: str) -> str:
 
 
 def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str]:
+    """Clauses on why a test cannot rank estimators: too few independent segments, and those of
+    `cannot_rank`.
+    """
     too_few = (
         f"the test ranges contain {ranking.n_blocks} independent segments of driving, and at "
         f"least {MIN_BLOCKS} are needed"
@@ -127,6 +136,9 @@ def _obstacles(part: PartArtefacts, test_set: str, ranking: Ranking) -> list[str
 
 
 def _lowest_on_validation(part: PartArtefacts, names: Sequence[Name]) -> EvaluatedModel:
+    """The model with the lowest RMSE(v) on validation among the chosen seeds of some estimators;
+    one without such a metric counts as infinite.
+    """
     runs = runs_of(part)
     groups = by_name(part.models)
     errors = list[tuple[float, EvaluatedModel]]()

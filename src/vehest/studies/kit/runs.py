@@ -21,10 +21,24 @@ Runs = dict[
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
-    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by
-    run and test set.
+    """Metrics of all samples under nominal conditions, by run and test set.
 
-    Raises `DataError`.
+    Parameters
+    ----------
+    artefacts : PartArtefacts
+        The comparison.
+    column : str
+        ``value``, or ``low`` or ``high`` for the ends of intervals.
+
+    Returns
+    -------
+    Runs
+        (estimator, variant, seed, test set) -> metric -> number; NaN entries are left out.
+
+    Raises
+    ------
+    DataError
+        A run has two different values of one metric.
     """
     nominal = nominal_rows(artefacts.metrics)
     columns = (
@@ -61,7 +75,24 @@ def value_of_run(runs: Runs, name: Name, seed: int, test_set: str, metric: str) 
 
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
-    """A metric of the model itself, under whatever test set it was noted."""
+    """A metric of the model itself, under whatever test set it was noted.
+
+    Parameters
+    ----------
+    runs : Runs
+        As `runs_of` returns them.
+    name : Name
+        Estimator and variant.
+    seed : int
+        Of the model.
+    metric : str
+        Such as ``n_parameters`` or ``epochs``.
+
+    Returns
+    -------
+    float
+        NaN where the metric was never noted.
+    """
     values = (
         run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run
     )
@@ -69,10 +100,28 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data
-    choose nothing.
+    """The seed that stands for an estimator: that with the lowest RMSE(v) on the validation range.
 
-    Raises `DataError`.
+    Test data choose nothing.
+
+    Parameters
+    ----------
+    seeds : sequence of int
+        In ascending order: the first of equals is taken.
+    name : Name
+        Estimator and variant.
+    runs : Runs
+        As `runs_of` returns them.
+
+    Returns
+    -------
+    int
+        A seed without a finite value counts as infinite; a single seed needs no metrics.
+
+    Raises
+    ------
+    DataError
+        There are several seeds, and none has metrics on the validation range.
     """
     if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
         raise DataError(

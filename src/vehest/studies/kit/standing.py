@@ -20,10 +20,17 @@ BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the stat
 
 
 def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without
-    infinite errors.
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds.
 
-    Raises `DataError`.
+    Returns
+    -------
+    Ranking
+        Without candidates one of whose seeds has an infinite error.
+
+    Raises
+    ------
+    DataError
+        Stored errors by segment are damaged, or lack the test set.
     """
     segments = {
         name: [model.segments(test_set) for model in models]
@@ -36,8 +43,15 @@ def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
-    """``low`` and ``high`` of RMSE(β) over seeds [deg], ``beats_zero``, ``beats_static_map``, and
-    ``against_best`` in words.
+    """``low`` and ``high`` of a candidate's RMSE(β) over seeds [deg], ``beats_zero``,
+    ``beats_static_map``, and ``against_best`` in words.
+
+    Returns
+    -------
+    dict
+        ``beats_*`` is ``yes``, ``no`` (significantly worse), not significant, or MISSING where
+        nothing was compared, as for the baselines themselves; ``against_best`` is ``best``, not
+        significant, or the difference with its interval [deg].
     """
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
     columns: dict[str, str | float] = {"rmse_sideslip_low": low, "rmse_sideslip_high": high}
@@ -63,6 +77,9 @@ def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
 
 
 def _against_best(ranking: Ranking, name: Name) -> str:
+    """The difference to the best [deg] with its interval, positive where the candidate is worse; or
+    that it is the best, or not significantly different.
+    """
     if not ranking.order:
         return MISSING
     if name == ranking.order[0]:
@@ -74,7 +91,10 @@ def _against_best(ranking: Ranking, name: Name) -> str:
 
 
 def figure_of(ranking: Ranking, name: Name) -> str:
-    """RMSE(β) of an estimator over all its seeds with its 95 % interval: ``0.19° [0.16, 0.23]``."""
+    """RMSE(β) of an estimator over all its seeds with its 95 % interval: ``0.19° [0.16, 0.23]``.
+
+    At least two decimals; the interval is left out where the test is too short for one.
+    """
     size = ranking.rmse[name]
     decimals = max(2, decimals_for([size], 2))
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
@@ -105,6 +125,15 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
 def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: str) -> str:
     """The best estimator, those that are not significantly worse, and whether it beats the
     baselines.
+
+    Parameters
+    ----------
+    ranking : Ranking
+        Of all candidates; below MIN_BLOCKS segments nothing is said on baselines.
+    titles : mapping
+        (estimator, variant) -> title, as Markdown.
+    test_text : str
+        What was tested on, as it ends a sentence.
     """
     if not ranking.order:
         return f"No estimator has a finite sideslip error on {test_text}."
@@ -140,8 +169,11 @@ def basis_sentence(ranking: Ranking, test_text: str) -> str:
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."
     return (
-        f"{figures}; paired block bootstrap over {ranking.n_blocks} blocks of "
-        f"{ranking.block_seconds:.3g} s and over seeds, "
-        "corrected for several comparisons (Holm). The squared error of the best estimator is "
-        f"spread as over {ranking.effective_blocks:.0f} equal blocks."
+        f"{figures}. Intervals: paired bootstrap over {ranking.n_blocks} blocks of "
+        f"{ranking.block_seconds:.3g} s and over seeds. A difference of two estimators is "
+        "significant if its 95 % interval, after Holm's correction for the "
+        f"{len(ranking.pairs) // 2} comparisons of this test, excludes zero. Effective number of "
+        f"blocks: {ranking.effective_blocks:.1f} of {ranking.n_blocks}; it is small where few "
+        "blocks contain most of the squared error. Method: docs/evaluation.md, section "
+        '"Intervals and significance".'
     )

@@ -25,6 +25,16 @@ def timings_of_study(
     """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title).
 
     Nothing where it is not known.
+
+    Parameters
+    ----------
+    parts : sequence of tuple
+        The table of a part is long: estimator, variant, seed, metric (a time's name), value [s].
+
+    Returns
+    -------
+    list
+        A heading and the table ``timings``: medians over seeds; online steps are in ms there.
     """
     rows = [row for part in parts for row in _rows(*part)]
     if not rows:
@@ -54,6 +64,7 @@ def timings_of_study(
 def _rows(
     part: str, table: pd.DataFrame, titles: Mapping[tuple[str, str], str]
 ) -> list[dict[str, object]]:
+    """A row an estimator of one part: number of fits, and medians over seeds of every time."""
     seeds = table.drop_duplicates(
         subset=[*NAME, "seed", "metric"]
     )  # a time of the fit is noted under every test set

@@ -31,9 +31,8 @@ MIN_RATIO_OF_PERCENTILES = (
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
-    """Sentences, each about one test set or one estimator, those first that are left out.
-
-    None where there is nothing to warn of.
+    """Sentences in Markdown, each about one test set or one estimator, those about estimators that
+    are left out first; empty where there is nothing to warn of.
     """
     left_out = [
         f"{as_code(name)} is left out: {as_text(reason)}"
@@ -69,6 +68,12 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     information on it; none if it can.
 
     An error below the bound shows that an estimator uses information that the bound does not.
+
+    Returns
+    -------
+    list of str
+        Clauses for a sentence: the reference sideslip is below MIN_SIDESLIP_DEG (rms), or both the
+        bound and the lowest error exceed MAX_BOUND_OVER_SIGNAL of it.
     """
     level = _level(artefacts, artefacts.split.tests[test_set])
     clauses = []
@@ -108,6 +113,7 @@ def sizes_of_sideslip(artefacts: PartArtefacts, spans: Sequence[Span]) -> FloatA
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
+    """Tests whose reference sideslip is below MIN_SIDESLIP_DEG (rms)."""
     sentences = []
     for test_set, spans in artefacts.split.tests.items():
         level = _level(artefacts, spans)
@@ -194,6 +200,7 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
+    """Estimators some of whose trainings ended at their largest number of epochs."""
     runs = runs_of(artefacts)
     estimators = list[str]()
     for name, models in by_name(artefacts.models).items():
@@ -234,6 +241,9 @@ def _divergence(artefacts: PartArtefacts) -> list[str]:
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
     """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, where
     sideslip is scored and measured.
+
+    Ranges without a stored reference are passed over. An array without a sample holds one zero, so
+    that quantiles of it exist.
     """
     parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
