@@ -21,6 +21,7 @@ from vehest.data.errors import ConfigurationError, DataError, unknown_option
 from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
+from vehest.estimators.prior_map import PriorMap
 from vehest.estimators.registry import option_names
 from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.trust.record import Trust
@@ -191,8 +192,9 @@ def adapted(
 def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[str, Any]:
     """The configuration of a training with the wheelbase and centre of gravity of its one car.
 
-    They replace settings of null and the default wheelbase of the self-calibrating filter. Other
-    settings stay, as do all where the cars have no wheelbase or different ones.
+    They replace settings of null and the default wheelbase of the self-calibrating filter and of
+    its prior map. Other settings stay, as do all where the cars have no wheelbase or different
+    ones.
 
     Parameters
     ----------
@@ -203,8 +205,11 @@ def with_car_values(config: dict[str, Any], cars: Iterable[CarValues]) -> dict[s
     """
     settings = config["estimator"]
     unstated: set[float | None] = {None}
-    if settings["name"] == SelfCalibrating.name:
-        unstated.add(SelfCalibrating.settings_type().wheelbase)
+    unstated |= {
+        family.settings_type().wheelbase
+        for family in (SelfCalibrating, PriorMap)
+        if family.name == settings["name"]
+    }
     if settings.get("wheelbase", 0.0) not in unstated:
         return config
     different_cars = set(cars)
