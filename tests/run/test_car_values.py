@@ -138,8 +138,9 @@ def test_null_wheelbase_in_a_training_is_that_of_its_only_car():
     assert values({"estimator": filter_of}, first, third) == (2.7, None)
     assert values({"estimator": filter_of}, TABLE | {"name": "one"}) == (2.7, None)
     assert values({"estimator": filter_of | {"wheelbase": 3.0}}, first) == (3.0, None)
-    prior_map = {"name": "prior_map", "wheelbase": 2.7, "cg_to_rear_axle": None}
-    assert values({"estimator": prior_map}, first) == (2.4, 1.1)
+    map_of = {"name": "prior_map", "wheelbase": 2.7, "cg_to_rear_axle": None}
+    assert values({"estimator": map_of}, first) == (2.4, 1.1)
+    assert values({"estimator": map_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     without = {"estimator": {"name": "zero"}}
     assert with_car_values(without, [car_of(first)]) is without
 

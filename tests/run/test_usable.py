@@ -270,6 +270,16 @@ def test_supplying_all_missing_settings_makes_estimators_usable(name):
     assert after.usable == ("with settings" if after.of_car else "yes")
 
 
+@pytest.mark.parametrize("wheelbase", [2.4, 2.7])  # the latter is the default of both
+def test_a_wheelbase_of_the_data_set_needs_no_setting(wheelbase):
+    dataset = DATASET | {"name": "one", "car": {"wheelbase": wheelbase}}
+    for declared, expected in ((dataset, "yes"), (None, "with settings")):
+        table = {
+            row.estimator: row.usable for row in all_usabilities([summary_of(log(FULL))], declared)
+        }
+        assert (table["self_calibrating"], table["prior_map"]) == (expected, expected)
+
+
 def test_missing_references_gaps_and_channels_are_named_by_estimator():
     table = rows(log(FULL - {"vy_ref"}))
     assert (table["ksnn"]["usable"], table["ksnn"]["missing_to_train"]) == (

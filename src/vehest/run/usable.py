@@ -129,6 +129,7 @@ def all_usabilities(
         Configuration of a data set, for values of its car.
     """
     cars = [car_of(dataset)] if dataset else []
+    has_wheelbase = any(car.wheelbase is not None for car in cars)
     with_files = choices("estimator")
     rows = []
     for name in dict.fromkeys((*with_files, *estimator_names())):
@@ -136,7 +137,8 @@ def all_usabilities(
         try:
             if name in with_files:
                 config = compose_config("train", [f"estimator={name}"])
-            rows.append(usability(name, with_car_values(config, cars), recordings))
+            settings = with_car_values(config, cars)
+            rows.append(usability(name, settings, recordings, has_wheelbase=has_wheelbase))
         except ConfigurationError as error:
             if name not in with_files:
                 raise
@@ -149,6 +151,8 @@ def usability(
     config: Config,
     recordings: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary] | None = None,
+    *,
+    has_wheelbase: bool = False,
 ) -> Usability:
     """Whether the estimator of a configuration can be trained on recordings and used on them.
 
@@ -162,6 +166,8 @@ def usability(
         To train on.
     to_estimate : sequence of RecordingSummary or None
         To estimate; by default the same.
+    has_wheelbase : bool
+        Whether the data set states the wheelbase, which may equal the default of a setting.
 
     Returns
     -------
@@ -171,7 +177,7 @@ def usability(
     family = str(config["estimator"]["name"])
     to_estimate = recordings if to_estimate is None else to_estimate
     try:
-        return _usability(name, config, recordings, to_estimate)
+        return _usability(name, config, recordings, to_estimate, has_wheelbase)
     except VehestError:
         raise
     except Exception as error:
@@ -186,6 +192,7 @@ def _usability(
     config: Config,
     recordings: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
+    has_wheelbase: bool,
 ) -> Usability:
     """As `usability`, where nothing but vehest's errors is expected."""
     summaries = [*recordings, *to_estimate]
@@ -227,19 +234,20 @@ def _usability(
         patterns,
         car=car_parameters(family),
         settings_suffice=bool(settings) and not has_supplies and without.endswith(SUFFICES),
-        of_car=_overrides_of_car(estimator),
+        of_car=_overrides_of_car(estimator, has_wheelbase),
     )
 
 
-def _overrides_of_car(estimator: Estimator) -> str:
-    """Overrides with values of the car that a first comparison needs and the settings do not have
-    yet, for people.
+def _overrides_of_car(estimator: Estimator, has_wheelbase: bool) -> str:
+    """Overrides with values of the car that a first comparison needs and neither the settings nor
+    the data set have yet, for people.
     """
     overrides = " ".join(trial.overrides for trial in estimator.trials)
     if "{car}" in overrides:
         return "estimator.car.mass=… and the car's other values"
     default = getattr(type(estimator.settings)(), "wheelbase", None)
-    if "{wheelbase}" in overrides and getattr(estimator.settings, "wheelbase", None) == default:
+    is_default = getattr(estimator.settings, "wheelbase", None) == default
+    if "{wheelbase}" in overrides and is_default and not has_wheelbase:
         return "estimator.wheelbase=…"
     return ""
 
