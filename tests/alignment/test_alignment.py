@@ -208,6 +208,13 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
     ]
 
 
+def test_what_may_be_zero_is_not_corrected(motion):
+    alignment = align(recorded(motion, {"delay": PLANTED["delay"]}), AlignmentSettings(IMU))
+    may_be_zero = {parameter.name for parameter in alignment.parameters if parameter.may_be_zero}
+    assert {"lever_x", "lever_y", "yaw", "offset_ax", "offset_ay"} <= may_be_zero
+    assert [transform["name"] for transform in alignment.transforms] == ["delay_correction"]
+
+
 @pytest.mark.parametrize("quantity", IMU)
 def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     truth = {name: PLANTED[name] for name in QUANTITIES[quantity]}

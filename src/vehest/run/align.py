@@ -93,9 +93,10 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
                 "", ("residual RMS", "before", "after", "after, without tilt", "unit"), rows
             ),
         ]
+    proposal = f"to apply the corrections: '{override_of(alignment)}'"
     lines += [
         *(f"note: {note}" for note in alignment.notes),
-        f"to apply the corrections: '{override_of(alignment)}'",
+        proposal if alignment.transforms else "no correction is proposed",
     ]
     return lines if out is None else [*lines, f"written: {out}"]
 
