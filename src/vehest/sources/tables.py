@@ -183,8 +183,7 @@ def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -
         if not count and numbered:
             raise DataError(
                 f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or "
-                "remove "
-                f"all but one, or declare one of them: {listed(numbered)}"
+                f"remove all but one, or declare one of them: {listed(numbered)}"
             )
         if not count:
             raise DataError(

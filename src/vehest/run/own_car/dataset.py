@@ -147,9 +147,8 @@ def draft(examined: Examined) -> Draft:
     if ratio and used_ratio is None:
         notes.append(
             "'steer' is left out: the steering ratio estimated from slow corners is "
-            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, "
-            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by "
-            "--steering-ratio to add it"
+            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, less certain than {100 * MAX_RATIO_UNCERTAINTY:g} "
+            "%; state your car's by --steering-ratio to add it"
         )
     crawl_speed = max(map(_crawl_speed, recordings))
     if crawl_speed:
@@ -260,8 +259,7 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
                 factor = math.sqrt(low * high / (low_of_longest * high_of_longest))
                 unlike.append(
                     f"{name}: in '{recording.id}' its gain in turns is {factor:.2g} times that in "
-                    f"'{longest.id}'; "
-                    "if it is another car, create a data set for each"
+                    f"'{longest.id}'; if it is another car, create a data set for each"
                 )
     worded = [
         f"{finding.channel}: {place}{finding.message}"

@@ -319,8 +319,7 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
                 start = stamps[np.argmax(steps)]
                 yield (
                     f"'{log.file.name}' has a gap of {steps.max():.3g} s at {start:.4g} s after "
-                    "its start, "
-                    "which is interpolated linearly; split the file there"
+                    "its start, which is interpolated linearly; split the file there"
                 )
                 break
 
