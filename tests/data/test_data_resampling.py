@@ -12,6 +12,7 @@ from scipy import signal
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.data.resampling import resampled
 from vehest.data.transforms import Resample, windowed_sinc
 
 RATIOS = [
@@ -102,3 +103,11 @@ def test_ratios_that_a_method_cannot_make_are_refused():
     for rate_hz in (0.0, math.nan):
         with pytest.raises(ConfigurationError, match="rate_hz must be a positive number"):
             Resample(rate_hz)
+
+
+@pytest.mark.parametrize(("slowest_hz", "needed"), [(math.inf, 20.0), (5.0, 5.0)])
+def test_a_recording_that_is_too_slow_is_refused_with_the_rate_that_would_do(slowest_hz, needed):
+    slow = recorded(np.zeros(40), 2.0)
+    preparation = {"method": "polyphase", "transforms": []}
+    with pytest.raises(DataError, match=f"2 Hz, below the 20 Hz needed; .* at {needed:g} Hz or"):
+        resampled(slow, 20.0, preparation, slowest_hz=slowest_hz)

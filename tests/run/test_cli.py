@@ -467,7 +467,7 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
         table.to_csv(f"{name}.csv", index=False)
     Path("parts.parquet").mkdir()
     for name, out, says in (
-        ("slow.csv", "out.parquet", "below the 100 Hz"),
+        ("slow.csv", "out.parquet", "below the 100 Hz needed; record or export it at 5 Hz or"),
         ("less.csv", "out.parquet", "no channel 'ax'"),
         ("slow.csv", "out.xlsx", "must end in .parquet, .csv or"),
         ("lap.csv", "parts.parquet", "is a folder"),

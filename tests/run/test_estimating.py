@@ -186,7 +186,7 @@ def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accep
 
 def in_parts(monkeypatch, seconds=7.0):
     monkeypatch.setattr("vehest.data.recording.MAX_PART_SECONDS", seconds)
-    monkeypatch.setattr("vehest.sources.tabular.LARGE", 0)
+    monkeypatch.setattr("vehest.sources.table_parts.LARGE", 0)
 
 
 @pytest.mark.parametrize("name", ["own", "self_calibrating", "pretrained"])

@@ -6,7 +6,7 @@ import pytest
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import DataError
 from vehest.data.recording import joined
-from vehest.sources import tabular
+from vehest.sources import table_parts
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
 from vehest.sources.tables import TextLayout, cut_end, read_columns
@@ -52,7 +52,7 @@ CUT_ENDS = {
 def test_the_end_of_a_table_whose_logger_was_switched_off_is_left_out_and_named(
     tmp_path, monkeypatch, end, large
 ):
-    monkeypatch.setattr(tabular, "LARGE", large)
+    monkeypatch.setattr(table_parts, "LARGE", large)
     written, text = CUT_ENDS[end]
     file = tmp_path / "lap.csv"
     file.write_bytes(COMPLETE.encode() + written)

@@ -317,9 +317,8 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
                 "warning",
                 "stuck",
                 name,
-                f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s "
-                f"from t = {time:.12g} s while the car moves; check the sensor, or exclude this "
-                "range",
+                f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s from t = {time:.12g} "
+                "s while the car moves; check the sensor, or exclude this range",
             )
 
 
@@ -401,11 +400,10 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             at = begin + int(np.nanargmax(sizes[begin:end]))
             unit = CHANNELS[name].unit
             message = (
-                f"{number_of(len(spikes), 'spike')} of at most "
-                f"{SPIKE_SECONDS:g} s far outside the usual range ({low:.4g} to {high:.4g} "
-                f"{unit}), "
-                f"the largest {samples[at]:.4g} {unit} at t = {recording.time[at]:.12g} s; "
-                "mark these samples as missing, or exclude them"
+                f"{number_of(len(spikes), 'spike')} of at most {SPIKE_SECONDS:g} s far outside the "
+                f"usual range ({low:.4g} to {high:.4g} {unit}), the largest {samples[at]:.4g} "
+                f"{unit} at t = {recording.time[at]:.12g} s; mark these samples as missing, or "
+                "exclude them"
             )
             yield Finding("warning", "spike", name, message)
         jumps = [
@@ -417,11 +415,10 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             begin, end = max(jumps, key=lambda run: run[1] - run[0])
             unit = CHANNELS[name].unit
             message = (
-                f"jumps away and back {number_of(len(jumps), 'time')} within "
-                f"{JUMP_SECONDS:g} s, the longest to {samples[begin]:.4g} {unit} for "
-                f"{(end - begin) / recording.rate_hz:.3g} s from "
-                f"t = {recording.time[begin]:.12g} s; mark these samples as missing, "
-                "or exclude them"
+                f"jumps away and back {number_of(len(jumps), 'time')} within {JUMP_SECONDS:g} s, "
+                f"the longest to {samples[begin]:.4g} {unit} for "
+                f"{(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} "
+                "s; mark these samples as missing, or exclude them"
             )
             yield Finding("warning", "spike", name, message)
 
@@ -495,9 +492,8 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         runs = runs[runs[:, 1] - runs[:, 0] > DROPOUT_SECONDS * recording.rate_hz]
         if len(runs):
             message = (
-                f"{number_of(len(runs), 'dropout')}: below "
-                f"{100 * DROPOUT_SHARE:g} % of the other wheels' speed, "
-                f"the longest {_longest(runs, recording)}"
+                f"{number_of(len(runs), 'dropout')}: below {100 * DROPOUT_SHARE:g} % of the other "
+                f"wheels' speed, the longest {_longest(runs, recording)}"
             )
             yield Finding(
                 "warning",
@@ -516,13 +512,10 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     if len(runs):
         lowest = min(float(recording[speed][begin:end].min()) for begin, end in runs.tolist())
         message = (
-            f"reversing in {number_of(len(runs), 'segment')} "
-            f"(below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
-            f"{_longest(runs, recording)}, minimum {lowest:.3g} m/s; most estimators assume "
-            "forward "
-            "driving: exclude the range (start and stop in the split), or set sign: -1 for the "
-            "speed "
-            "if the car drove forwards"
+            f"reversing in {number_of(len(runs), 'segment')} (below -{REVERSE_SPEED:g} m/s for "
+            f"{REVERSE_SECONDS:g} s or more), the longest {_longest(runs, recording)}, minimum "
+            f"{lowest:.3g} m/s; most estimators assume forward driving: exclude the range (start "
+            "and stop in the split), or set sign: -1 for the speed if the car drove forwards"
         )
         yield Finding("note", "reverse", speed, message)
 

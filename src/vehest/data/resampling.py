@@ -33,7 +33,8 @@ def resampled(
     if recording.rate_hz < min(rate_hz * (1 - 1e-9), slowest_hz):
         raise DataError(
             f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the "
-            f"{rate_hz:g} Hz needed"
+            f"{rate_hz:g} Hz needed; record or export it at {min(rate_hz, slowest_hz):g} Hz or "
+            "more, since it does not show what the car does between slower samples"
         )
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)

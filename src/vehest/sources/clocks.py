@@ -117,10 +117,9 @@ def span_fault(stamps: FloatArray) -> str:
     steps = np.diff(stamps)
     at = int(np.argmax(steps))
     return (
-        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of "
-        f"{steps[at]:.6g} s between sample {at} "
-        f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, "
-        "or what lies on one side"
+        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of {steps[at]:.6g} "
+        f"s between sample {at} ({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); "
+        "remove the stray stamp, or what lies on one side"
     )
 
 
@@ -212,8 +211,7 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, locat
     if len(bad):
         fault = (
             f"{number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
-            f"{times[bad[-1]]:.6g} s "
-            "that are marked invalid or no finite numbers"
+            f"{times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
         )
         raise DataError(
             f"{location} holds {fault}; cut the range out, or declare the channel gappy"

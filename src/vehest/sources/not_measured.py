@@ -21,20 +21,18 @@ MIN_HUGE = 1e15  # beyond it a number of a log is a code such as 1e20 or 3.4e38
 MIN_CODES = 2  # samples; one alone may be a spike
 
 _SYMBOLS = re.compile(r"[-–—*?]+|#[A-Z/0]+[!?]?", re.IGNORECASE)  # dashes; #VALUE!, #N/A
-_FILLERS = frozenset(("signal", "value", "data", "sensor", "is", "indicator", "code", "state"))
-_PHRASES = frozenset(
-    (
-        *("na", "nv", "nan", "sna", "snv", "inf", "ind", "qnan", "snan", "none", "null", "void"),
-        *("missing", "invalid", "inv", "inval", "invld", "unknown", "undefined", "undef"),
-        *("unavailable", "no", "notavailable", "notavail", "temporarilynotavailable"),
-        *("notvalid", "notdefined", "notmeasured", "notknown", "reserved"),
-        *("error", "err", "fault", "faulty", "failure"),
-        *("init", "initial", "initialized", "initialised", "initializing", "initialising"),
-        *("initialization", "initialisation", "notinitialized", "notinitialised"),
-        *("fehler", "ungueltig", "ungültig", "nichtgültig", "nichtgueltig", "undefiniert"),
-        *("nichtverfuegbar", "nichtverfügbar", "initialisierung"),
-    )
-)
+_FILLERS = ("signal", "value", "data", "sensor", "is", "indicator", "code", "state")
+_WORDED_MARKS = """
+    na nv nan sna snv inf ind qnan snan none null void
+    missing invalid inv inval invld unknown undefined undef unavailable no
+    notavailable notavail temporarilynotavailable notvalid notdefined notmeasured notknown reserved
+    error err fault faulty failure
+    init initial initialized initialised initializing initialising initialization initialisation
+    notinitialized notinitialised
+    fehler ungueltig ungültig nichtgültig nichtgueltig undefiniert
+    nichtverfuegbar nichtverfügbar initialisierung
+"""
+_PHRASES = frozenset(_WORDED_MARKS.split())
 
 
 def marks_not_measured(text: str, signal: str = "") -> bool:

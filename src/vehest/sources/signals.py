@@ -321,9 +321,8 @@ class SignalSource(FileSource):
         ):
             raise DataError(
                 f"{location} comes at {signal.rate_hz:.6g} Hz, faster than the raster of "
-                f"{rate_hz:.6g} Hz, into which vibrations "
-                "would fold; take that rate here and let 'vehest downsample' filter, or accept: "
-                "[aliasing]"
+                f"{rate_hz:.6g} Hz, into which vibrations would fold; take that rate here and let "
+                "'vehest downsample' filter, or accept: [aliasing]"
             )
         if name in self.gappy:
             return on_nearest(

@@ -18,7 +18,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
@@ -183,8 +182,7 @@ def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -
         if not count and numbered:
             raise DataError(
                 f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or "
-                "remove "
-                f"all but one, or declare one of them: {listed(numbered)}"
+                f"remove all but one, or declare one of them: {listed(numbered)}"
             )
         if not count:
             raise DataError(
@@ -296,27 +294,21 @@ def column_parts(
                 stream = opened.enter_context(table_stream(file, layout.n_bytes))
                 opened.enter_context(decoding_failures_ignored())
                 batches = iter(pc.open_csv(stream, **options))
-            batch = next(batches, None)
-            at = 0
+            first = next(batches, None)
+            pending = (
+                pa.table({name: [] for name in selected})
+                if first is None
+                else pa.Table.from_batches([first])
+            )
             for length in lengths:
-                values = {name: np.empty(length) for name in selected}
-                done = 0
-                while batch is not None and done < length:
-                    rows = batch.slice(at, length - done)
-                    for name in selected:
-                        values[name][done : done + rows.num_rows] = numbers_of(rows.column(name))
-                    at = at + rows.num_rows
-                    done = done + rows.num_rows
-                    if at == batch.num_rows:
-                        batch = next(batches, None)
-                        at = 0
+                while pending.num_rows < length and (batch := next(batches, None)) is not None:
+                    pending = pa.concat_tables([pending, pa.Table.from_batches([batch])])
+                part = pending.slice(0, length)
+                pending = pending.slice(length)
+                values = {name: numbers_of(part.column(name)) for name in selected}
                 for column in values.values():
                     column.flags.writeable = False  # so that a recording shares it
-                yield (
-                    values
-                    if done == length
-                    else {name: column[:done] for name, column in values.items()}
-                )
+                yield values
     except DAMAGE:
         read_columns(file, selected, layout)  # whose errors state the row
         raise

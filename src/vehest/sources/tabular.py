@@ -5,9 +5,8 @@ Names, units and signs are declared in conf/dataset.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -16,12 +15,10 @@ from pydantic import AfterValidator, Field
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.limits import check_limit
-from vehest.data.parquet import ROWS_AT_A_TIME
-from vehest.data.recording import MISSING, PART, Recording, part_slices
+from vehest.data.recording import MISSING, PART, Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.clocks import Clock, ClockPolicy, bridged, even_clock, uniform_clock
+from vehest.sources.clocks import Clock, ClockPolicy, bridged, uniform_clock
 from vehest.sources.columns import (
     ChannelMap,
     ChannelNames,
@@ -35,6 +32,7 @@ from vehest.sources.columns import (
 )
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import sample_and_hold_from_config
+from vehest.sources.table_parts import even_parts, is_large
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import (
     TimeColumn,
@@ -47,14 +45,10 @@ from vehest.sources.table_rows import (
 from vehest.sources.tables import (
     TextLayout,
     column_names,
-    column_parts,
     cut_end,
-    is_parquet,
     listed,
     read_columns,
 )
-
-LARGE = 1 << 25  # bytes of a table of text from which on it is read in parts
 
 
 def _encoding(name: str) -> str:
@@ -97,6 +91,15 @@ class TabularOptions:
     encoding: Annotated[str, AfterValidator(_encoding)] = "utf8"
     skip_rows: Annotated[int, Field(ge=0, le=10_000)] = 0
 
+    def __post_init__(self) -> None:
+        if self.time is None and self.rate_hz is None:
+            raise ValueError("without a time column, rate_hz must be given")
+        is_cut = self.time_restarts or self.max_gap is not None
+        if is_cut and (self.runs is not None or self.time is None):
+            raise ValueError(
+                "time_restarts and max_gap need a time column, and no column that counts runs"
+            )
+
 
 class TabularSource(FileSource):
     """Tables, a recording each, or one for each uninterrupted run that a column of them counts."""
@@ -120,14 +123,7 @@ class TabularSource(FileSource):
                 column_from_config(options.time, f"{location}: time", "s", TimeColumn),
             )
         )
-        if self.time is None and options.rate_hz is None:
-            raise ConfigurationError(f"{location}: without a time column, rate_hz must be given")
         self._cuts = options.time_restarts or options.max_gap is not None
-        if self._cuts and (options.runs is not None or self.time is None):
-            raise ConfigurationError(
-                f"{location}: time_restarts and max_gap need a time column, and no column that "
-                "counts runs"
-            )
         self.dropped = dropped_rows_from_config(options.drop_rows or {}, location)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
         self.held = (
@@ -157,56 +153,44 @@ class TabularSource(FileSource):
         """`read_file` in parts, of a large table whose clock is even and whose rows can be read one
         after another.
         """
-        options = self.options
+        require_files([file], self.name)
+        time = self._time_of_parts(file)
+        if time is None:
+            yield self.read_file(file)
+            return
+        columns = self._columns_of(file)
+        selected = list(dict.fromkeys(column.column for column in columns.values()))
+        number = 0
+        try:
+            layout = self._layout_of(file)
+            for values, clock, part in even_parts(file, time, selected, layout):
+                number, _ = part
+                measured = measured_columns(columns, values)
+                yield self._prepared(self._recording_of(file, None, columns, measured, clock, part))
+        except DataError:
+            self.read_file(file)  # whose errors are of all its rows
+            raise
+        if not number:
+            yield self.read_file(file)
+
+    def _time_of_parts(self, file: Path) -> TimeColumn | None:
+        """The column of times of a large table in which no row needs all others; None of another
+        table.
+        """
         time = self.time
-        can_be_divided = not (
+        needs_all_rows = (
             self._cuts
-            or options.runs
+            or self.options.runs
             or self.held
             or self.pose
             or self.dropped
             or self.transforms
             or self.reference_point
         )
-        require_files([file], self.name)
-        small = not is_parquet(file) and file.stat().st_size < LARGE
-        if (
-            small
-            or not can_be_divided
-            or time is None
-            or time.wraps_at
-            or time.sort
-            or options.clock != "strict"
-            or is_stored_recording(file)
-        ):
-            yield self.read_file(file)
-            return
-        columns = self._columns_of(file)
-        selected = list(dict.fromkeys(column.column for column in columns.values()))
-        try:
-            layout = self._layout_of(file)
-            blocks = column_parts(file, [time.column], layout, repeat(ROWS_AT_A_TIME))
-            clock = even_clock(
-                time.to_si(block[time.column], "s")
-                for block in takewhile(lambda block: len(block[time.column]), blocks)
-            )
-            if clock is None:
-                yield self.read_file(file)
-                return
-            check_limit("samples", clock.n_samples, f"'{file}' has {clock.n_samples} rows")
-            slices = part_slices(clock.n_samples, clock.rate_hz)
-            parts = column_parts(
-                file, selected, layout, (rows.stop - rows.start for rows in slices)
-            )
-            for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
-                measured = measured_columns(self.columns or {}, values)
-                part = [number, len(slices)]
-                yield self._prepared(
-                    self._recording_of(file, None, columns, measured, clock.part(rows), part)
-                )
-        except DataError:
-            self.read_file(file)  # whose errors are of all its rows
-            raise
+        if time is None or needs_all_rows or time.wraps_at or time.sort:
+            return None
+        is_strict = self.options.clock == "strict"
+        return time if is_strict and is_large(file) and not is_stored_recording(file) else None
 
     def _read(self, file: Path, run: int | None) -> Recording:
         require_files([file], self.name)
@@ -221,17 +205,11 @@ class TabularSource(FileSource):
 
     def columns_read(self, names: Sequence[str]) -> list[str]:
         """Columns read of a table with columns of these names: of channels, poses, times, runs."""
-        columns = [
-            *self.columns_of(names).values(),
-            *(self.pose.columns.values() if self.pose else ()),
-        ]
-        others = [
-            self.time and self.time.column,
-            self.options.runs,
-            self.held and self.held.updated,
-        ]
-        wanted = [column.column for column in columns]
-        return list(dict.fromkeys([*wanted, *(str(name) for name in others if name is not None)]))
+        poses = self.pose.columns if self.pose else {}
+        columns = [column.column for column in (*self.columns_of(names).values(), *poses.values())]
+        updated = self.held and self.held.updated
+        others = (self.time and self.time.column, self.options.runs, updated)
+        return list(dict.fromkeys([*columns, *(str(name) for name in others if name is not None)]))
 
     def recording_of(self, table: Mapping[str, FloatArray], name: str) -> Recording:
         """A recording of columns in memory, (T,) each.
@@ -315,13 +293,10 @@ class TabularSource(FileSource):
             )
         clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         sampled_channels = () if self.held is None else self.held.channels
-        channels = {
-            name: clock.align(
-                column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy
-            )
-            for name, column in columns.items()
-            if name not in sampled_channels
+        even_columns = {
+            name: column for name, column in columns.items() if name not in sampled_channels
         }
+        channels = _on_clock(even_columns, values, clock, self.gappy)
         provenance: dict[str, Any] = (
             {"file": file.name}
             | ({} if run is None else {"run": run})
@@ -374,6 +349,19 @@ class TabularSource(FileSource):
         sparse = {*self.gappy, *(self.held.channels if self.held else ())}
         columns = self._columns_of(file)
         return list({column.column: None for name, column in columns.items() if name not in sparse})
+
+
+def _on_clock(
+    columns: Mapping[str, Column],
+    values: Mapping[str, FloatArray],
+    clock: Clock,
+    gappy: Collection[str],
+) -> dict[str, FloatArray]:
+    """Channels in SI units, a sample a tick."""
+    return {
+        name: clock.align(column.to_si(values[column.column], channel(name).unit), name in gappy)
+        for name, column in columns.items()
+    }
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:

@@ -265,11 +265,10 @@ def require_slip_offsets(log: Log, location: str) -> None:
     if measured < MIN_DIFFERENCE_SHARE * expected:
         raise DataError(
             f"{location}: slip at the front and the rear left wheel differs by {measured:.2g}° "
-            f"(rms) where the yaw rate makes {expected:.2g}°: "
-            "the offsets of the logger, {lateral, longitudinal}, changed places, and Slip_COG, "
-            "Slip_FL … apply to other points than it "
-            "says; take Slip_Angle or Lat._Vel., which apply to the antenna, or accept: "
-            f"[{SLIP_CHECK}]"
+            f"(rms) where the yaw rate makes {expected:.2g}°: the offsets of the logger, "
+            "{lateral, longitudinal}, changed places, and Slip_COG, Slip_FL … apply to other "
+            "points than it says; take Slip_Angle or Lat._Vel., which apply to the antenna, or "
+            f"accept: [{SLIP_CHECK}]"
         )
 
 

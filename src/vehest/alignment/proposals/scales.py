@@ -60,27 +60,26 @@ class WrongScale:
         """
         if not self.is_decided:
             return search
+        right = {name: self._right(name, factor) for name, factor in self.factors.items()}
         turning = search.turning
-        columns = dict(turning.columns)
-        units = dict(turning.units)
-        free = list(search.free)
-        for channel, factor in self.factors.items():
-            wrong = self.columns[channel]
-            unit = unit_of_factor(channel, wrong.unit, factor)
-            right = (
-                replace(wrong, unit=unit)
-                if unit
-                else replace(wrong, values=wrong.values / factor, slow=wrong.slow / factor)
-            )
-            if channel in columns:
-                columns[channel] = right
-                units[channel] = unit or units[channel]
-            else:
-                free = [right if column.name == wrong.name else column for column in free]
-        turning = replace(turning, columns=columns, units=units, scale=1.0)
-        return replace(
-            search, turning=turning, motion=turning.motion(search.motion.rate_hz), free=free
+        of_turning = {name: column for name, column in right.items() if name in turning.columns}
+        turning = replace(
+            turning,
+            columns={**turning.columns, **of_turning},
+            units={**turning.units, **{name: column.unit for name, column in of_turning.items()}},
+            scale=1.0,
         )
+        by_name = {column.name: column for column in right.values()}
+        free = [by_name.get(column.name, column) for column in search.free]
+        return Search(turning, turning.motion(search.motion.rate_hz), free)
+
+    def _right(self, channel: str, factor: float) -> Candidate:
+        """A wrong column in the unit that explains it, or else divided by its factor."""
+        wrong = self.columns[channel]
+        unit = unit_of_factor(channel, wrong.unit, factor)
+        if unit:
+            return replace(wrong, unit=unit)
+        return replace(wrong, values=wrong.values / factor, slow=wrong.slow / factor)
 
     def questioned(self, proposal: Proposal) -> Proposal:
         """A proposal of the corrected search with the question, if its column is wrong."""

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -361,6 +361,10 @@ class Repeat(NamedTuple):
     unit: str
     sign: int
 
+    def proposal(self, channel: str, *evidence: str, **more: Any) -> Proposal:
+        """The column as a channel; ``more`` are further fields of the proposal."""
+        return Proposal(self.column.name, channel, self.unit, self.sign, evidence, **more)
+
 
 def repeated(search: Search) -> Iterator[Proposal]:
     """Propose channels for speeds, yaw rates and lateral accelerations that are measured twice.
@@ -375,12 +379,13 @@ def repeated(search: Search) -> Iterator[Proposal]:
     Proposal
         The car's own and the reference's, also for the column of the motion itself.
     """
+    turning = search.turning
+    measured = {
+        channel: Repeat(column, turning.units[channel], turning.signs[channel])
+        for channel, column in turning.columns.items()
+    }
     for channel in MIN_NAMED_REPEAT_CORRELATION:
-        first = Repeat(
-            search.turning.columns[channel],
-            search.turning.units[channel],
-            search.turning.signs[channel],
-        )
+        first = measured[channel]
         repeats = []
         scaled = []
         for column in search.free:
@@ -400,29 +405,28 @@ def repeated(search: Search) -> Iterator[Proposal]:
             search.free.remove(repeat.column)
             if _is_copy(repeat, first, channel):
                 repeats.remove(repeat)
-                evidence = f"'{repeat.column.name}' holds the same samples in {repeat.unit}"
-                yield Proposal(first.column.name, channel, first.unit, first.sign, (evidence,))
+                yield first.proposal(
+                    channel, f"'{repeat.column.name}' holds the same samples in {repeat.unit}"
+                )
         family = [*(() if first.column.is_wheel_mean else (first,)), *repeats]
         if repeats:
             yield from _separated(family, channel)
         elif scaled and family:
             search.free.remove(scaled[0])
-            yield from _scaled_speed(scaled[0], first, search.turning.decided)
-    ay = search.turning.columns.get("ay")
+            yield from _scaled_speed(scaled[0], first, turning.decided)
+    if "ay" not in measured:
+        return
+    ay = measured["ay"]
     for column in list(search.free):
-        if (
-            ay is not None
-            and abs(correlation(column.slow, ay.slow)) > MIN_AY_REPEAT_CORRELATION
-            and column.hint("ay") >= 0.0
-        ):
+        agreement = abs(correlation(column.slow, ay.column.slow))
+        if agreement > MIN_AY_REPEAT_CORRELATION and column.hint("ay") >= 0.0:
             search.free.remove(column)
-            text = (
-                f"'{column.name}': correlation {abs(correlation(column.slow, ay.slow)):.3f}, "
-                "measured at another point or filtered"
+            yield ay.proposal(
+                "ay",
+                f"'{column.name}': correlation {agreement:.3f}, measured at another point or "
+                "filtered",
+                is_repeated=True,
             )
-            unit = search.turning.units["ay"]
-            sign = search.turning.signs["ay"]
-            yield Proposal(ay.name, "ay", unit, sign, (text,), is_repeated=True)
 
 
 def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
@@ -509,9 +513,7 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
     question = (
         f"is it the reference's speed, or the car's own ('{column.name}' being another quantity)?"
     )
-    yield Proposal(
-        name, "vx_ref", first.unit, first.sign, (f"proportional to '{column.name}'",), question
-    )
+    yield first.proposal("vx_ref", f"proportional to '{column.name}'", question=question)
 
 
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
@@ -529,36 +531,18 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     lowest = min(abs(correlation(repeat.column.slow, slow)) for repeat in plain)
     text = f"correlation with the other {channel} {lowest:.2f}"
 
-    def proposal(
-        repeat: Repeat,
-        name: str,
-        *more: str,
-        question: str = "",
-        alternatives: tuple[str, ...] = (),
-    ) -> Proposal:
-        evidence = (text, *more)
-        return Proposal(
-            repeat.column.name,
-            name,
-            repeat.unit,
-            repeat.sign,
-            evidence,
-            question,
-            alternatives=alternatives,
-            is_repeated=True,
-        )
-
     reference = f"{channel}_ref"
     if of_car and references:
         of_car.sort(key=lambda repeat: -max(repeat.column.hints.values(), default=0.0))
         question = (
             f"{len(of_car)} columns could be the car's own {channel}" if len(of_car) > 1 else ""
         )
-        first = proposal(
-            of_car[0],
+        first = of_car[0].proposal(
             channel,
+            text,
             question=question,
             alternatives=tuple(repeat.column.name for repeat in of_car[1:]),
+            is_repeated=True,
         )
         reference_column = references[0].column
         reason = (
@@ -571,18 +555,12 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
             if reference_column.is_reference or channel in reference_column.hints
             else f"is it the reference's {channel}? Its name does not say so"
         )
-        return [first, proposal(references[0], reference, reason, question=question)]
+        second = references[0].proposal(
+            reference, text, reason, question=question, is_repeated=True
+        )
+        return [first, second]
     if len(plain) < 2:
-        return [
-            Proposal(
-                repeat.column.name,
-                channel,
-                repeat.unit,
-                repeat.sign,
-                ("the other columns are filtered",),
-            )
-            for repeat in plain
-        ]
+        return [repeat.proposal(channel, "the other columns are filtered") for repeat in plain]
     question = (
         f"which column is the car's own {channel}, and which the reference's? No name decides"
     )
@@ -593,10 +571,20 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     }
     rough, smooth = sorted(plain, key=lambda repeat: roughness[id(repeat)], reverse=True)[:2]
     return [
-        proposal(
-            rough, channel, "the noisier of the two", question=question, alternatives=(reference,)
+        rough.proposal(
+            channel,
+            text,
+            "the noisier of the two",
+            question=question,
+            alternatives=(reference,),
+            is_repeated=True,
         ),
-        proposal(
-            smooth, reference, "the smoother of the two", question=question, alternatives=(channel,)
+        smooth.proposal(
+            reference,
+            text,
+            "the smoother of the two",
+            question=question,
+            alternatives=(channel,),
+            is_repeated=True,
         ),
     ]

@@ -147,9 +147,8 @@ def draft(examined: Examined) -> Draft:
     if ratio and used_ratio is None:
         notes.append(
             "'steer' is left out: the steering ratio estimated from slow corners is "
-            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, "
-            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by "
-            "--steering-ratio to add it"
+            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, less certain than {100 * MAX_RATIO_UNCERTAINTY:g} "
+            "%; state your car's by --steering-ratio to add it"
         )
     crawl_speed = max(map(_crawl_speed, recordings))
     if crawl_speed:
@@ -260,8 +259,7 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
                 factor = math.sqrt(low * high / (low_of_longest * high_of_longest))
                 unlike.append(
                     f"{name}: in '{recording.id}' its gain in turns is {factor:.2g} times that in "
-                    f"'{longest.id}'; "
-                    "if it is another car, create a data set for each"
+                    f"'{longest.id}'; if it is another car, create a data set for each"
                 )
     worded = [
         f"{finding.channel}: {place}{finding.message}"
@@ -321,65 +319,48 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     if car := {key: value for key, value in examined.vehicle.items() if value is not None}:
         dataset["car"] = car
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
-    columns = {column.name: column for column in log.columns}
+    columns = log.by_name
     if log.source == "rosbag":
         return dataset | _bag_options(columns, proposals.channels)
     if log.source == "mdf":
         return dataset | _mdf_options(columns, proposals.channels)
     dataset |= log.options
+    clock = log.clock
     if log.source != "vbo":
-        dataset["time"] = (
-            None
-            if log.clock is None
-            else {"column": log.clock.column, "unit": log.clock.unit, **log.clock.repair}
-        )
-        dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
+        if clock is None:
+            dataset |= {"time": None, "rate_hz": examined.rate_hz}
+        else:
+            dataset["time"] = {"column": clock.column, "unit": clock.unit, **clock.repair}
     dataset["clock"] = "strict"
     if log.source == "vbo" and any(
         np.isnan(columns[proposal.column].values).any() for proposal in proposals.channels
     ):
         dataset.setdefault("max_gap", MAX_GAP)
     if log.source in TABLES:
-        gaps = {
-            surveyed.file.stem: np.array(
+        longest_bridge = 0.0
+        has_holes = False
+        dropped: dict[str, list[int | str]] = {}
+        for surveyed in examined.logs:
+            gaps = np.array(
                 [_gaps(examined, surveyed, proposal.column) for proposal in proposals.channels]
             )
-            for surveyed in examined.logs
-        }
-        short = max(
-            float(surveyed[surveyed <= MAX_BRIDGED_SECONDS].max(initial=0.0))
-            for surveyed in gaps.values()
-        )
-        dataset |= (
-            {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0}
-            if short
-            else {}
-        )
-        if log.clock is not None:
-            holes = {
-                surveyed.file.stem: [
-                    f"{surveyed.file_row(first)}-{surveyed.file_row(last - 1)}"
-                    for first, last in true_runs(
-                        gaps[surveyed.file.stem].max(axis=0) > MAX_BRIDGED_SECONDS
-                    )
-                ]
-                for surveyed in examined.logs
-            }
-            dropped = {
-                surveyed.file.stem: [
-                    *surveyed.repeated_names,
-                    *holes[surveyed.file.stem],
-                    *map(surveyed.file_row, _rows_written_twice(surveyed)),
-                ]
-                for surveyed in examined.logs
-            }
-            dataset |= (
-                {"drop_rows": named}
-                if (named := {stem: rows for stem, rows in dropped.items() if rows})
-                else {}
-            )
-            if any(holes.values()) and "runs" not in log.options:
-                dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
+            short = gaps[gaps <= MAX_BRIDGED_SECONDS]
+            longest_bridge = max(longest_bridge, float(short.max(initial=0.0)))
+            holes = true_runs(gaps.max(axis=0) > MAX_BRIDGED_SECONDS)
+            has_holes |= len(holes) > 0
+            rows = [
+                *surveyed.repeated_names,
+                *(f"{surveyed.file_row(a)}-{surveyed.file_row(b - 1)}" for a, b in holes),
+                *map(surveyed.file_row, _rows_written_twice(surveyed)),
+            ]
+            dropped |= {surveyed.file.stem: rows} if rows else {}
+        if longest_bridge:
+            bridge = math.ceil(100.0 * longest_bridge * 1.05) / 100.0
+            dataset |= {"source": "text_log", "bridge": bridge}
+        if dropped and clock is not None:
+            dataset["drop_rows"] = dropped
+        if has_holes and clock is not None and "runs" not in log.options:
+            dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
     units = {
         name: surveyed.unit if log.source == "vbo" else "" for name, surveyed in columns.items()
     }
@@ -439,7 +420,7 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
     """Whether a column lacks samples that neither lines bridge nor pauses cut out; a recording with
     such gaps cannot be resampled.
     """
-    signal = next(signal for signal in log.columns if signal.name == column)
+    signal = log.by_name[column]
     measured_rows = np.flatnonzero(np.isfinite(signal.values))
     if log.source in TABLES:
         return not len(measured_rows) or (
@@ -458,7 +439,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without
     any, 0 in a row with one.
     """
-    values = next(signal.values for signal in log.columns if signal.name == column)
+    values = log.by_name[column].values
     seconds = (
         log.seconds
         if log.seconds is not None

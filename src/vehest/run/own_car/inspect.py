@@ -149,9 +149,8 @@ def inspect(
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
     for log in others:
-        columns_of_log = {column.name: column for column in log.columns}
         missing = [
-            proposal for proposal in proposals.channels if proposal.column not in columns_of_log
+            proposal for proposal in proposals.channels if proposal.column not in log.by_name
         ]
         notes = [
             f"'{proposal.column}' ({proposal.channel}) is left out: it is missing or empty in "
@@ -168,19 +167,14 @@ def inspect(
         for column in longest.columns:
             if (
                 column.name in {proposal.column for proposal in remaining}
-                and columns_of_log[column.name].unit != column.unit
+                and log.by_name[column.name].unit != column.unit
             ):
-                difference = (
-                    f"has '{column.name}' in '{columns_of_log[column.name].unit}', "
-                    f"'{longest.file}' in '{column.unit}'"
-                )
                 raise DataError(
-                    f"'{log.file}' {difference}; use the same unit in both, or create a data set "
-                    "for each"
+                    f"'{log.file}' has '{column.name}' in '{log.by_name[column.name].unit}', "
+                    f"'{longest.file}' in '{column.unit}'; use the same unit in both, or create a "
+                    "data set for each"
                 )
-        proposals = possible(
-            proposals, {name: column.values for name, column in columns_of_log.items()}
-        )
+        proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         raise DataError(
@@ -319,8 +313,7 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
                 start = stamps[np.argmax(steps)]
                 yield (
                     f"'{log.file.name}' has a gap of {steps.max():.3g} s at {start:.4g} s after "
-                    "its start, "
-                    "which is interpolated linearly; split the file there"
+                    "its start, which is interpolated linearly; split the file there"
                 )
                 break
 

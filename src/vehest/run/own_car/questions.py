@@ -159,10 +159,8 @@ def questions_of(examined: Examined) -> Iterator[Question]:
             )
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
             impossible_share = max(
-                proposal.is_impossible(signal.values).mean()
+                proposal.is_impossible(log.by_name[proposal.column].values).mean()
                 for log in examined.logs
-                for signal in log.columns
-                if signal.name == proposal.column
             )
             factor = [f"{proposal.factor:.5g}"] if proposal.factor != 1.0 else []
             declared = [

@@ -266,9 +266,8 @@ def never_occurs(
     kind = "extended identifier" if message.described.is_extended_frame else "identifier"
     return (
         f"'{file}': signal '{signal.signal}' for channel '{channel}' {often}{on}: message "
-        f"'{message.name}' carries it, with the {kind} "
-        f"{message.described.frame_id:#x}; leave the channel out, or correct dbc, bus or the map "
-        "of channels"
+        f"'{message.name}' carries it, with the {kind} {message.described.frame_id:#x}; leave the "
+        "channel out, or correct dbc, bus or the map of channels"
     )
 
 

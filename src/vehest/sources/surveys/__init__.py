@@ -92,9 +92,11 @@ def survey(path: Path) -> Log:
 
 def _without_codes(log: Log) -> Log:
     """A log of which numbers that stand for a missing sample, such as -9999, are NaN."""
+    if log.source == "rosbag":
+        return log
     columns = []
     skipped = list(log.skipped)
-    for column in log.columns if log.source != "rosbag" else ():
+    for column in log.columns:
         codes = codes_of_not_measured(column.values)
         if codes:
             is_code = np.isin(column.values, codes)
@@ -107,7 +109,7 @@ def _without_codes(log: Log) -> Log:
                 "which loggers write where nothing was measured"
             )
         columns.append(column)
-    return replace(log, columns=tuple(columns) or log.columns, skipped=tuple(skipped))
+    return replace(log, columns=tuple(columns), skipped=tuple(skipped))
 
 
 def _survey(path: Path) -> Log:

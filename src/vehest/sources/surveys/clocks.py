@@ -89,34 +89,27 @@ def find_clock(
     options : dict
         Options of the source by which runs begin.
     """
-    best = None
-    likely = -1
-    step = 0.0
-    repaired = {}
+    candidates = []
     for name, raw in columns.items():
         written = units.get(name, "").replace(" ", "").strip("[]()").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
-        column_step = _step(values, named=named)
-        counts_rows = column_step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
-        stamps = (
-            None
-            if column_step is None or counts_rows
-            else _stamps(name, column_step, unit, named, float(np.ptp(values)))
-        )
-        if column_step is not None and stamps is not None and 2 * bool(unit) + named > likely:
+        step = _step(values, named=named)
+        counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
+        if step is None or counts_rows:
+            continue
+        stamps = _stamps(name, step, unit, named, float(np.ptp(values)))
+        if stamps is not None:
             is_unknown = bool(written.strip("-")) and not unit
-            best = replace(stamps, repair=repair, asked=stamps.asked or is_unknown)
-            repaired = {name: values}
-            likely = 2 * bool(unit) + named
-            step = column_step
+            stamps = replace(stamps, repair=repair, asked=stamps.asked or is_unknown)
+            candidates.append((2 * bool(unit) + named, stamps, values, step))
     n_rows = len(next(iter(columns.values())))
-    if best is None:
+    if not candidates:
         return None, None, (slice(0, n_rows),), {}
-    columns = {**columns, **repaired}
-    values = columns[best.column]
+    _, best, values, step = max(candidates, key=lambda candidate: candidate[0])
+    columns = {**columns, best.column: values}
     steps = np.diff(values)
     seconds = (values - values[0]) * STATED_UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)

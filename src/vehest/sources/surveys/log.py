@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,6 +65,11 @@ class Log:
     ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
     repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
+
+    @cached_property
+    def by_name(self) -> dict[str, RawColumn]:
+        """Name -> column."""
+        return {column.name: column for column in self.columns}
 
     def file_row(self, place: int) -> int:
         """Number in the file, from 1, of a row of the columns, from 0.

@@ -150,12 +150,9 @@ def survey_table(file: Path) -> Log:
         marks |= odd_marks
         skipped += unread
         units = dict(shape.units)
-        always = ("delimiter", "decimal")
-        usual = asdict(TextLayout())
+        usual = asdict(TextLayout(delimiter="", decimal=""))  # which are always stated
         options = {
-            name: option
-            for name, option in asdict(shape.layout).items()
-            if name in always or option != usual[name]
+            name: option for name, option in asdict(shape.layout).items() if option != usual[name]
         }
         options |= {"missing": sorted(marks)} if marks else {}
     if not values:
@@ -298,26 +295,19 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
     data = [k for k, share in shares.items() if share >= LEAST_NUMBERS]
     if not data:
         return Shape(TextLayout())
-    first = next(
-        (k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0]
-    )
+    first = next(k for k, after in pairwise([*data, data[-1] + 1]) if after - k == 1)
     score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
     first_row = rows[first]
     above = [
-        k
-        for k, row in rows.items()
-        if k < first and len(names_of(row, first_row)) == n_columns and any(map(str.strip, row))
+        k for k, row in rows.items() if k < first and len(names_of(row, first_row)) == n_columns
     ]
     if not above:
         return Shape(TextLayout(), score=score)
     at = _names_at(rows, above)
     units_at = next((k for k in above if k > at and _are_units(rows[k])), None)
     names = tuple(names_of(rows[at], first_row))
-    units = (
-        {}
-        if units_at is None
-        else {name: cell.strip() for name, cell in zip(names, rows[units_at], strict=False)}
-    )
+    cells = [] if units_at is None else rows[units_at]
+    units = dict(zip(names, map(str.strip, cells), strict=False))
     layout = TextLayout(
         delimiter, decimal, encoding, skip_rows=at, rows_below_names=sum(k > at for k in above)
     )
@@ -339,9 +329,10 @@ def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
 def _share(row: Sequence[str], decimal: str) -> float:
     """Share of cells that are numbers, empty ones left out; 0 where there is none."""
     filled = [cell for cell in row if cell.strip()]
-    n_numbers = sum(_is_number(cell, decimal) for cell in filled)
-    n_others = sum(not (_is_number(cell, decimal) or marks_not_measured(cell)) for cell in filled)
-    return n_numbers / (n_numbers + n_others) if n_numbers else 0.0
+    others = [cell for cell in filled if not _is_number(cell, decimal)]
+    n_marks = sum(map(marks_not_measured, others))
+    n_numbers = len(filled) - len(others)
+    return n_numbers / (len(filled) - n_marks) if n_numbers else 0.0
 
 
 def _is_number(cell: str, decimal: str) -> bool:
