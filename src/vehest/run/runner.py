@@ -447,7 +447,7 @@ class Runner(Stages):
             labels = [job.plan.label for group in waiting for job in group.jobs]
             for label in labels:
                 self.messages.line("plan", "train", label)
-            self.messages.line("plan", "train", f"{len(labels)} in all", f"{n_there} others exist")
+            self.messages.line("plan", "train", f"{len(labels)} in all; {n_there} others exist")
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(estimator_class(name).slow_kernel):

@@ -302,7 +302,7 @@ def _cells(row: Usability) -> list[str]:
         ", ".join(row.missing.to_estimate),
         f"to train {to_train}" if to_train else "",
         "a setting" if row.to_give else "",
-        "training recordings of the name it expects" if row.patterns else "",
+        "training recordings named as in its settings" if row.patterns else "",
         f"samples of {', '.join(row.gaps)}" if row.gaps else "",
     ]
     supplies = [
