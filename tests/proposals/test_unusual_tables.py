@@ -242,6 +242,10 @@ UNSUITED = {
         long_format("Zeit,Runde,Messgröße,Messwert"),
         "'Messgröße' names the quantity, 'Messwert' holds",
     ),
+    "a German measuring system": (
+        long_format("Zeitstempel,Runde,Messkanal,Messwert"),
+        "'Messkanal' names the quantity, 'Messwert' holds",
+    ),
     "an OBD logger": (long_format("time,lap,PID,Data"), "'PID' names the quantity, 'Data' holds"),
     "annotated CSV": (
         "#group,false,false,true,true,false,false,true,true\n"
@@ -480,3 +484,10 @@ def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table.assign(ay=d["ay"]))])
     with pytest.raises(ConfigurationError, match="column 'v' holds numbers with a unit"):
         ask(examined, [], interactive=False)
+
+
+def test_codes_of_j1939_are_not_measured():
+    kilometres_an_hour = np.linspace(20.0, 90.0, 100)
+    code = 0xFFFF / 256.0
+    assert codes_of_not_measured(np.r_[kilometres_an_hour, code, code]) == [code]
+    assert codes_of_not_measured(np.r_[kilometres_an_hour, 200.25, 200.25]) == []

@@ -17,6 +17,8 @@ _ENDS_OF_RANGE = frozenset(
     for sign, below in ((1, 1), (1, 0), (-1, 1), (-1, 0))
 )
 _NINES = frozenset(sign * (10**digits - 1) for digits in range(3, 10) for sign in (1, -1))
+DECIMAL_SCALES = (1.0, 10.0, 100.0, 1e3, 1e4)
+BINARY_SCALES = (16.0, 128.0, 256.0, 1024.0, 8192.0)  # of J1939: 65535 / 256 km/h is no speed
 MIN_HUGE = 1e15  # beyond it a number of a log is a code such as 1e20 or 3.4e38
 MIN_CODES = 2  # samples; one alone may be a spike
 
@@ -89,13 +91,15 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
 
 def _looks_like_code(value: float) -> bool:
     """Whether a number is huge, the end of an integer's range or all nines, perhaps scaled by a
-    power of ten.
+    power of ten or, the end of a range, by one of two.
     """
     if abs(value) >= MIN_HUGE:
         return True
-    for scale in (1.0, 10.0, 100.0, 1e3, 1e4):
+    for scale in (*DECIMAL_SCALES, *BINARY_SCALES):
         integer = round(value * scale)
         is_integer = abs(value * scale - integer) <= 1e-6 * abs(integer)  # of single precision, too
-        if is_integer and (integer in _ENDS_OF_RANGE or (scale < 1e3 and integer in _NINES)):
+        if is_integer and (
+            integer in _ENDS_OF_RANGE or (scale in DECIMAL_SCALES[:3] and integer in _NINES)
+        ):
             return True
     return False

@@ -348,7 +348,7 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             longest_bridge = max(longest_bridge, float(short.max(initial=0.0)))
             holes = true_runs(gaps.max(axis=0) > MAX_BRIDGED_SECONDS)
             has_holes |= len(holes) > 0
-            rows = [
+            rows: list[int | str] = [
                 *surveyed.repeated_names,
                 *(f"{surveyed.file_row(a)}-{surveyed.file_row(b - 1)}" for a, b in holes),
                 *map(surveyed.file_row, _rows_written_twice(surveyed)),

@@ -12,7 +12,7 @@ from vehest.data.errors import DataError, printable
 _CANDUMP = re.compile(r"\s*\([\d.: -]+\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
 _ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
 _NAMES_SIGNAL = re.compile(
-    r"(signal|channel|sensor|kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
+    r"(signal|channel|sensor|(mess)?kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
     r"topic|tag|key|pid|messgr(ö|oe)(ß|ss)e|bezeichnung)(_?(name|id))?|\w*_name|name",
     re.IGNORECASE,
 )
