@@ -28,6 +28,7 @@ from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
+STACK_SECONDS = 5.0  # a busy machine lets a command wait for a core, which then writes its stack
 Row = namedtuple(
     "Row",
     "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict "
@@ -171,12 +172,19 @@ def _watch(case, command):
     process = os.pidfd_open(child)
     events = os.open(pipe, os.O_RDWR | os.O_NONBLOCK)
     readers = _Readers(child)
-    while not select.select([process], [], [], POLL_SECONDS)[0]:
+
+    def is_late():
         readers.look()
-        if time.monotonic() - started > min(case.seconds + readers.waited, MOST_WALL_SECONDS):
+        return time.monotonic() - started > min(case.seconds + readers.waited, MOST_WALL_SECONDS)
+
+    stopped = False
+    while not (stopped or select.select([process], [], [], POLL_SECONDS)[0]):
+        if is_late():
+            # the kernel counts a wait for a core when it ends: once the stack is written, all of it
             _ask_for_stack(child, case.folder / "log" / "stack")
-            os.killpg(child, signal.SIGKILL)
-            break
+            stopped = is_late()
+    if stopped:
+        os.killpg(child, signal.SIGKILL)
     os.close(process)
     readers.look()
     seconds = max(0.0, time.monotonic() - started - readers.waited)
@@ -197,6 +205,7 @@ def _watch(case, command):
     return Outcome(
         exit_code=os.waitstatus_to_exitcode(status),
         seconds=seconds,
+        stopped=stopped,
         cpu_seconds=resources.ru_utime + resources.ru_stime,
         peak_mb=(max(0, most_kb - imports_kb) + max(readers.peaks_kb.values(), default=0)) / 1024,
         stdout=_text(logs / "stdout"),
@@ -210,11 +219,12 @@ def _watch(case, command):
 
 
 def _ask_for_stack(child, file):
-    """Let a command write where it is, and wait until it has, or for at most a second."""
+    """Let a command write where it is, and wait until it has, or for `STACK_SECONDS`."""
+    before = _text(file)
     with contextlib.suppress(ProcessLookupError):
         os.kill(child, STACK_SIGNAL)
     asked = time.monotonic()
-    while not _text(file) and time.monotonic() - asked < 1:
+    while _text(file) == before and time.monotonic() - asked < STACK_SECONDS:
         time.sleep(POLL_SECONDS)
 
 

@@ -68,7 +68,7 @@ def test_each_misdeed_gets_its_verdict(tmp_path):
 
 
 def outcome(exit_code, stderr, changed=()):
-    return Outcome(exit_code, 0.1, 0.1, 1.0, "", stderr, (), changed, "")
+    return Outcome(exit_code, 0.1, exit_code == -9, 0.1, 1.0, "", stderr, (), changed, "")
 
 
 @pytest.mark.parametrize(
@@ -84,6 +84,8 @@ def outcome(exit_code, stderr, changed=()):
         ),
         (False, outcome(3, "/a/b.py:3: RuntimeWarning: overflow\nerror: no\n"), "several lines"),
         (False, outcome(7, "error: no\n"), "exit1"),
+        (False, outcome(-9, ""), "slow"),
+        (False, outcome(-11, ""), "crash"),
         (False, outcome(0, "", ("up/up/up/place/outputs/a",)), "ok"),
         (False, outcome(0, "", ("up/up/up/place/out.csv",)), "ok"),
         (False, outcome(0, "", ("up/up/up/place/raw/one.csv",)), "outside"),

@@ -36,6 +36,7 @@ class Outcome:
 
     exit_code: int  # negative for a signal
     seconds: float  # of wall clock, less those spent waiting for a core
+    stopped: bool  # because its time was up
     cpu_seconds: float
     peak_mb: float  # most memory above that of the imports
     stdout: str
@@ -63,7 +64,7 @@ def _findings(case, command, outcome):
     )
     if outcome.peak_mb > MEMORY_MB:
         yield "memory", f"{outcome.peak_mb:.0f} MB"
-    if outcome.seconds > case.seconds:
+    if outcome.stopped or outcome.seconds > case.seconds:
         yield (
             "slow",
             f"{outcome.seconds:.0f} s, {outcome.cpu_seconds:.0f} s of them computing; "
