@@ -12,8 +12,8 @@ from vehest.data.errors import DataError, printable
 _CANDUMP = re.compile(r"\s*\([\d.: -]+\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
 _ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
 _NAMES_SIGNAL = re.compile(
-    r"(signal|channel|sensor|(mess)?kanal|parameter|variable|telemetry|quantity|measurement|metric|field|"
-    r"topic|tag|key|pid|messgr(ö|oe)(ß|ss)e|bezeichnung)(_?(name|id))?|\w*_name|name",
+    r"(signal|channel|sensor|(mess)?kanal|parameter|variable|telemetry|quantity|measurement|metric|"
+    r"field|topic|tag|key|pid|messgr(ö|oe)(ß|ss)e|bezeichnung)(_?(name|id))?|\w*_name|name",
     re.IGNORECASE,
 )
 _NAMES_VALUE = re.compile(r"(\w*_)?(value|val|(mess)?wert|reading|data)", re.IGNORECASE)
