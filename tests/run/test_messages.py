@@ -52,7 +52,7 @@ def _shows_only_text(text):
         (("train", "--seed", "3"), "written without dashes: seed=…"),
         (("train", "jobs=3"), "an option is written --jobs"),
         (("run", "small", "dry_run=true"), "an option is written --dry-run"),
-        (("config", "estimate", "model=mine"), "vehest estimate MODEL FILE has none"),
+        (("config", "estimate", "model=mine"), "vehest estimate takes the model before the file"),
         (("train", "ksnn"), "write key=value"),
         (("config", "trian"), "is not one of: ingest, downsample, train, eval, estimate"),
         (("data", "show", "no\x1b[31m\u202efile"), r"no\x1b[31m\u202efile"),

@@ -49,9 +49,10 @@ from vehest.data.transforms import Preparation
 
 Config = dict[str, Any]
 
-COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "name", "out", "quiet")
-OPTION_HINTS = {option: f"an option is written --{option}" for option in COMMAND_OPTIONS}
-OPTION_HINTS["model"] = "an option is written --model; vehest estimate MODEL FILE has none"
+OPTION_HINTS = {
+    option: f"an option is written --{option}"
+    for option in ("dry-run", "download", "force", "jobs", "json", "name", "out", "quiet")
+} | {"model": "an option is written --model; vehest estimate takes the model before the file"}
 """Option of a command that is easily mistaken for a key of the configuration -> how to write it."""
 
 # key of a configuration: the rates that overrides set, which are not lowered to the rate of the

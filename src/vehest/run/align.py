@@ -243,10 +243,15 @@ def _report(alignment: Alignment) -> str:
         f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at "
         f"{cutoff_hz:.3g} Hz.",
         *(as_text(line) if isinstance(line, str) else _markdown(line) for line in printed),
-        "Transforms that apply the corrections, in this order, for `downsample`:",
-        f"```yaml\n{_transforms(alignment).rstrip()}\n```",
-        f"```sh\nvehest downsample DATASET rate_hz=… '{override_of(alignment)}'\n```",
     ]
+    if alignment.transforms:
+        parts += [
+            "Transforms that apply the corrections, in this order, for `downsample`:",
+            f"```yaml\n{_transforms(alignment).rstrip()}\n```",
+            f"```sh\nvehest downsample DATASET rate_hz=… '{override_of(alignment)}'\n```",
+        ]
+    else:
+        parts.append("No correction is proposed.")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
