@@ -46,6 +46,7 @@ from vehest_papers.learned_ukf.candidates import (
     runs_of,
     scored_of,
 )
+from vehest_papers.learned_ukf.data_amount import extrapolated
 from vehest_papers.learned_ukf.filtering import (
     drives_of,
     filtered,
@@ -70,6 +71,7 @@ SPLIT = Split(
     (SPANS["judged"],),
     {"tyre_a": (SPANS["a"],), "tyre_d": (SPANS["d"],)},
 )
+HALF_OF_TRAINING = 1.5  # s
 PHASE = {"learning_rate": 5e-4, "max_epochs": 1000, "schedule": "constant"}
 AS_THE_PAPER = dict.fromkeys(("one_step", "through", "noise"), PHASE)
 AS_THE_PAPER |= {
@@ -274,6 +276,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
         "real": part,
         **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)},
         "likelihood": part,
+        "half_1": half_of_training(part),
     }
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
@@ -304,6 +307,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
         "decided_claims",
         "overview",
         *(f"{name}_real" for name in ("consistency", "friction", "start", "coverage")),
+        "minutes_of_data",
     }
     files = {"claims", "budgets_real", "sequence_length", "data"}
     files |= {f"{name}_real" for name in ("table_1", "table_2", "by_state", "budget")}
@@ -343,7 +347,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
     assert set(document.data) >= {
         f"{name}_real" for name in ("slip_density", "traces", "figure_5", "figure_6")
     }
-    assert "SIMULATED data of a small racing car" in text
+    assert "SIMULATED data, A car" in text
     assert "Not in this report, since the recordings are missing: Curved tyres" in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
@@ -385,9 +389,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
     assert training.loc["NNTF_UH", "epochs_paper"] == "1000 + 1000"
     assert training.loc["NNTF", "epochs"] == "1000 + 1000 for the noise"
     assert training.loc["static_map", "training"] == "not applicable"
-    trials = next(
-        block for block in document.blocks if isinstance(block, Table) and block.name == "trials"
-    ).frame
+    trials = document.data["trials"]
     assert trials[["candidate", "step_size", "chosen"]].values.tolist() == [
         ["GRU", 0.001, ""],
         ["GRU", 0.002, "chosen"],
@@ -423,6 +425,31 @@ def only(part, candidate, training=None):
         for model in models_by_candidate(part)[candidate]
     ]
     return replace(part, models=retrained)
+
+
+def half_of_training(part):
+    """NNTF_UH of the part, as if trained on half of its training data."""
+    (span,) = part.split.train
+    half = replace(span, stop=HALF_OF_TRAINING)
+    return replace(only(part, "NNTF_UH"), split=replace(part.split, train=(half,)))
+
+
+def test_errors_extrapolate_along_a_power_law_with_the_interval_of_regression():
+    minutes = np.array([0.5, 0.5, 1.0, 1.0, 1.9, 1.9])
+    exact = extrapolated(minutes, 0.02 * minutes**-0.5, 7.3)
+    assert exact.value == pytest.approx(0.02 * 7.3**-0.5)
+    assert exact.high == pytest.approx(exact.low)
+    errors = 0.02 * minutes**-0.5 * np.exp([0.1, -0.2, 0.05, 0.1, -0.1, 0.05])
+    design = np.column_stack([np.ones(6), np.log(minutes)])
+    inverse = np.linalg.inv(design.T @ design)
+    line = inverse @ design.T @ np.log(errors)
+    variance = np.square(np.log(errors) - design @ line).sum() / 4.0
+    place = np.array([1.0, math.log(7.3)])
+    half = 2.7764451 * math.sqrt(variance * place @ inverse @ place)  # t, 4 degrees of freedom
+    figure = extrapolated(minutes, errors, 7.3)
+    assert math.log(figure.value) == pytest.approx(place @ line)
+    assert math.log(figure.high) == pytest.approx(place @ line + half)
+    assert math.log(figure.low) == pytest.approx(place @ line - half)
 
 
 def of_length(part, steps):

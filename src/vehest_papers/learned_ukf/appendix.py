@@ -27,7 +27,6 @@ def appendix_of_part(
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    source: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
     """Consistency of the filters and slip angles; errors by state and budgets of the main part as
@@ -45,7 +44,7 @@ def appendix_of_part(
     return [
         "## Appendix: consistency of the filters",
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
-        *_slips(part, name, source, data),
+        *_slips(part, name, kind, data),
     ]
 
 
@@ -69,15 +68,17 @@ def provenance(
         "validation range. Test data choose nothing.",
         *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
     ]
-    blocks: list[Block] = []
+    lines += [f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks]
     if artefacts.trials:
-        remarks = " ".join(f"{line[0].upper()}{line[1:]}." for line in artefacts.search_remarks)
-        table = trials_table(artefacts.trials)
-        blocks += ["## Appendix: trials", *([remarks] if remarks else []), table]
+        lines.append(
+            "Step sizes and batches that were tried, on one seed that is not in the tables and on "
+            "validation alone (tyre A, run 0): [CSV](tables/trials.csv)"
+        )
+        data["trials"] = trials_table(artefacts.trials)
     data["data"] = _ranges(artefacts, main)
     names = sorted({*data, TRAINING})
     files = ", ".join(f"[{name}](tables/{name}.csv)" for name in names)
-    return [*blocks, methods.provenance(lines), f"Further tables: {files}."]
+    return [methods.provenance(lines), f"Further tables: {files}."]
 
 
 def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
@@ -136,9 +137,7 @@ def _sequences(part: PartArtefacts, test: str) -> str:
     )
 
 
-def _slips(
-    part: PartArtefacts, name: str, source: str, data: dict[str, pd.DataFrame]
-) -> list[Block]:
+def _slips(part: PartArtefacts, name: str, kind: str, data: dict[str, pd.DataFrame]) -> list[Block]:
     filters = [model for model in part.models if model.estimator == "learned_ukf"]
     if not filters:
         return []
@@ -155,6 +154,6 @@ def _slips(
         f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts "
         "from."
     )
-    figure, percentiles, drawn = slips.distribution(angles, name, source, note)
+    figure, percentiles, drawn = slips.distribution(angles, name, kind, note)
     data |= {f"slip_density_{name}": drawn, f"slip_percentiles_{name}": percentiles}
     return ["## Appendix: slip angles", figure]

@@ -50,6 +50,7 @@ DUPLICATE_NAMES = (
 )  # parts whose candidates have the names of others
 SCRATCH = "scratch"
 LENGTH = re.compile(r"length_(\d+)(_samples)?")
+DATA_SHARE = re.compile(r"(half|quarter)_\d")
 MAX_STEPS = 500  # samples of a sequence, which both ways of Figure 7 share
 WHEEL_SPEED = {"rim_speed": "wheel_speed"}  # name of a state -> name in a metric
 SWAPPED = f"{AFTER} predicting, {BEFORE} observing"
@@ -62,9 +63,11 @@ def part_name(name: str) -> str:
 
 
 def candidate_name(part: str, candidate: str) -> str:
-    """Candidate of a part as blocks.csv has it: with the length of its training sequences where
-    parts differ in it.
+    """Candidate of a part as blocks.csv has it: with the length of its training sequences, or its
+    share of the training data, where parts differ in it.
     """
+    if DATA_SHARE.fullmatch(part):
+        return f"{candidate}, {part.replace('_', ' ')}"
     length = LENGTH.fullmatch(part)
     if length is None:
         return BASELINE_NAMES.get(candidate, candidate)

@@ -51,6 +51,7 @@ from vehest_papers.learned_ukf import (
 from vehest_papers.learned_ukf.appendix import appendix_of_part, minutes, provenance
 from vehest_papers.learned_ukf.budgets import Candidate, budgets
 from vehest_papers.learned_ukf.candidates import SETS, chosen, models_by_candidate, runs_of
+from vehest_papers.learned_ukf.data_amount import data_table
 from vehest_papers.learned_ukf.filtering import drives_of, loaded, lost_sequences
 from vehest_papers.learned_ukf.lengths import figure_7, lengths
 
@@ -147,9 +148,10 @@ def _values(
         for name in OVERVIEW_CANDIDATES
         if name in seeds
     ]
+    titles = [as_text(part.data_titles.get(name, name)) for name in part.split.datasets]
     return {
         "recommendation": without_line_breaks(content.recommendation),
-        "kind": words_of_kinds(part).upper(),
+        "data": f"{words_of_kinds(part).upper()} data, {listed(titles)}",
         "minutes": fixed(minutes(part, part.split.train), 1),
         "minutes_paper": fixed(paper.MINUTES_LEARNT, 1),
         "main_rows": main_rows,
@@ -209,11 +211,9 @@ def _outcome(
     """Everything of the main part and of those beside it on data of the same kind."""
     runs = runs_of(part)
     kind = words_of_kinds(part)
-    titles = [as_text(part.data_titles.get(name, name)) for name in part.split.datasets]
-    source = f"{kind.upper()}, {listed(titles)}"
     outcome = Outcome()
     _accuracy(outcome, name, blocks, kind, data)
-    _friction(outcome, name, part, source, kind)
+    _friction(outcome, name, part, kind)
     _instability(outcome, name, artefacts.parts, data)
     beside = {
         title: study_part
@@ -221,15 +221,16 @@ def _outcome(
         if words_of_kinds(study_part) == kind
     }
     _likelihood(outcome, name, part, beside, kind)
-    _prediction(outcome, name, part, source, data)
+    _prediction(outcome, name, part, kind.upper(), data)
     _variants(name, part, beside, data)
     _lengths(outcome, beside, blocks, kind, data)
+    _data_amount(outcome, name, part, beside, blocks, kind)
     groups = models_by_candidate(part)
     drawn_models: dict[str, EvaluatedModel] = {
         method: chosen(part, runs, method) for method in FIGURE_4_CANDIDATES if method in groups
     }
     if drawn_models:
-        figure, drawn = traces.hard_sequence(part, drawn_models, "tyre_d", name, source)
+        figure, drawn = traces.hard_sequence(part, drawn_models, "tyre_d", name, kind.upper())
         data[f"traces_{name}"] = drawn
         outcome.front.append(figure)
     losses = loss_curves(groups)
@@ -240,7 +241,7 @@ def _outcome(
             f"{kind.upper()}."
         )
         outcome.appendix += ["## Appendix: loss curves", loss_figure(losses, caption)]
-    outcome.appendix += appendix_of_part(name, part, runs, source, data)
+    outcome.appendix += appendix_of_part(name, part, runs, data)
     return outcome
 
 
@@ -256,7 +257,7 @@ def _accuracy(
         data[f"table_{number}_{name}"] = tables.accuracy(blocks, name, test)
 
 
-def _friction(outcome: Outcome, name: str, part: PartArtefacts, source: str, kind: str) -> None:
+def _friction(outcome: Outcome, name: str, part: PartArtefacts, kind: str) -> None:
     """Friction over time, what is measured of it, and what its start changes."""
     models = models_by_candidate(part).get(paper.NNTF_UH)
     if not models:
@@ -285,7 +286,7 @@ def _friction(outcome: Outcome, name: str, part: PartArtefacts, source: str, kin
     seeds = [model.seed for model in models]
     outcome.rows += block_errors.measured_rows(name, part, "tyre_d", measured, seeds)
     outcome.front += [
-        friction.figure(tracks, part.protocol.skip_seconds, name, source),
+        friction.figure(tracks, part.protocol.skip_seconds, name, kind.upper()),
         friction.convergence_table(tracks, times, part.protocol.skip_seconds, name, kind.upper()),
     ]
     outcome.appendix += [
@@ -364,6 +365,26 @@ def _lengths(
     if trained:
         figure, data["sequence_length"] = figure_7(lengths(trained), blocks, kind.upper())
         outcome.appendix += ["## Appendix: length of the training sequences", figure]
+
+
+def _data_amount(
+    outcome: Outcome,
+    name: str,
+    part: PartArtefacts,
+    beside: Mapping[str, PartArtefacts],
+    blocks: Mapping[Key, BlockErrors],
+    kind: str,
+) -> None:
+    shares = {
+        title: study_part
+        for title, study_part in beside.items()
+        if block_errors.DATA_SHARE.fullmatch(title)
+    }
+    if shares and paper.NNTF_UH in models_by_candidate(part):
+        outcome.appendix += [
+            "## Appendix: minutes of training data",
+            data_table({name: part, **shares}, blocks, kind.upper()),
+        ]
 
 
 def _likelihood(

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from vehest.report.document import Column, Table
 from vehest.report.style import MISSING
 from vehest.studies.artefacts import Trial
 from vehest_papers.learned_ukf.candidates import candidate_of
@@ -20,7 +19,7 @@ def step_size(trial: Trial) -> float:
     return float(training["through" if "through" in training else "phase"]["learning_rate"])
 
 
-def trials_table(trials: Sequence[Trial]) -> Table:
+def trials_table(trials: Sequence[Trial]) -> pd.DataFrame:
     """A row a trial of the study's searches."""
     rows = [
         {
@@ -34,22 +33,5 @@ def trials_table(trials: Sequence[Trial]) -> Table:
         }
         for trial in trials
     ]
-    frame = (
-        pd.DataFrame(rows)
-        .sort_values(["candidate", "step_size"], kind="stable")
-        .reset_index(drop=True)
-    )
-    columns = {
-        "candidate": Column("method"),
-        "step_size": Column("step size", digits=1, each=True),
-        "batch": Column("sequences in a batch", decimals=0),
-        "start": Column("noise starts from"),
-        "seed": Column("seed", decimals=0),
-        "validation": Column("MSE (weighted), validation", decimals=4),
-        "chosen": Column("chosen"),
-    }
-    caption = (
-        "Step sizes and batches that were tried, on one seed that is not in the tables. "
-        "Validation: tyre A, run 0."
-    )
-    return Table("trials", caption, frame, columns)
+    frame = pd.DataFrame(rows).sort_values(["candidate", "step_size"], kind="stable")
+    return frame.reset_index(drop=True)
