@@ -190,16 +190,16 @@ friction_slip: $(INSTALLED) ## how much the estimated friction widens the learne
 	$(BIN)/python tools/choose_friction_slip.py "$${VEHEST_OUTPUT:-outputs}"/friction_slip/train/learned_ukf-nntf_uh-seed*
 
 unseen_car: $(INSTALLED) ## the self-calibrating filter on cars that were not used for training (results/unseen_car); needs VEHEST_DATA, and committed choices
-	$(BIN)/python docs/make_unseen_car.py
+	$(BIN)/python tools/unseen_car.py
 
 unseen_car_planted: $(INSTALLED) ## the same filter on 200 drawn cars in town and 100 at the limit, simulated (results/unseen_car/drawn_cars.md)
-	$(BIN)/python docs/unseen_car_planted.py
+	$(BIN)/python tools/unseen_car_planted.py
 
 unseen_car_record: $(INSTALLED) ## vehest identify on drives of one car, on 200 planted cars and in scenes (results/unseen_car/record.md); needs VEHEST_DATA
-	$(BIN)/python docs/unseen_car_record.py
+	$(BIN)/python tools/unseen_car_record.py
 
 pretrained: sim_to_real ## the models for cars without a training of their own, from the study sim_to_real
-	PYTHONPATH=docs $(BIN)/python tools/make_pretrained.py
+	$(BIN)/python tools/make_pretrained.py
 
 sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quickstart, simulated; SEEDS="range(3)")
 	$(BIN)/vehest sweep split=$(SPLIT) estimator=ksnn estimator.n_local=2,3,4,5,6 estimator.n_hidden=0,1,2,3 estimator.bias=true,false \

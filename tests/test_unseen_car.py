@@ -4,7 +4,7 @@ drawn.
 
 import numpy as np
 import pytest
-from make_unseen_car import (
+from unseen_car import (
     BAND_HEADS,
     CARS,
     DRIVE_BAND_HEADS,

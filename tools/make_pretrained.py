@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from make_unseen_car import CARS, RATE, Car, drives_of, filter_of
+from unseen_car import CARS, RATE, Car, drives_of, filter_of
 
 from vehest.configuration.composition import compose_config
 from vehest.estimators.base import Estimator

@@ -7,9 +7,9 @@ import runpy
 import subprocess
 from pathlib import Path
 
-import make_unseen_car
 import pytest
-from make_unseen_car import CARS, chosen_since, raw_files_of
+import unseen_car
+from unseen_car import CARS, chosen_since, raw_files_of
 
 from vehest.artefacts import artefact as artefacts
 from vehest.data.errors import MissingError
@@ -173,7 +173,7 @@ def test_only_values_of_choices_count_as_chosen_since(monkeypatch):
         "a": "estimator: {grip: 14}  # m/s²\n",
         "b": "estimator:\n  grip: 14.0\n  memory: 150\n",
     }
-    monkeypatch.setattr(make_unseen_car, "git", lambda _, name: texts[name.partition(":")[0]])
+    monkeypatch.setattr(unseen_car, "git", lambda _, name: texts[name.partition(":")[0]])
     assert chosen_since("a", "b") == ["memory"]
 
 

@@ -466,8 +466,8 @@ def test_a_misspelt_declaration_is_refused(bags):
 
 
 def identify(car, root):
-    """Every figure that docs/identify.py prints of a car, by name."""
-    parts = runpy.run_path(str(ROOT / "docs" / "identify.py"))[car](root / car)
+    """Every figure that tools/identify.py prints of a car, by name."""
+    parts = runpy.run_path(str(ROOT / "tools" / "identify.py"))[car](root / car)
     return {name: value for _, part in parts for name, value in part.items()}
 
 

@@ -1,6 +1,6 @@
 """Print what recordings do not document, identified from the recordings themselves.
 
-    VEHEST_DATA=FOLDER python docs/identify.py CAR
+    VEHEST_DATA=FOLDER python tools/identify.py CAR
 
 with av21, dart, f1tenth (the bag, beside the publishers' CSV files) or roboracer. conf/dataset declares the constants, the car's page in
 docs/sources explains them. Of the declarations only files, rows that count and layouts of topics are used, so that nothing is confirmed by
@@ -773,7 +773,7 @@ CARS = {made.__name__: made for made in (av21, dart, f1tenth, roboracer)}
 
 if __name__ == "__main__":
     if "VEHEST_DATA" not in os.environ or len(sys.argv) != 2 or sys.argv[1] not in CARS:
-        sys.exit(f"VEHEST_DATA=FOLDER python docs/identify.py {'|'.join(CARS)}")
+        sys.exit(f"VEHEST_DATA=FOLDER python tools/identify.py {'|'.join(CARS)}")
     for title, figures in CARS[sys.argv[1]](Path(os.environ["VEHEST_DATA"]) / sys.argv[1]):
         print(f"\n## {title}")
         for name, value in figures.items():

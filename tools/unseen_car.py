@@ -880,7 +880,7 @@ def main() -> None:
             [TARGET / "report.md", TARGET / "openings.csv"],
             "make unseen_car",
             [
-                "script docs/make_unseen_car.py",
+                "script tools/unseen_car.py",
                 "evaluate self_calibrating",
                 *raw_files_of(found),
             ],

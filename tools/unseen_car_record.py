@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from make_unseen_car import (
+from unseen_car import (
     CARS,
     HELD_BACK,
     PLAIN,
@@ -732,7 +732,7 @@ def main() -> None:
         [TARGET / name for name in (*names, "record.md")],
         "make unseen_car_record",
         [
-            "script docs/unseen_car_record.py",
+            "script tools/unseen_car_record.py",
             "evaluate self_calibrating",
             *raw_files_of(car for car in CARS if car.development),
         ],

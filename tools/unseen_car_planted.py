@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from make_unseen_car import MARGIN, PLAIN, RATE, TARGET, TURN_YAW_RATE, WARM_UP, table
 from numpy.typing import NDArray
 from scipy.stats import beta
+from unseen_car import MARGIN, PLAIN, RATE, TARGET, TURN_YAW_RATE, WARM_UP, table
 from unseen_car_record import PRODUCTION, Profile, a_car, angle_of, driven, root
 
 from vehest.constants import GRAVITY, FloatArray
@@ -367,7 +367,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     record_tables(
         [TARGET / "drawn_cars.csv", TARGET / "drawn_cars.md"],
         "make unseen_car_planted",
-        ["script docs/unseen_car_planted.py", "evaluate self_calibrating"],
+        ["script tools/unseen_car_planted.py", "evaluate self_calibrating"],
     )
 
 
