@@ -405,9 +405,9 @@ def _of_local_models(
 def first_sub_model_shares(claim: Claim, parts: Parts) -> ByBlock | None:
     """RMS of the first sub-model over that of the estimate (Eq. 11).
 
-    The first sub-model integrates the slip rate. Squares of both are summed over the scored samples of each
-    segment, then over the blocks of the test set; half of the linearised logarithm of their ratio
-    is that of the root.
+    The first sub-model integrates the slip rate. Squares of both are summed over the scored samples
+    of each segment, then over the blocks of the test set; half of the linearised logarithm of their
+    ratio is that of the root.
     """
     scheme = parts[claim.part]
     models = _models(scheme, claim.candidate)

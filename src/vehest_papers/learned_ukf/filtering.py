@@ -63,8 +63,8 @@ def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
     ------
     ConfigurationError
         The part is not scored in sequences, or at another rate than the filter's.
-    DataError
-        A recording is missing or damaged.
+    MissingError, DataError
+        A recording is missing; one is damaged.
     """
     if (
         part.protocol.sequence_seconds is None
