@@ -217,7 +217,7 @@ def train_phases(
         for i in (folder_index, *twins)
         if i < len(context.checkpoint_folders)
     ]
-    run = _Run(phases, seed, context, folder_index, checkpoint_seconds, folders)
+    run = PhaseTraining(phases, seed, context, folder_index, checkpoint_seconds, folders)
     run.resume()
     while run.position < len(phases) and not run.current.interrupted:
         run.train_phase()
@@ -225,11 +225,17 @@ def train_phases(
 
 
 @dataclass
-class _Run:
-    """State of a training.
+class PhaseTraining:
+    """State of a training through its phases, which `train_phases` runs.
 
-    ``records`` has one entry for each phase begun. Of the current phase there are the parameters
-    (``state``), the best of them, Adam's moments and the random generator.
+    Attributes
+    ----------
+    records : list[PhaseRecord]
+        One for each phase begun, the current phase last.
+    state, best : dict[str, Tensor]
+        Parameters and buffers of all phases now, and with the best validation of the current phase.
+    adam, generator
+        Adam with its moments, and the random numbers of the batches, both of the current phase.
     """
 
     phases: Sequence[Phase]
