@@ -137,9 +137,7 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | Non
     series = prepare(network, series.float())
     targets = targets.float()
     rows = torch.arange(WINDOW)
-    order = torch.randperm(
-        len(starts), generator=torch.Generator().manual_seed(shuffle_seed(seed))
-    )
+    order = torch.randperm(len(starts), generator=torch.Generator().manual_seed(shuffle_seed(seed)))
     for batch in order.split(BATCH)[:batches]:
         optimiser.zero_grad()
         loss = (

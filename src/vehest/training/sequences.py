@@ -228,14 +228,8 @@ def train_phases(
 class PhaseTraining:
     """State of a training through its phases, which `train_phases` runs.
 
-    Attributes
-    ----------
-    records : list[PhaseRecord]
-        One for each phase begun, the current phase last.
-    state, best : dict[str, Tensor]
-        Parameters and buffers of all phases now, and with the best validation of the current phase.
-    adam, generator
-        Adam with its moments, and the random numbers of the batches, both of the current phase.
+    ``records`` has one entry for each phase begun. Of the current phase there are the parameters
+    (``state``), the best of them, Adam's moments and the random generator.
     """
 
     phases: Sequence[Phase]
