@@ -121,7 +121,7 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | Non
     from vehest.data.windows import windows_of
     from vehest.estimators.registry import estimator_class
     from vehest.training.members import constrain, prepare
-    from vehest.training.supervised import _shuffle_seed
+    from vehest.training.supervised import shuffle_seed
 
     estimator = estimator_class(name).from_config(config)
     train, validation = drives()
@@ -137,9 +137,7 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | Non
     series = prepare(network, series.float())
     targets = targets.float()
     rows = torch.arange(WINDOW)
-    order = torch.randperm(
-        len(starts), generator=torch.Generator().manual_seed(_shuffle_seed(seed))
-    )
+    order = torch.randperm(len(starts), generator=torch.Generator().manual_seed(shuffle_seed(seed)))
     for batch in order.split(BATCH)[:batches]:
         optimiser.zero_grad()
         loss = (

@@ -417,7 +417,7 @@ def on_gpu(
     seconds: float,
 ) -> dict[str, Any]:
     """One row's part of the GPU: eager, compiled, and compiled steps replayed from one graph."""
-    torch._dynamo.reset()
+    torch.compiler.reset()
     model = Filter(filter_).cuda()
     wait = torch.cuda.synchronize
     found: dict[str, Any] = {}

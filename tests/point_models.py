@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vehest.filters.unscented_scan import CompiledNoise, _sequences_first, _sequences_last
+from vehest.filters.unscented_scan import CompiledNoise, sequences_first, sequences_last
 from vehest.filters.unscented_steps import room
 
 
@@ -11,12 +11,12 @@ def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     out = room((points.shape[1], size, len(points)), points.dtype)
     upstreams = []
     learnt = []
-    x = _sequences_last(points)
-    u = _sequences_last(inputs)
+    x = sequences_last(points)
+    u = sequences_last(inputs)
     if upstream is not None:
-        upstreams = [_sequences_last(upstream)]
+        upstreams = [sequences_last(upstream)]
         learnt = [model.learnt(gradients)]
-        u = _sequences_last(np.pad(inputs, ((0, 0), (0, model.scratch_rows * points.shape[1]))))
+        u = sequences_last(np.pad(inputs, ((0, 0), (0, model.scratch_rows * points.shape[1]))))
         model.entries[entry - 2](
             x, u, model.car, np.empty_like(upstreams[0]), 0, len(points)
         )  # leaves what its adjoint takes
@@ -28,8 +28,8 @@ def noise_by(function):
     """Noise that a function of states (B, n) and inputs (B, p) says, (B, k, k)."""
 
     def write(states, inputs, _, out, first, end):
-        out[..., first:end] = _sequences_last(
-            function(_sequences_first(states, first, end), _sequences_first(inputs, first, end))
+        out[..., first:end] = sequences_last(
+            function(sequences_first(states, first, end), sequences_first(inputs, first, end))
         )
 
     return CompiledNoise(write, ())
@@ -40,5 +40,5 @@ def covariances(noise, states, inputs):
     (B, p): (B, k, k).
     """
     out = room((*noise.car[0].shape, len(states)), states.dtype)
-    noise.entry(_sequences_last(states), _sequences_last(inputs), noise.car, out, 0, len(states))
+    noise.entry(sequences_last(states), sequences_last(inputs), noise.car, out, 0, len(states))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))

@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.luenberger import Luenberger
-from vehest.report.document import _no_formula
+from vehest.report.document import without_formula
 from vehest.run.compare_files import compare_estimates
 from vehest.sources.base import read_single
 from vehest.sources.surveys import survey
@@ -70,9 +70,9 @@ def test_a_damaged_calibration_names_its_file(tmp_path):
 
 def test_tables_to_download_start_no_formula():
     formulas = ('=HYPERLINK("x")', "+1|cmd", "@SUM(A1)")
-    assert [_no_formula(cell) for cell in formulas] == [f"'{cell}" for cell in formulas]
+    assert [without_formula(cell) for cell in formulas] == [f"'{cell}" for cell in formulas]
     plain = ("+0.280 [0.039, 0.521]", "lap 3", -0.5)
-    assert tuple(map(_no_formula, plain)) == plain
+    assert tuple(map(without_formula, plain)) == plain
 
 
 def test_spreadsheets_and_measurements_are_refused_with_a_remedy(tmp_path):

@@ -447,8 +447,14 @@ class OnlineEstimator:
         values = self.stepper.step({**(sample or {}), **channels}, time)
         if values is not self._values:
             self._values = values
-            fields = {name: values[name] for name in OnlineEstimate._fields if name in values}
-            self.last = OnlineEstimate(**{"health": 0.0, "health_reason": 0.0, **fields})
+            self.last = OnlineEstimate(
+                values["vy"],
+                values["sideslip"],
+                values.get("health", 0.0),
+                values.get("health_reason", 0.0),
+                values.get("band_vy", math.nan),
+                values.get("band_sideslip", math.nan),
+            )
         return self.last
 
     @property

@@ -12,7 +12,11 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.networks import velocity_recurrent
-from vehest.estimators.networks.velocity_recurrent import SequenceSettings
+from vehest.estimators.networks.velocity_recurrent import (
+    DriveTensors,
+    SequenceSettings,
+    sequence_phase,
+)
 from vehest.estimators.registry import estimator_class
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseSettings
@@ -45,12 +49,12 @@ def _estimator(name, seed=0, **config):
 
 
 def _drives(estimator, recordings):
-    return velocity_recurrent._Drives(estimator, recordings, torch.float32)
+    return DriveTensors(estimator, recordings, torch.float32)
 
 
 def _phase(estimator, training, train, validation):
     drives = (_drives(estimator, recordings) for recordings in (train, validation))
-    return velocity_recurrent._phase(estimator.network, estimator.settings, training, *drives)
+    return sequence_phase(estimator.network, estimator.settings, training, *drives)
 
 
 @pytest.mark.parametrize("name", NAMES)

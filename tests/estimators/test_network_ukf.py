@@ -157,7 +157,7 @@ def test_pre_training_has_the_loss_of_the_formulas_and_the_filters_process_noise
     )
     levels = torch.tensor([2e-3, 3e-3], dtype=torch.float64)
     rows = torch.tensor([[3, 500, 1000]])
-    phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
+    phase = estimator.pre_training_phase(samples, samples, levels, EndToEndSettings())
     outputs = estimator.network(samples.inputs[rows])[0]
     unit = float(estimator.network.unit)
     sigma = torch.sigmoid(outputs[:, 1:])
@@ -248,7 +248,7 @@ def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_traini
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     gradient = torch.ones(4, 30, 4)
     gradient[2, 3, 1] = torch.inf
-    cleaned = training._cleaned(gradient, batch, torch.tensor([True, False, False, False]))
+    cleaned = training.finite_gradient(gradient, batch, torch.tensor([True, False, False, False]))
     assert cleaned.sum((1, 2)).tolist() == [0.0, 120.0, 0.0, 120.0]
     assert training.lost == 1
     _, training = end_to_end()

@@ -373,7 +373,7 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
         expected.append(
             list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3]
         )
-        tape = stepper._filter._tape
+        tape = stepper.filter.tape
         repaired = repaired + bool(tape.repaired[0, 0])
         lifted = lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
     assert repaired > 20

@@ -125,9 +125,8 @@ def test_covariances_stay_symmetric_and_positive():
     The short form of the update, (I - KC)P, turns negative on the way.
     """
     model, measurements, _ = example(300, seed=8)
-    model = model._replace(
-        process_noise=1e-6 * model.process_noise, observation_noise=1e-6 * model.observation_noise
-    )
+    A, b, Q, C, d, R = model
+    model = LinearModel(A, b, 1e-6 * Q, C, d, 1e-6 * R)
     start = Gaussian(np.zeros(N), 1e10 * np.eye(N))
     result = kalman_scan(model, measurements, start).filtered.covariance
     assert np.array_equal(result, result.transpose(0, 2, 1))
@@ -144,7 +143,8 @@ def test_covariances_stay_symmetric_and_positive():
 
 def test_shapes_that_do_not_fit_are_refused():
     model, measurements, initial = example(4)
-    wrong = model._replace(observation=model.observation[..., :2])
+    A, b, Q, C, d, R = model
+    wrong = LinearModel(A, b, Q, C[..., :2], d, R)
     with pytest.raises(
         ValueError, match=r"observation of shape \(4, 2, 2\) does not fit \(4, 2, 3\)"
     ):

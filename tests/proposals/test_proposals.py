@@ -22,7 +22,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.data.transforms import Resample
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.dataset import draft
-from vehest.run.own_car.inspect import _busiest, inspect
+from vehest.run.own_car.inspect import busiest_rows, inspect
 from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
@@ -1155,7 +1155,7 @@ def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_rea
         "nanstd",
         lambda values, **options: (lengths.append(values.size), nanstd(values, **options))[1],
     )
-    chosen = _busiest(rows, 6_000, 1_000)
+    chosen = busiest_rows(rows, 6_000, 1_000)
     np.testing.assert_array_equal(chosen, rows[:, 20_000:26_000])
     assert sum(lengths) <= 2 * rows.size
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vehest.report.figures import Reliability, _spread_heights, reliability_figure
+from vehest.report.figures import Reliability, reliability_figure, spread_heights
 from vehest.report.style import line_of
 
 
@@ -29,5 +29,5 @@ def test_labels_of_a_reliability_figure_keep_order_and_distance():
     assert [line.get_ydata().tolist() for line in axes.lines[1:]] == [
         row.coverage.tolist() for row in rows
     ]
-    placed = _spread_heights([0.99, 0.98, 0.5, 1.0], 0.05, 1.0)
+    placed = spread_heights([0.99, 0.98, 0.5, 1.0], 0.05, 1.0)
     assert placed == pytest.approx([0.95, 0.9, 0.5, 1.0])

@@ -16,7 +16,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
-from vehest.run.compare_files import _named_by_estimator, compare_estimates, compare_files
+from vehest.run.compare_files import compare_estimates, compare_files, named_by_estimator
 from vehest.run.estimate_tables import parse_columns, parse_shift, read_estimate_table
 from vehest.run.inspect_data import check
 
@@ -456,9 +456,9 @@ def test_a_row_is_named_by_the_estimator_that_its_table_records(drive):
         zeros = np.zeros(len(drive))
         return Estimate(drive.id, estimator, drive.rate_hz, 0.0, {"vy": zeros, "sideslip": zeros})
 
-    alone = _named_by_estimator({"out": by("ksnn"), "mine": by("mine")}, ["gru-seed0"])
+    alone = named_by_estimator({"out": by("ksnn"), "mine": by("mine")}, ["gru-seed0"])
     assert list(alone) == ["ksnn", "mine"]
-    twice = _named_by_estimator({"out": by("ksnn"), "before": by("ksnn")}, [])
+    twice = named_by_estimator({"out": by("ksnn"), "before": by("ksnn")}, [])
     assert list(twice) == ["out", "before"]
     taken = {"out": by("ksnn"), "still": by("zero"), "ksnn": by("other")}
-    assert list(_named_by_estimator(taken, [])) == ["out", "still", "other"]
+    assert list(named_by_estimator(taken, [])) == ["out", "still", "other"]

@@ -11,7 +11,7 @@ import pytest
 
 from vehest.data.errors import DataError
 from vehest.run import ingest
-from vehest.run.ingest import _make_part
+from vehest.run.ingest import make_part
 from vehest.run.launchers.local import launch
 from vehest.sources.tabular import TabularSource
 
@@ -89,12 +89,12 @@ def killed(dataset, recording_id, parts, *_):
     """Make a recording as an ingest does, but be killed at two of the three."""
     if recording_id != "two":
         os.kill(os.getpid(), signal.SIGKILL)
-    _make_part(dataset, recording_id, parts)
+    make_part(dataset, recording_id, parts)
 
 
 def test_killed_workers_are_named_by_their_recordings(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
-        broken.setattr(ingest, "_make_part", killed)
+        broken.setattr(ingest, "make_part", killed)
         code, _, err = place("ingest", "mine", "--jobs", "2")
     assert code == 4
     first, second = ("one", "three") if "recording 'one'" in err else ("three", "one")

@@ -14,7 +14,7 @@ from processes import start
 from vehest.artefacts.artefact import StagePlan, read_artefact
 from vehest.artefacts.locks import Lock, held
 from vehest.run import group
-from vehest.run.group import _locked
+from vehest.run.group import locked_jobs
 from vehest.run.train import TrainJob
 
 pytestmark = pytest.mark.apart
@@ -101,7 +101,7 @@ def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
     first = jobs[0].plan.lock
     second = jobs[1].plan.lock
     assert first.take()
-    with _locked(jobs, lambda: False, pytest.fail) as free:
+    with locked_jobs(jobs, lambda: False, pytest.fail) as free:
         assert [job.seed for job in free] == [1, 2]
         assert not second.take()
     assert second.take(), "a group that is done with its members holds none"
@@ -112,10 +112,10 @@ def test_group_trains_free_jobs_first_and_waits_without_locks(tmp_path):
         messages.append(waiting)
         first.release()
 
-    with _locked(jobs[:2], lambda: False, others_end) as free:
+    with locked_jobs(jobs[:2], lambda: False, others_end) as free:
         assert [job.seed for job in free] == [0]
     assert [waiting.label for waiting in messages] == [jobs[0].plan.folder.name]
-    with _locked(jobs[1:2], lambda: True, messages.append) as free:
+    with locked_jobs(jobs[1:2], lambda: True, messages.append) as free:
         assert free == [], "who is asked to stop waits no longer"
     second.release()
 

@@ -12,6 +12,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -180,17 +181,23 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     assert terminal == (f"{hostile} " in text.split("warning", 1)[1].split(hostile, 1)[1])
 
 
+def running_timers():
+    return [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+
+
 def test_a_stage_gets_a_line_once_it_has_been_silent_for_long(monkeypatch):
     monkeypatch.setattr(console, "MAX_SILENT_SECONDS", 0.0)
     messages = Messages()
     stream = io.StringIO()
     messages.console = type(messages.console)(file=stream, soft_wrap=True, width=200)
     messages.begin("ingest", "long")
-    messages._timers["ingest", "long"].join()
+    for timer in running_timers():
+        timer.join()
     monkeypatch.setattr(console, "MAX_SILENT_SECONDS", 600.0)
     messages.begin("train", "short")
     messages.begin("report", "stopped")
-    timers = [messages._timers[key] for key in (("train", "short"), ("report", "stopped"))]
+    timers = running_timers()
+    assert len(timers) == 2
     messages.end("train", "short")
     messages.close()
     for timer in timers:

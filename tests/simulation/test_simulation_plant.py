@@ -586,7 +586,7 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
 
 
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
-    function = compiled._CachedFunction(compiled._advance)
+    function = compiled.CachedFunction(compiled.advance.dispatcher.py_func)
     called = Event()
     assert function.lock is not None
     monkeypatch.setattr(function, "dispatcher", called.set)

@@ -17,7 +17,7 @@ from vehest.training import supervised
 from vehest.training.checkpoints import resume_epoch
 from vehest.training.context import FitContext
 from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
-from vehest.training.supervised import SupervisedSettings, _shuffle_seed
+from vehest.training.supervised import MemberBatch, MemberTraining, SupervisedSettings, shuffle_seed
 
 DATA = FitData([planar_drive(30.0, seed=1, noise=0.05)], [planar_drive(15.0, seed=2, noise=0.05)])
 SHAPES = [
@@ -25,11 +25,6 @@ SHAPES = [
     ("gru", {"n_states": 2}),
     ("lstm", {"n_states": 2}),
 ]
-
-
-RUN = supervised._Run
-BATCH = supervised._Batch
-"""Classes of a training in progress, into which tests plant faults."""
 
 
 @pytest.fixture(autouse=True)
@@ -151,8 +146,8 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
     """Make weights of one member NaN in an epoch, and in later ones, while its step size is larger
     than ``bad_above``.
     """
-    train_epoch = RUN.train_epoch
-    descend = BATCH.descend
+    train_epoch = MemberTraining.train_epoch
+    descend = MemberBatch.descend
 
     def spoilt_epoch(self):
         def spoilt_descend(batch, data, windows):
@@ -163,11 +158,11 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
             return losses
 
         with monkeypatch.context() as patch:
-            patch.setattr(BATCH, "descend", spoilt_descend)
+            patch.setattr(MemberBatch, "descend", spoilt_descend)
             train_epoch(self)
 
-    monkeypatch.setattr(RUN, "train_epoch", spoilt_epoch)
-    monkeypatch.setattr(RUN, "planted", member, raising=False)
+    monkeypatch.setattr(MemberTraining, "train_epoch", spoilt_epoch)
+    monkeypatch.setattr(MemberTraining, "planted", member, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +199,7 @@ def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     ):
         assert np.array_equal(flat_weights(expected), flat_weights(actual))
         np.testing.assert_equal(dict(record.history), dict(resumed_record.history))
-    monkeypatch.setattr(RUN, "planted", 0)
+    monkeypatch.setattr(MemberTraining, "planted", 0)
     (alone,), _ = _fit("ksnn", {}, [1], settings)
     assert np.array_equal(flat_weights(alone), flat_weights(spoilt[1]))
 
@@ -259,7 +254,7 @@ def _loop_with_all_its_weights(averaging):
         for w in sets
     )
     adam = torch.optim.Adam(network.parameters(), lr=1e-2)
-    generator = torch.Generator().manual_seed(_shuffle_seed(3))
+    generator = torch.Generator().manual_seed(shuffle_seed(3))
     steps = []
     averages = []
     losses = []

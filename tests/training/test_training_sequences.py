@@ -13,11 +13,16 @@ from torch import nn
 from conftest import die_after, stop_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
-from vehest.training import sequences
 from vehest.training.adam import Adam
 from vehest.training.checkpoints import load_checkpoint, resume_epoch
 from vehest.training.context import DivergenceError, FitContext
-from vehest.training.sequences import Phase, PhaseSettings, record_of_phases, train_phases
+from vehest.training.sequences import (
+    Phase,
+    PhaseSettings,
+    PhaseTraining,
+    record_of_phases,
+    train_phases,
+)
 
 X = torch.linspace(-2, 2, 48).unsqueeze(1)
 Y = torch.sin(2 * X)
@@ -338,14 +343,13 @@ def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
 def runs(monkeypatch):
     """Trainings that have begun, so that a planted loss can ask for the step size and the epoch."""
     begun = []
-    run_type = sequences._Run
-    prepare = run_type.__post_init__
+    prepare = PhaseTraining.__post_init__
 
     def watched(self):
         begun.append(self)
         prepare(self)
 
-    monkeypatch.setattr(run_type, "__post_init__", watched)
+    monkeypatch.setattr(PhaseTraining, "__post_init__", watched)
     return begun
 
 

@@ -237,7 +237,7 @@ class CnnUkf(NetworkUkf):
         driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
-            self._pre_training(train, judged, levels, training),
+            self.pre_training_phase(train, judged, levels, training),
             Phase(
                 "end_to_end",
                 training.end_to_end,
@@ -294,7 +294,7 @@ class CnnUkf(NetworkUkf):
                 network.get_parameter("bias_3")[..., DISTRUST] = SATURATED
         return handles
 
-    def _pre_training(
+    def pre_training_phase(
         self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
     ) -> Phase:
         """Phase of the network alone (Eqs. 5 and 6).
@@ -434,7 +434,7 @@ class EndToEnd:
         outputs = outputs.reshape(count, steps, -1).double()
         lost = torch.zeros(count, dtype=torch.bool)
         if outputs.requires_grad:
-            outputs.register_hook(lambda gradient: self._cleaned(gradient, batch, lost))
+            outputs.register_hook(lambda gradient: self.finite_gradient(gradient, batch, lost))
         output = estimator.output_of(outputs)
         initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
         measurements = torch.cat([batch.measured, output.sideslip.unsqueeze(-1)], -1)
@@ -457,7 +457,7 @@ class EndToEnd:
             math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0
         )
 
-    def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
+    def finite_gradient(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
         """A gradient, (B, T, 4), that is zero for lost sequences and where it is not finite."""
         bad = ~torch.isfinite(gradient).all(-1)
         bad[lost] = False

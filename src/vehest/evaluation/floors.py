@@ -370,7 +370,7 @@ def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatA
     Parameters
     ----------
     model : LinearModel[FloatArray]
-        See `LinearModel`, observation (T, m, n); offsets do not matter.
+        See `LinearModel`, observation (T, m, n); covariances do not depend on its offsets.
     prior : FloatArray
         Covariance of the state at the first sample before its measurement, (n, n).
 
@@ -378,15 +378,8 @@ def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatA
     the Kalman filter.
     """
     steps, m, n = model.observation.shape
-    zero = LinearModel(
-        model.transition,
-        np.zeros(n),
-        model.process_noise,
-        model.observation,
-        np.zeros(m),
-        model.observation_noise,
-    )
-    return kalman_scan(zero, np.zeros((steps, m)), Gaussian(np.zeros(n), prior)).filtered.covariance
+    initial = Gaussian(np.zeros(n), prior)
+    return kalman_scan(model, np.zeros((steps, m)), initial).filtered.covariance
 
 
 def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
@@ -554,17 +547,14 @@ def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
 
 def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatArray:
     """Standard deviation of v along a drive [m/s], (T,)."""
-    model, prior = _model_of(drive, inputs, levels)
+    (A, b, Q, C, d, R), prior = _model_of(drive, inputs, levels)
     deviation = np.empty(len(drive.vy_ref))
     for begin in range(0, len(deviation), SAMPLES_TOGETHER):
         part = slice(begin, begin + SAMPLES_TOGETHER)
-        part_model = model._replace(
-            transition=model.transition[part], observation=model.observation[part]
-        )
-        covariance = posterior_bound(part_model, prior)
+        transition = A[part]
+        covariance = posterior_bound(LinearModel(transition, b, Q, C[part], d, R), prior)
         deviation[part] = np.sqrt(covariance[:, 0, 0])
-        last = part_model.transition[-1]
-        prior = last @ covariance[-1] @ last.T + model.process_noise
+        prior = transition[-1] @ covariance[-1] @ transition[-1].T + Q
     return deviation
 
 

@@ -48,7 +48,7 @@ from vehest.trust.guard import (
     Guard,
 )
 from vehest.trust.health_kernel import Layout, Model
-from vehest.trust.named_arrays import views
+from vehest.trust.named_arrays import values_by_field, views
 from vehest.trust.tyre_check import FRICTION_SLIP
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
@@ -299,9 +299,9 @@ def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
     layout = Layout(*map(int, views(Layout, packed, ())[0]))
     model, _ = views(Model, packed, layout)
     return {
-        **model._asdict(),
-        **layout._asdict(),
-        **{name: float(value) for name, value in model.settings._asdict().items()},
+        **values_by_field(model),
+        **values_by_field(layout),
+        **{name: float(value) for name, value in values_by_field(model.settings).items()},
         "n_statistics": layout.statistics,
         "limits": model.limits.all_values,
         "inverse": model.inverse.all_values,

@@ -157,7 +157,7 @@ class TorchModel(PointModel):
         """
         with torch.enable_grad():
             state, input_tensor = _of_torch(points, inputs, *ends)
-            upstream = torch.from_numpy(_sequences_first(up, *ends))
+            upstream = torch.from_numpy(sequences_first(up, *ends))
             leaf_gradients = torch.autograd.grad(
                 function(state.requires_grad_(), input_tensor),
                 [state, *self.parameters],
@@ -174,8 +174,8 @@ def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tenso
     """Points (B, S, n) and inputs (B, 1, p) of some sequences as tensors, which share no memory
     with the arrays.
     """
-    return torch.from_numpy(_sequences_first(points, first, end)), torch.from_numpy(
-        _sequences_first(inputs, first, end)
+    return torch.from_numpy(sequences_first(points, first, end)), torch.from_numpy(
+        sequences_first(inputs, first, end)
     ).unsqueeze(-2)
 
 
@@ -359,6 +359,9 @@ class UnscentedStepper:
         The same after it; both are valid until the next step and may be changed.
     innovation, innovation_covariance, gain
         Of the last update, (m,), (m, m) and (n, m).
+    tape : Tape
+        Intermediate values of the last half-step, of one sample and one sequence; what the other
+        attributes view.
     """
 
     def __init__(
@@ -377,7 +380,7 @@ class UnscentedStepper:
         self._model = model
         self._setting = _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._tape = tape = tape_of(1, 1, n, measurements, dtype)
+        self.tape = tape = tape_of(1, 1, n, measurements, dtype)
         self.prior = Gaussian(tape.prior_mean[0, :, 0], tape.prior_covariance[0, :, :, 0])
         self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
         self.prior.mean[:] = mean
@@ -460,7 +463,7 @@ class UnscentedStepper:
         with self._model.working():
             self._runs[at](
                 self._setting,
-                self._tape,
+                self.tape,
                 y,
                 u,
                 (noise_covariance, noise_covariance),
@@ -505,7 +508,7 @@ class _Moved(torch.autograd.Function):
         out = room(points.shape, points.dtype)
         with model.working():
             model.entries[0](*ctx.forward_values[1:], model.car, out, 0, len(states))
-        return torch.from_numpy(_sequences_first(out[0]))
+        return torch.from_numpy(sequences_first(out[0]))
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
@@ -559,8 +562,8 @@ class _Scan(torch.autograd.Function):
         y = _by_time(measurements)
         u = _by_time(inputs, scratch_rows)
         noises = (_by_time(process), _by_time(observation))
-        tape.prior_mean[0] = _sequences_last(mean.detach().numpy())
-        tape.prior_covariance[0] = _sequences_last(covariance.detach().numpy())
+        tape.prior_mean[0] = sequences_last(mean.detach().numpy())
+        tape.prior_covariance[0] = sequences_last(covariance.detach().numpy())
         refused = np.zeros(measurements.shape[::2], np.int64)
         halves = (1, 2 * len(y))
         run = _forward_by(model, functions, (tape, u[0]))
@@ -635,7 +638,7 @@ class _Scan(torch.autograd.Function):
             for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)
         ]
         y_bar, *noise_bars = (_by_sequence(part) for part in (measured, *noises))
-        first_bars = (torch.from_numpy(_sequences_first(part)) for part in (mean, covariance))
+        first_bars = (torch.from_numpy(sequences_first(part)) for part in (mean, covariance))
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
@@ -692,7 +695,7 @@ def _backward_by(
     return partial(backward, Backward(*called)), parameter_gradients
 
 
-def _sequences_last(values: Array) -> Array:
+def sequences_last(values: Array) -> Array:
     """(B, ...) -> (..., B), followed by room for a vector."""
     moved = np.moveaxis(values, 0, -1)
     out: Array = room(moved.shape, values.dtype)
@@ -700,7 +703,7 @@ def _sequences_last(values: Array) -> Array:
     return out
 
 
-def _sequences_first(values: Array, first: int = 0, end: int | None = None) -> Array:
+def sequences_first(values: Array, first: int = 0, end: int | None = None) -> Array:
     """(..., B) -> (B, ...) of some sequences, together in memory."""
     return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
 

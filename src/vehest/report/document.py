@@ -520,7 +520,7 @@ def _open_blocks(document: Document) -> int | None:
     return next(appendices, None)
 
 
-def _no_formula(cell: Any) -> Any:
+def without_formula(cell: Any) -> Any:
     """A cell that spreadsheets show as text: an apostrophe before what they would read as a
     formula.
     """
@@ -533,7 +533,7 @@ def _page_table(table: Table) -> dict[str, Any]:
     """
     headers, rows, numeric = formatted(table)
     csv = (
-        table.frame.map(_no_formula)
+        table.frame.map(without_formula)
         .to_csv(index=False, lineterminator="\n")
         .encode("utf-8", "backslashreplace")
     )

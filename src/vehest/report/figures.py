@@ -362,7 +362,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         )
         axes.set_xlabel("nominal level [%]")
         axes.set_ylabel("errors of β inside [%]")
-        heights = _spread_heights(
+        heights = spread_heights(
             [float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0
         )
         for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
@@ -386,7 +386,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
     return figure
 
 
-def _spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
+def spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
     """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
     placed = [0.0] * len(heights)
     last = top + step

@@ -112,7 +112,7 @@ def compare_files(
         tables = {
             file.stem: read_estimate_table(file, drive, named_columns, seconds) for file in files
         }
-        estimates = _named_by_estimator(tables, models)
+        estimates = named_by_estimator(tables, models)
         for name in models:
             folder, model, trust = open_model(name, options.output, note)
             model, trust, remarks = adapted(model, trust, drive.car, settings)
@@ -158,7 +158,7 @@ def _check_rows(names: Sequence[str]) -> None:
             )
 
 
-def _named_by_estimator(
+def named_by_estimator(
     tables: Mapping[str, Estimate], models: Sequence[str]
 ) -> dict[str, Estimate]:
     """Estimates by the estimator that their tables record; by the file's name where that is the

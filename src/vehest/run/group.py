@@ -103,7 +103,7 @@ class Group:
             models = {job.plan.key: self.existing(job.plan) for job in self.jobs}
             waiting = [job for job in self.jobs if models[job.plan.key] is None]
             while waiting and not should_stop():
-                with _locked(waiting, should_stop, on_progress) as jobs:
+                with locked_jobs(waiting, should_stop, on_progress) as jobs:
                     for job in jobs:
                         if STAGE in self.force:
                             drop_checkpoint(job.plan.checkpoint_folder)
@@ -194,7 +194,7 @@ def compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractConte
 
 
 @contextmanager
-def _locked(
+def locked_jobs(
     jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_waiting: Callable[[Waiting], None]
 ) -> Iterator[list[TrainJob]]:
     """Hold the locks of those trainings that are free; where none is, wait for the first.

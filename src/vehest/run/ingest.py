@@ -134,7 +134,7 @@ def write_ingest(
     ]
     description = json.dumps(config["dataset"])
     tasks: list[Callable[..., None]] = [
-        partial(_make_part, description, recording_id, parts) for recording_id in missing
+        partial(make_part, description, recording_id, parts) for recording_id in missing
     ]
     if min(jobs, len(tasks)) > 1 and has_to_compile(
         SLOW_KERNEL
@@ -182,7 +182,7 @@ def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataErro
     return error
 
 
-def _make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
+def make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
     """Make one recording in a worker; the source is opened once a process."""
     _make(_opened(description), recording_id, parts)
 

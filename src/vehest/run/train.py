@@ -228,7 +228,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         "n_parameters": estimator.n_parameters,
         "downsample": _preparation(job.data),
         "interrupted": record.interrupted,
-        **_divergence(record),
+        **divergence_values(record),
     }
     save_model(estimator, folder, about)
     if record.history:
@@ -244,7 +244,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         )
 
 
-def _divergence(record: FitRecord) -> dict[str, Any]:
+def divergence_values(record: FitRecord) -> dict[str, Any]:
     """What model.yaml says of a training that diverged; empty for one that never did."""
     if "step_size_halvings" not in record.metrics:
         return {}

@@ -217,7 +217,7 @@ def train_phases(
         for i in (folder_index, *twins)
         if i < len(context.checkpoint_folders)
     ]
-    run = _Run(phases, seed, context, folder_index, checkpoint_seconds, folders)
+    run = PhaseTraining(phases, seed, context, folder_index, checkpoint_seconds, folders)
     run.resume()
     while run.position < len(phases) and not run.current.interrupted:
         run.train_phase()
@@ -225,8 +225,8 @@ def train_phases(
 
 
 @dataclass
-class _Run:
-    """State of a training.
+class PhaseTraining:
+    """State of a training through its phases, which `train_phases` runs.
 
     ``records`` has one entry for each phase begun. Of the current phase there are the parameters
     (``state``), the best of them, Adam's moments and the random generator.

@@ -1,10 +1,12 @@
 """Supervised training of windowed networks: Adam on the mean squared error, with early stopping.
 
-    windows -> `_Prepared` -> batches -> `_Run._descend` or `_Run._step` -> validation -> `_Member`
+    windows -> `_Prepared` -> batches -> `MemberBatch.descend` or `MemberBatch.step` -> validation
+        -> `_Member`
 
-Members (networks of one shape) train as one batch. `_Run` has the weights, their average and Adam's
-moments of those that still train, one row each; a `_Member` has what does not depend on the batch:
-best weights, losses, the order of windows. A member trains to the same bits as it would alone.
+Members (networks of one shape) train as one batch. `MemberBatch` has the weights, their average and
+Adam's moments of those that still train, one row each; a `_Member` has what does not depend on the
+batch: best weights, losses, the order of windows. A member trains to the same bits as it would
+alone.
 """
 
 from __future__ import annotations
@@ -95,7 +97,7 @@ def train_members(
     Source: Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015, Section 7.2 for the averaging
     of the weights.
     """
-    run = _Run(networks, seeds, train, validation, settings, context)
+    run = MemberTraining(networks, seeds, train, validation, settings, context)
     run.resume()
     run.train_batch()
     while run.diverged and not run.interrupted:
@@ -169,7 +171,7 @@ class _Member:
         return record_of_epochs(self.train_loss, self.validation_loss, metrics, is_interrupted)
 
 
-class _Batch:
+class MemberBatch:
     """Weights that train together with Adam's moments and their running average, one row a member.
 
     Parameters
@@ -337,8 +339,18 @@ class _Batch:
 
 
 @dataclass
-class _Run:
-    """A training of several members; rows of ``batch`` belong to the members in ``active``."""
+class MemberTraining:
+    """State of a training of several members, which `train_members` runs.
+
+    Attributes
+    ----------
+    active : list[int]
+        Indices of the members that train in ``batch``, in the order of its rows.
+    batch : MemberBatch
+        Their weights and Adam's moments.
+    epoch : int
+        Finished epochs of the active members.
+    """
 
     networks: Sequence[nn.Module]
     seeds: Sequence[int]
@@ -355,7 +367,7 @@ class _Run:
         self.validation = _Prepared(self.network, self.validation_windows, self.settings)
         weights = FlatParameters(self.network).pack(self.networks)
         self.members = [
-            _Member(start.clone(), torch.Generator().manual_seed(_shuffle_seed(seed)))
+            _Member(start.clone(), torch.Generator().manual_seed(shuffle_seed(seed)))
             for start, seed in zip(weights, self.seeds, strict=True)
         ]
         # members that continue alone later, in their order, with the state that they continue from;
@@ -368,11 +380,11 @@ class _Run:
         self._activate(list(range(len(self.members))), {"parameters": weights})
 
     def _activate(self, members: list[int], state: dict[str, Tensor]) -> None:
-        """Train these members from now on, from a state as `_Batch` receives it."""
+        """Train these members from now on, from a state as `MemberBatch` receives it."""
         self.active = members
         # active members never diverged, or there is a single one
         halvings = self.members[members[0]].halvings if members else 0
-        self.batch = _Batch(
+        self.batch = MemberBatch(
             self.network,
             state,
             {name: values[members] for name, values in self.fixed.items()},
@@ -610,7 +622,7 @@ class _Prepared:
         return len(self.starts)
 
 
-def _shuffle_seed(seed: int) -> int:
+def shuffle_seed(seed: int) -> int:
     """Seed of the order of windows, independent of the stream from which initial weights were
     drawn.
     """

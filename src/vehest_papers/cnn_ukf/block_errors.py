@@ -108,7 +108,18 @@ def _pseudo_measurement_rows(learnt: Limited) -> list[BlockRow]:
 
 
 def network_squares(outputs: Sequence[Sequence[Outputs]]) -> tuple[FloatArray, FloatArray]:
-    """Sums of the squared errors of β_DD, (S, M) [deg²], and samples, (M,)."""
+    """Sums of the squared errors of β_DD by seed and manoeuvre.
+
+    Parameters
+    ----------
+    outputs
+        Outputs of a hybrid's network, seed by seed, manoeuvre by manoeuvre.
+
+    Returns
+    -------
+    tuple of array
+        Sums (S, M) [deg²] and samples of each manoeuvre (M,).
+    """
     sums = np.array(
         [[float(np.square(manoeuvre.error).sum()) for manoeuvre in seed] for seed in outputs]
     )
@@ -206,8 +217,15 @@ def training_rows(
     """How far every candidate was trained; those of the full set are checked by a part with twice
     the epochs.
 
-    ``is_complete``: whether all planned trainings are done; else candidates without a training are
-    rows as well.
+    Parameters
+    ----------
+    parts
+        Part -> its candidates; the part `DOUBLED` has the trainings with twice the epochs, which
+        are no candidates of their own.
+    content
+        Candidates of the paper, with its epochs; others have no row.
+    is_complete
+        Whether all planned trainings are done; else candidates without a training are rows as well.
     """
     doubled = _validation(parts.get(DOUBLED, {}))
     rows: dict[str, TrainingRow] = {}

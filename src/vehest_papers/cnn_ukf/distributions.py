@@ -72,6 +72,20 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
 def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
     """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean
     and standard deviation.
+
+    Parameters
+    ----------
+    runs
+        Candidate -> its seeds.
+    number
+        Of the paper's figure: 5, or 11 for the small training set.
+    title, data
+        Subject and data sets, for the caption.
+
+    Returns
+    -------
+    tuple of Figure and DataFrame
+        The frame has a row for each candidate and bin: its lower edge ``from_deg`` and ``samples``.
     """
     picked = {candidate: chosen(seeds) for candidate, seeds in runs.items()}
     by_candidate = {
@@ -117,7 +131,15 @@ def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figur
 
 
 def groups(runs: Runs, data: str) -> tuple[Figure, pd.DataFrame]:
-    """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
+    """MSE_nl by group of manoeuvres, of all seeds (Figure 6).
+
+    Returns
+    -------
+    tuple of Figure and DataFrame
+        Bars are medians over seeds, with their range. The frame has a row a group: the number ``n``
+        of its manoeuvres, and for each candidate the median with its range in words and, under
+        ``CANDIDATE_median``, as a number [deg²].
+    """
     of_run = {
         candidate: [kpis_by_group(run.test) for run in seeds] for candidate, seeds in runs.items()
     }

@@ -61,7 +61,9 @@ def factorial_table(comparison: ManoeuvreErrors, data: str) -> Table:
 
 
 def effects_table(comparison: ManoeuvreErrors, data: str) -> Table:
-    """Ratio of MSE_nl between two levels of each factor, averaged over the cells of the others."""
+    """Ratio of MSE_nl between two levels of each factor, averaged over the cells of the others:
+    table ``effects``, a row for each of `EFFECTS`.
+    """
     rows = [
         {"effect": name, "ratio": figure_in_words(figure) if cells else NOT_TRAINED, "cells": cells}
         for name, (figure, cells) in effects_of(comparison).items()
@@ -79,7 +81,11 @@ def effects_table(comparison: ManoeuvreErrors, data: str) -> Table:
 
 
 def effects_of(comparison: ManoeuvreErrors) -> dict[str, tuple[Figure, int]]:
-    """Effect -> its ratio, and how many pairs of cells it rests on."""
+    """Effect -> its ratio, and how many pairs of cells it rests on.
+
+    A pair are two cells that differ in the levels of one factor only. Pairs of which a cell is not
+    trained yet are left out; an effect without pairs has the ratio NaN.
+    """
     cells = [
         (curve, noise, hybrid)
         for curve in CURVES
@@ -105,7 +111,12 @@ def _with_level(cell: Cell, factor: int, level: str) -> Cell:
 
 
 def _mean_ratio(comparison: ManoeuvreErrors, pairs: Sequence[tuple[Cell, Cell]]) -> Figure:
-    """Geometric mean over pairs of cells and manoeuvres of the ratio of MSE_nl."""
+    """Geometric mean over pairs of cells and manoeuvres of the ratio of MSE_nl.
+
+    Errors are means over seeds. Manoeuvres in which an error is 0 are left out. Logarithms are
+    averaged over pairs first, so that the 95 % interval is that of the mean over manoeuvres;
+    without `MIN_BLOCKS` of them there is none.
+    """
     if not pairs:
         return Figure(math.nan, math.nan, math.nan)
     sums = [
@@ -128,7 +139,19 @@ def floor_table(
     data: str,
 ) -> Table:
     """Errors of both hybrids, quantiles of σ_DD and its rank correlation with the network's error,
-    by ε.
+    by ε (Eq. 6).
+
+    Parameters
+    ----------
+    comparison
+        Candidates of all parts on the test.
+    outputs
+        Candidate -> outputs of its network, seed by seed, manoeuvre by manoeuvre; candidates that
+        are not in it are listed as not trained.
+    active
+        A row a candidate, with the quantiles of its σ_DD in words in ``distrust``.
+    data
+        Data sets, for the caption.
     """
     rows = []
     for hybrid in paper.HYBRIDS:

@@ -33,8 +33,20 @@ Sums = tuple[FloatArray, FloatArray]  # sum and size of each manoeuvre, (M,) eac
 def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:
     """Sum of an indicator's loss over each manoeuvre and the samples in it.
 
-    Errors of the sideslip angle in degrees. Maxima, errors at the peak and root mean squares have
-    size 1, or 0 where no sample of a manoeuvre counts.
+    Parameters
+    ----------
+    manoeuvres
+        Recording -> what was scored of it, M of them.
+    indicator
+        One of `MSE`, `MSE_NL`, `ME`, `ME_NL`, `VARIANCE_NL`, `AT_PEAK` and `BALANCED`. Those that
+        end in ``nonlinear`` take samples with |ay| ≥ 4 m/s² alone.
+
+    Returns
+    -------
+    tuple of array
+        Sums and sizes, (M,). Of squared errors [deg²], for `VARIANCE_NL` about the mean over all
+        manoeuvres; maxima, the mean absolute error around the largest reference angle and the root
+        mean square of a manoeuvre [deg] have size 1, maxima 0 where no sample counts.
     """
     errors = [sideslip_errors(parts) for parts in manoeuvres.values()]
     if indicator in (MSE_NL, ME_NL, VARIANCE_NL):
@@ -85,6 +97,13 @@ class ManoeuvreErrors:
     ----------
     runs
         Candidate -> its seeds, all over the same manoeuvres.
+
+    Attributes
+    ----------
+    manoeuvres : tuple of str
+        Names of the recordings, M of them, which are the blocks of all errors.
+    groups : list of str
+        Group of each manoeuvre.
     """
 
     def __init__(self, runs: Runs) -> None:
@@ -101,7 +120,9 @@ class ManoeuvreErrors:
         return tuple(run.model.seed for run in self.runs[candidate])
 
     def errors(self, candidate: str, indicator: str, group: str = "") -> BlockErrors:
-        """An indicator of a candidate, over all manoeuvres or those of a group."""
+        """An indicator of a candidate, over all manoeuvres or those of a group, seed by seed: sums
+        (S, M) and sizes (M,) as of `sums_of`.
+        """
         key = candidate, indicator
         if key not in self._errors:
             pairs = [sums_of(run.test, indicator) for run in self.runs[candidate]]
@@ -125,7 +146,9 @@ class ManoeuvreErrors:
         return value_of(self.errors(candidate, indicator, group), indicator)[1]
 
     def ratio(self, first: str, second: str, indicator: str) -> Figure:
-        """An indicator of the first candidate over that of the second."""
+        """An indicator of the first candidate over that of the second, pooled over the manoeuvres
+        in which both are finite, with its 95 % interval.
+        """
         return ratio_of(
             paired_errors(
                 self.errors(first, indicator), self.errors(second, indicator), indicator, "test"

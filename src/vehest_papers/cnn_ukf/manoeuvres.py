@@ -87,7 +87,19 @@ def car_of(recording: str) -> str:
 
 
 def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:
-    """Indicators of a set of manoeuvres; raises `DataError` where the set is empty."""
+    """Indicators of a set of manoeuvres.
+
+    Parameters
+    ----------
+    manoeuvres
+        Name of a manoeuvre -> what was scored of it. Samples of all manoeuvres are pooled for
+        squared errors; largest errors are averaged over manoeuvres.
+
+    Raises
+    ------
+    DataError
+        The set is empty.
+    """
     if not manoeuvres:
         raise DataError("there are no manoeuvres to take errors of")
     errors = [
@@ -119,8 +131,19 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
 
 
 def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
-    """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s²
-    only; raises `DataError` where none is.
+    """Distribution of the error of the sideslip angle (Figures 5 and 11), in bins of `BIN`.
+
+    Parameters
+    ----------
+    parts
+        Scored ranges, taken together.
+    nonlinear_only
+        Whether samples with |ay| ≥ 4 m/s² alone count.
+
+    Raises
+    ------
+    DataError
+        No sample counts.
     """
     errors = np.concatenate(
         [

@@ -42,6 +42,13 @@ def mean_error_over_least_of_others(
 
     Where |ay| is at least 4 m/s². Their mean over manoeuvres is the difference of the two
     magnitudes: the sign of each mean error is that over all manoeuvres.
+
+    Parameters
+    ----------
+    main
+        Candidates on the test.
+    candidate, rivals
+        The candidate that is compared, and those of which the smallest magnitude counts.
     """
     magnitudes = [_magnitude_parts(main, name) for name in rivals]
     smallest = min(magnitudes, key=lambda parts: float(parts.mean()))
@@ -49,7 +56,11 @@ def mean_error_over_least_of_others(
 
 
 def _magnitude_parts(main: ManoeuvreErrors, candidate: str) -> FloatArray:
-    """Contributions of each manoeuvre to the magnitude of a mean error, (S, M) [deg]."""
+    """Contributions of each manoeuvre to the magnitude of a mean error, (S, M) [deg].
+
+    A contribution is the sum of the errors in the manoeuvre over the mean number of samples of a
+    manoeuvre, with the sign that makes the mean over all manoeuvres of a seed positive.
+    """
     sums = []
     for run in main.runs[candidate]:
         parts = list(run.test.values())
@@ -76,12 +87,24 @@ def is_best_in_group(
 
 
 def _values_of_seeds(main: ManoeuvreErrors, candidate: str, group: str) -> FloatArray:
+    """MSE of a group of manoeuvres in non-linear driving, pooled over its samples, (S,) [deg²]."""
     errors = main.errors(candidate, MSE_NL, group)
     return errors.sums.sum(axis=1) / max(float(errors.sizes.sum()), 1.0)
 
 
 def distrust_correlations(outputs: Seeds) -> FloatArray:
-    """Rank correlation of a network's deviation with the magnitude of its error."""
+    """Spearman's rank correlation of a network's deviation with the magnitude of its error.
+
+    Parameters
+    ----------
+    outputs
+        Outputs of the network, seed by seed, manoeuvre by manoeuvre.
+
+    Returns
+    -------
+    array, shape (S, M)
+        Over the samples of each manoeuvre; 0 where the deviation is constant.
+    """
 
     def correlation(manoeuvre: Outputs) -> float:
         if np.ptp(manoeuvre.distrust) == 0:
@@ -99,6 +122,7 @@ def distrust_decades_ratios(first: Seeds, second: Seeds) -> FloatArray:
 
 
 def _decades(outputs: Seeds) -> FloatArray:
+    """log₁₀ of the 99th over the 1st percentile of the deviation in each manoeuvre, (S, M)."""
     ends = np.array(
         [[np.percentile(manoeuvre.distrust, [1.0, 99.0]) for manoeuvre in seed] for seed in outputs]
     )
@@ -106,7 +130,10 @@ def _decades(outputs: Seeds) -> FloatArray:
 
 
 def yaw_rate_noise_rises(outputs: Seeds) -> FloatArray:
-    """Median process noise of the yaw rate where |β| ≥ 5° over that where |β| < 1°."""
+    """Median process noise of the yaw rate where |β| ≥ 5° over that where |β| < 1°.
+
+    β is the reference; NaN in manoeuvres without samples of either kind.
+    """
 
     def rise(manoeuvre: Outputs) -> float:
         angle = np.abs(manoeuvre.sideslip)
@@ -133,6 +160,15 @@ def lateral_velocity_noise_rises(outputs: Seeds) -> FloatArray:
 
 
 def _ratio_of_medians(outputs: Outputs, column: int, above: np.ndarray, below: np.ndarray) -> float:
+    """Median of a standard deviation of the process noise over some samples, over that over others.
+
+    Parameters
+    ----------
+    column
+        `LATERAL_VELOCITY` or `YAW_RATE`.
+    above, below
+        Masks of the samples of numerator and denominator, (K,); NaN is returned if one is empty.
+    """
     assert outputs.process is not None
     if not (above.any() and below.any()):
         return float("nan")
@@ -147,6 +183,15 @@ def stiffness_rise_differences(
     [deg²].
 
     Each has its own worst combination of stiffnesses, by the MSE over all manoeuvres.
+
+    Parameters
+    ----------
+    conditions
+        Errors with each combination of wrong stiffnesses (Figure 14 of the paper).
+    nominal
+        Errors with the stiffnesses as identified.
+    candidate, reference
+        Filters whose rises are compared.
     """
     return np.subtract(
         *paired_seeds(
@@ -158,6 +203,12 @@ def stiffness_rise_differences(
 def _worst_rise(
     conditions: Sequence[ManoeuvreErrors], nominal: ManoeuvreErrors, candidate: str
 ) -> FloatArray:
+    """MSE with the worst combination of stiffnesses less the nominal MSE, by manoeuvre (S, M)
+    [deg²].
+
+    Differences of sums are divided by the mean number of samples of a manoeuvre, so that their mean
+    over manoeuvres is the difference of the pooled errors.
+    """
     errors = [condition.errors(candidate, MSE) for condition in (*conditions, nominal)]
     sizes = errors[0].sizes
     worst = max(errors, key=lambda condition: float(condition.sums.mean(axis=0).sum()))
@@ -169,6 +220,15 @@ def largest_ratios_over_stiffnesses(
 ) -> FloatArray:
     """MSE of a candidate over that of another in non-linear driving, at the stiffnesses where its
     geometric mean is largest.
+
+    That the candidate is better at all stiffnesses is tested by the worst of them alone.
+
+    Parameters
+    ----------
+    conditions
+        Errors with each combination of stiffnesses.
+    candidate, reference
+        Filters of numerator and denominator.
     """
     ratios = []
     for condition in conditions:

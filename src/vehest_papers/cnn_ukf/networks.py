@@ -90,7 +90,20 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
 def filtered_with(
     fitted: DugoffUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement] | None
 ) -> list[FloatArray]:
-    """β of a filter given these outputs of its network, or none, drive by drive [rad]."""
+    """β of a filter given these outputs of its network, drive by drive [rad].
+
+    Parameters
+    ----------
+    drives
+        Measurements, T samples each; filtered together where they can be.
+    pseudo
+        Outputs of the network on each drive; None for a filter without one.
+
+    Returns
+    -------
+    list of array
+        atan2(v, u) of the filtered v and the measured u, (T,), in the order of the drives.
+    """
     angles: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
         mean = steps.filtered.mean.numpy()
@@ -107,7 +120,21 @@ def filtered_run(
     pseudo: Sequence[PseudoMeasurement] | None,
     candidate: str = "",
 ) -> Run:
-    """A run whose test is filtered anew by a changed filter, given the outputs of its network."""
+    """A run whose test is filtered anew by a changed filter, given the outputs of its network.
+
+    Parameters
+    ----------
+    estimator
+        The changed filter.
+    run
+        The run whose scored samples and validation are taken over.
+    prepared
+        Recordings of the part.
+    pseudo
+        Outputs of the network on each test drive; None for a filter without one.
+    candidate
+        Name of the new run; empty: that of ``run``.
+    """
     assert isinstance(estimator, DugoffUkf)
     drives = prepared.estimator_inputs(TEST)
     test = {}
@@ -122,6 +149,9 @@ def filtered_run(
 def shift_of(run: Run, prepared: Prepared) -> float:
     """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over
     scored samples.
+
+    Both are filtered with the same variance of β_DD, once as the network says and once with all
+    angles 1° larger. 1 would mean that the filter follows its network, 0 that it ignores it.
     """
     fitted = hybrid_of(run)
     drives = prepared.estimator_inputs(TEST)
@@ -146,8 +176,10 @@ def shift_of(run: Run, prepared: Prepared) -> float:
 
 
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
-    """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no
-    estimator.
+    """A hybrid whose filter has access to the error of its network's angle at each sample; an
+    oracle, no estimator.
+
+    The variance of β_DD is ε + e², with the floor ε of the hybrid (Eq. 6) and the true error e.
     """
     fitted = hybrid_of(run)
     drives = prepared.estimator_inputs(TEST)

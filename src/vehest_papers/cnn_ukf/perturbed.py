@@ -63,8 +63,19 @@ class Perturbed:
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
-    """A copy of a filter whose cornering stiffnesses are off by shares of their values; raises
-    `DataError` where it has none.
+    """A copy of a filter whose cornering stiffnesses are off by shares of their values.
+
+    Parameters
+    ----------
+    fitted
+        A filter, or a hybrid with one.
+    front, rear
+        Shares, -0.1 for 10 % less.
+
+    Raises
+    ------
+    DataError
+        The estimator has no cornering stiffness.
     """
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
@@ -76,8 +87,13 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
 
 
 def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
-    """A copy of a filter that takes mass and yaw inertia for so many times what they are; its tyres
-    stay as found; raises `DataError`.
+    """A copy of a filter that assumes so many times the mass and the yaw inertia of the car; its
+    tyres stay as identified.
+
+    Raises
+    ------
+    DataError
+        The estimator has no mass.
     """
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
@@ -94,6 +110,15 @@ def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
 def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) -> EnsembleUkf:
     """A copy of a DE-UKF whose p₁ and p₂ (Eq. 11) suit its filter as it is now, by the rule of its
     training.
+
+    Parameters
+    ----------
+    fitted
+        A DE-UKF; its network and its filter stay as they are.
+    recordings
+        With references; the mean over them of the filter's squared error is minimised.
+    seed
+        Of the search, `TRIALS` trials in `STAGES` stages.
     """
     changed = copy.deepcopy(fitted)
     changed.scaling = np.array([0.0, 1.0])
@@ -116,8 +141,11 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
 
 def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
-    """The filters of the study, all seeds, under all perturbations; p₁ and p₂ alone are tuned anew,
-    of the seed that validation chooses.
+    """The filters of the study, all seeds, under all perturbations.
+
+    The outputs of the networks are computed once, since no perturbation of a filter changes them;
+    the test is filtered again under each perturbation. p₁ and p₂ are tuned anew for one condition
+    alone, both stiffnesses off by -10 %, of the seed of the DE-UKF that validation chooses.
     """
     filters = {candidate: runs[candidate] for candidate in WITH_FILTER if candidate in runs}
     fitted = {
@@ -211,7 +239,13 @@ def figure_14(results: Perturbed, data: str) -> Figure:
 
 
 def by_condition(results: Perturbed) -> pd.DataFrame:
-    """MSE_nl of every filter as it is and under every perturbation, with intervals."""
+    """MSE_nl of every filter as it is and under every perturbation, with intervals.
+
+    Returns
+    -------
+    DataFrame
+        A row a condition, a column a candidate; "–" where a candidate has no run of a condition.
+    """
     conditions: dict[str, Runs] = {"as identified": results.stiffness[NOMINAL]}
     conditions |= {
         f"stiffness {label}": runs

@@ -31,7 +31,17 @@ LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     """The test manoeuvre of a group with the largest sideslip angle among those in which the car
-    did not spin; raises `DataError`.
+    did not spin.
+
+    Parameters
+    ----------
+    group
+        One of the names in `vehest_papers.cnn_ukf.manoeuvres.GROUPS`.
+
+    Raises
+    ------
+    DataError
+        The test set has no manoeuvre of the group without a spin.
     """
     peaks = {}
     for span in part.split.tests[TEST]:
@@ -47,7 +57,19 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
 
 
 def compared(runs: Mapping[str, Run], span: Span, number: int, subject: str, data: str) -> Figure:
-    """Reference and all estimates of one manoeuvre."""
+    """Reference and all estimates of one manoeuvre, and their errors below (Figures 7, 9 and 12).
+
+    Parameters
+    ----------
+    runs
+        Candidate -> the run that is drawn.
+    span
+        The manoeuvre.
+    number
+        Of the paper's figure.
+    subject, data
+        Manoeuvre in words, and data sets, for the caption.
+    """
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with new_figure(DOUBLE_COLUMN, 3.9) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
@@ -78,11 +100,23 @@ def inner_life(
     constant: FloatArray,
     data: str,
 ) -> Figure:
-    """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the
-    process noise, distrust (Figure 8).
+    """Outputs of the hybrids' networks in one manoeuvre (Figure 8): β_DD beside β, both deviations
+    of the process noise, distrust.
 
-    ``constant``, (2,), are deviations of the filter's process noise where no network gives them;
-    ``warm_up`` [s] is of the estimates.
+    Parameters
+    ----------
+    runs
+        Candidate -> the run that is drawn; only hybrids are.
+    prepared
+        Recordings, from which the networks' outputs are computed again.
+    warm_up
+        Of the estimates, before the first scored sample [s].
+    span
+        The manoeuvre.
+    constant : array, shape (2,)
+        Deviations of the filter's process noise where no network gives them [m/s, rad/s].
+    data
+        Data sets, for the caption.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if candidate in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
@@ -144,7 +178,9 @@ def inner_life(
 def angles_of_networks(
     runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str
 ) -> Figure:
-    """β of both hybrids and β_DD of their networks (Figure 13)."""
+    """β of both hybrids and β_DD of their networks in one manoeuvre (Figure 13); parameters as of
+    `inner_life`.
+    """
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         axes = figure.subplots()
         _angles(axes, {candidate: run.test[span.recording][0] for candidate, run in runs.items()})
@@ -171,7 +207,11 @@ def angles_of_networks(
 def lap(
     runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str
 ) -> Figure:
-    """Figure 10: angles, accelerations and distrust where a lap has the largest mean |ay|."""
+    """Angles, accelerations and distrust in the part of a lap with the largest mean |ay| (Figure
+    10).
+
+    The part lasts `LAP_SECONDS`, or as long as the lap. Parameters are as of `inner_life`.
+    """
     scored_lap = next(iter(runs.values())).test[span.recording][0]
     length = min(
         round(LAP_SECONDS / float(scored_lap.time[1] - scored_lap.time[0])), len(scored_lap.time)
@@ -248,6 +288,9 @@ def _from_start(part: Scored) -> FloatArray:
 
 
 def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
+    """Draw the reference and each estimate of β over the time from the first scored sample
+    [deg].
+    """
     first = next(iter(parts.values()))
     axes.plot(
         _from_start(first),

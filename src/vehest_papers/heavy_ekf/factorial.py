@@ -141,7 +141,20 @@ def _baselines():  # type: ignore[no-untyped-def]
 def changes(
     cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]
 ) -> dict[tuple[int, tuple[str, str]], Change]:
-    """(position of the cell, pair) -> change, paired over seeds, Holm-corrected over the map."""
+    """Change of the RMSE(β) in each cell for each pair of filters, paired over seeds.
+
+    Parameters
+    ----------
+    cells
+        Of one map.
+    pairs
+        First and second filter; their p-values in all cells are one family of Holm's correction.
+
+    Returns
+    -------
+    dict
+        (position of the cell, pair) -> change.
+    """
     keys = [(position, pair) for position in range(len(cells)) for pair in pairs]
     contrasts = [
         mean_contrast(
@@ -159,6 +172,11 @@ def changes(
 
 
 def _change(contrast: Contrast, p_value: float, level: float, pair: tuple[str, str]) -> Change:
+    """A contrast of logarithms with Holm's correction as a change.
+
+    The interval has the confidence that the correction leaves this cell; the power is that of
+    detecting the paper's ratio at ``level``, that of Bonferroni.
+    """
     factor = max(p_value / contrast.p_value, 1.0) if contrast.p_value > 0 else 0.05 / level
     low, high = contrast.interval(1.0 - (1.0 - CONFIDENCE) / factor)
     outcome = NOT_DIFFERENT

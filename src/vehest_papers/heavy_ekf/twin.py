@@ -185,6 +185,15 @@ def course(
 def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     """A drive of a course, and sensors, that the seed alone decides: the same for all plants of
     equal slip.
+
+    Parameters
+    ----------
+    conditions
+        Rear slip, load, friction and road.
+    seed
+        Of the course and, in a stream of its own, of the sensors' noise.
+    seconds
+        Length of the drive [s].
     """
     generator = np.random.default_rng([seed, 22])
     plant = Plant.of(payload=conditions.payload)
@@ -210,8 +219,14 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
 
 
 def driven(plant: Plant, planned: Course) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States (β, r), (K, 2), road-wheel angle and lateral acceleration (K,) along a course, by
-    Runge and Kutta's fourth order.
+    """Motion of the plant along a course, by Runge and Kutta's fourth order.
+
+    Returns
+    -------
+    states : array, shape (K, 2)
+        β [rad] and r [rad/s] at the plant's steps.
+    steer, lateral : array, shape (K,)
+        Road-wheel angle [rad] and lateral acceleration [m/s²].
     """
     states = np.zeros((len(planned.speed), 2))
     steer = np.zeros(len(planned.speed))
@@ -251,7 +266,12 @@ _axle = numba.njit(rational_axle)
 def _drive(  # type: ignore[no-untyped-def]
     car, tyres, speed, slip, slip_rate, friction, road, step, states, steer, lateral
 ):
-    """Driver and plant; the steering angle stands still during a step."""
+    """Driver and plant over K steps; fills ``states`` (K, 2), ``steer`` and ``lateral`` (K,) in
+    place.
+
+    At each step the driver moves the steering angle towards the wanted one (`_steering`), within
+    its rate and range, and holds it while the plant moves.
+    """
     angle = 0.0
     for k in range(len(speed)):
         u = speed[k]
@@ -299,7 +319,11 @@ def rates(car, tyres, u, mu, pull, angle, sideslip, yaw_rate):  # type: ignore[n
 def _steering(  # type: ignore[no-untyped-def]
     car, tyres, u, mu, pull, slip, slip_rate, sideslip, yaw_rate
 ):
-    """Road-wheel angle by which the driver turns the rear axle's slip towards the wanted one."""
+    """Road-wheel angle by which the driver turns the rear axle's slip towards the wanted one.
+
+    The wanted yaw rate and front force are those of the module's docstring. The force is limited to
+    `FRONT_SHARE` of the largest, and the slip angle that gives it is the smaller solution of Eq. 4.
+    """
     mass, inertia, front_arm, rear_arm = car
     rear_slip = rear_arm * yaw_rate / u - sideslip
     rear = _axle(rear_slip, tyres[2], tyres[3], mu).force

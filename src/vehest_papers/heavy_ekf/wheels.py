@@ -57,7 +57,22 @@ def wheel_sums(part: PartArtefacts) -> dict[str, dict[str, tuple[FloatArray, ...
 def block_sums(
     drive: Recording, wheels: SpeedFromWheels
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums over blocks of 10 s: variances of the wheels, measured and corrected; samples."""
+    """Sums over blocks of 10 s of one drive; samples of a slow car do not count.
+
+    Parameters
+    ----------
+    drive
+        With the four wheel speeds [rad/s], and what their correction needs.
+    wheels
+        Correction of the wheel speeds (Eqs. 61 to 64), with its tracks.
+
+    Returns
+    -------
+    tuple of array
+        Variance over the four wheels of the measured and of the corrected speeds, summed over the
+        samples of each block [m²/s²], and the number of its samples; blocks without samples are
+        left out.
+    """
     is_moving = (drive["vx_ref"] > MIN_SPEED).astype(np.float64)
     measured = wheels.wheel_radius * drive.stack([f"wheel_speed_{wheel}" for wheel in WHEELS]).T
     starts = np.arange(0, len(drive), round(BLOCK_SECONDS * drive.rate_hz))

@@ -91,7 +91,7 @@ def blocks_of(rows: Iterable[BlockRow], source: str = "errors by block") -> dict
 
     Parameters
     ----------
-    where
+    source
         What an error names: the file that the rows are from.
 
     Raises

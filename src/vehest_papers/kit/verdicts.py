@@ -164,7 +164,17 @@ def exponent_of(metric: str) -> float:
 
 
 def paired_errors(first: BlockErrors, second: BlockErrors, metric: str, test_set: str) -> Pair:
-    """Errors of two candidates in the blocks that both have samples in.
+    """Errors of two candidates in the blocks that both have samples in, and in which both are
+    finite.
+
+    Parameters
+    ----------
+    first, second
+        On the same blocks, in any order.
+    metric
+        Of both.
+    test_set
+        What an error message names.
 
     Raises
     ------
@@ -194,7 +204,22 @@ def paired_errors(first: BlockErrors, second: BlockErrors, metric: str, test_set
 
 
 def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]:
-    """Logarithm of an error pooled over blocks and seeds, and the error with its 95 % interval."""
+    """An error pooled over blocks and seeds, and its logarithm for tests.
+
+    Parameters
+    ----------
+    errors
+        Of one candidate; blocks in which a seed is not finite are left out.
+    metric
+        Its name, which says whether the error is a root of pooled squares (`exponent_of`).
+
+    Returns
+    -------
+    contrast : Contrast or None
+        Logarithm of the error; None with too few blocks for an interval, or an error of 0.
+    figure : Figure
+        The error with its 95 % interval, in its unit.
+    """
     chosen = np.isfinite(errors.sums).all(axis=0) & (errors.sizes > 0)
     sums = errors.sums[:, chosen]
     sizes = errors.sizes[chosen]
@@ -222,12 +247,21 @@ def ratio_of(pair: Pair) -> Figure:
 def judge_paper(
     paper: Paper, blocks: Mapping[Key, BlockErrors] | None, training: Mapping[str, Training]
 ) -> dict[str, Judgement]:
-    """Verdicts on all claims, id -> judgement; p-values of orders are corrected within families.
+    """Verdicts on all claims; p-values of orders are corrected within families.
 
     Parameters
     ----------
+    paper
+        Its claims.
     blocks : mapping or None
-        None where the study has no blocks.csv.
+        Errors by block and seed; None where the study has no blocks.csv.
+    training
+        Candidate -> how far it was trained.
+
+    Returns
+    -------
+    dict
+        id of the claim -> judgement.
     """
     ordered = _orders_of(paper, blocks or {})
     return {

@@ -1,10 +1,17 @@
 """What claims of the paper measure beside errors: values by block and seed, one function a kind of
 claim.
 
+Each function of a claim receives the claim and the parts of the study by name, and returns the
+values from which `vehest_papers.kit.verdicts` judges the claim, S seeds by B blocks. It returns
+None where a candidate, or a part that the claim needs, is not trained. What is measured of the
+trained weights alone has a single block, `WEIGHTS`.
+
 A ratio of two pooled errors is given by block as its linearisation: the mean over blocks is the
 ratio (or its logarithm), the spread that of a ratio of sums. Two tests have different blocks: both
 are cut into equally many segments, whose k-th are paired. As segments of two tests are independent,
 the variance of the difference is the sum of both.
+
+FVU is the fraction of the variance of v that an estimate leaves unexplained.
 """
 
 from __future__ import annotations
@@ -42,7 +49,15 @@ WEIGHTS = ("weights",)  # the only block of what is measured of trained weights
 
 @dataclass(frozen=True, eq=False)
 class ByBlock:
-    """A value of each seed and block."""
+    """A value of each seed and block.
+
+    Attributes
+    ----------
+    blocks : sequence of str
+        Names of the B blocks; unique within a test set.
+    values : array, shape (S, B)
+        Not finite where a seed diverged in a block.
+    """
 
     blocks: Sequence[str]
     values: FloatArray  # (S, B)
@@ -75,16 +90,28 @@ def log_values(sums: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 def as_ratio(logs: FloatArray) -> FloatArray:
-    """Linearised logarithms as a linearised ratio: the mean is exp(mean)."""
+    """Linearised logarithms as a linearised ratio.
+
+    Parameters
+    ----------
+    logs : array, shape (S, B)
+        As of `log_values`, or a difference of two of them, with mean m.
+
+    Returns
+    -------
+    array, shape (S, B)
+        exp(m) (1 + logs - m), whose mean is the ratio exp(m).
+    """
     mean = logs.mean()
     return np.asarray(np.exp(mean) * (1.0 + logs - mean), dtype=np.float64)
 
 
 def smallest_car_ratio(claim: Claim, parts: Parts) -> ByBlock | None:
-    """FVU on the other car over that on the own one, of the structure in which the ratio is
+    """FVU on the other car over that on the training car, of the structure in which the ratio is
     smallest.
 
     That all ratios lie above a limit is tested by the smallest alone (an intersection-union test).
+    Blocks are segments of both tests, the k-th of one paired with the k-th of the other.
     """
     scheme = parts[claim.part]
     errors = scheme.errors(scheme.training_test)
@@ -100,8 +127,11 @@ def smallest_car_ratio(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def relative_car_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """FVU on the other car over that on the own one, of the candidate over that of the other
+    """FVU on the other car over that on the training car, of the candidate over that of the other
     candidate.
+
+    The ratio of ratios is exact in each block: the exponential of the difference of both linearised
+    logarithms.
     """
     scheme = parts[claim.part]
     names = [scheme.name_of(name) for name in claim.names]
@@ -133,8 +163,11 @@ def _segment_names(number: int) -> list[str]:
 
 
 def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Rank correlation over structures of the number of parameters and the error about its mean, in
-    each block with each seed.
+    """Spearman's rank correlation over structures of the number of parameters and the error.
+
+    The error of a structure in a block is the sum of its squares about the mean error, so that one
+    correlation is given for each seed and block. Luenberger observers, which are tuned and not
+    trained, are left out. None with fewer than `MIN_STRUCTURES` structures.
     """
     scheme = parts[claim.part]
     errors = scheme.errors(claim.test_set)
@@ -164,7 +197,11 @@ def parameter_rank_correlations(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def specialised_over_others(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Lowest FVU of the candidate's structures over the lowest of all others."""
+    """Lowest FVU of the candidate's structures over the lowest of all others.
+
+    The two structures are those with the lowest FVU over the test set itself; the ratio is
+    linearised by block.
+    """
     scheme = parts[claim.part]
     errors = scheme.errors(claim.test_set)
     names = {name: category for name, category in scheme.structures().items() if name in errors}
@@ -195,6 +232,12 @@ def ax_noise_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def _noise_ratios(claim: Claim, parts: Parts, channel: str) -> ByBlock | None:
+    """Gain of a network from noise of a channel to v̂ over that of the observer, one value a seed.
+
+    Gains are the closed forms of `sensitivity_of` up to `MAX_HZ`, at each of `YAW_RATES`, of which
+    the larger ratio counts. A yaw rate at which the observer is reset, and so passes nothing, is
+    left out.
+    """
     scheme = parts[claim.part]
     observer = behaviour.luenberger_of(scheme)
     place = CHANNELS.index(channel)
@@ -243,6 +286,10 @@ def band_powers(scheme: Scheme, model: EvaluatedModel, test: str) -> tuple[list[
 def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     """Power of the errors over that of Luenberger or LSTM, of the band and benchmark in which the
     ratio is largest.
+
+    Blocks are the segments of `band_powers`, bands those of `BANDS_HZ`; as in `smallest_car_ratio`,
+    one ratio stands for all, so that a claim on every band is tested by the worst. None with fewer
+    than `MIN_SEGMENTS` segments.
     """
     scheme = parts[claim.part]
     powers = []
@@ -270,7 +317,10 @@ def largest_band_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     """Operations of a step over the smaller number of GRU and LSTM, of the structures that
-    validation chooses in scheme 1.
+    validation chooses in scheme 1 (Section VIII-G of the paper).
+
+    Additions and multiplications count, sigmoids and hyperbolic tangents do not
+    (`cost.operations`). Seeds of a structure cost the same, so that all values are equal.
     """
     scheme = parts.get("scheme_1")
     if scheme is None:
@@ -292,6 +342,9 @@ def operation_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 def regularisation_loss_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
     """FVU without over FVU with validation on the other car, of the candidate over that of the
     other candidate.
+
+    Without: the part of the claim, whose training validates on its own car. With: scheme 2, on the
+    same blocks.
     """
     without, regularised = parts[claim.part], parts.get("scheme_2")
     if regularised is None:
@@ -316,23 +369,32 @@ def regularisation_loss_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def leaks_at_zero_yaw_rate(claim: Claim, parts: Parts) -> ByBlock | None:
-    """γ₁ of the local model at ω = 0."""
+    """γ₁ of the local model at ω = 0, the leak of the integrator of v (Eq. 7a); one value a
+    seed.
+    """
     return _of_local_models(claim, parts, lambda models: models.gamma[0, 0])
 
 
 def leak_differences(claim: Claim, parts: Parts) -> ByBlock | None:
-    """γ₁ of the last local model less that of the first."""
+    """γ₁ of the last local model, at the largest |ω|, less that of the first at ω = 0; one value a
+    seed.
+    """
     return _of_local_models(claim, parts, lambda models: models.gamma[-1, 0] - models.gamma[0, 0])
 
 
 def slip_rate_weights(claim: Claim, parts: Parts) -> ByBlock | None:
-    """The largest β₁ of all local models."""
+    """The largest β₁ of all local models, the weight of the slip rate a_y - ω u in v (Eq. 7a); one
+    value a seed.
+    """
     return _of_local_models(claim, parts, lambda models: models.beta[:, 0].max())
 
 
 def _of_local_models(
     claim: Claim, parts: Parts, value: Callable[[LocalModels], float]
 ) -> ByBlock | None:
+    """A number of the local models of each seed that is a KS-NN; None where there is no such
+    seed.
+    """
     networks = [
         load_model(model.model_folder) for model in _models(parts[claim.part], claim.candidate)
     ]
@@ -341,7 +403,12 @@ def _of_local_models(
 
 
 def first_sub_model_shares(claim: Claim, parts: Parts) -> ByBlock | None:
-    """RMS of the first sub-model over that of the estimate."""
+    """RMS of the first sub-model over that of the estimate (Eq. 11).
+
+    The first sub-model integrates the slip rate. Squares of both are summed over the scored samples
+    of each segment, then over the blocks of the test set; half of the linearised logarithm of their
+    ratio is that of the root.
+    """
     scheme = parts[claim.part]
     models = _models(scheme, claim.candidate)
     if not models:
@@ -372,7 +439,11 @@ def first_sub_model_shares(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def stopping_epochs(claim: Claim, parts: Parts) -> ByBlock | None:
-    """Passes over the training windows after which training stopped, of each seed."""
+    """Passes over the training windows after which training stopped, one value a seed.
+
+    Where an epoch takes ``epoch_steps`` batches instead of all windows, its epochs are converted to
+    passes by the windows of an epoch over the samples of the training drives.
+    """
     scheme = parts[claim.part]
     name = scheme.key_of(str(claim.candidate))
     runs = scheme.runs
@@ -389,7 +460,11 @@ def stopping_epochs(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
-    """RMSE of v of networks trained on windows of 60 samples over that of those trained on 30."""
+    """RMSE of v of networks trained on windows of 60 samples over that of those trained on 30.
+
+    Both are scored where a window of 60 samples is full, so that they differ in the network alone.
+    Blocks are stretches of `SEGMENT_SECONDS`.
+    """
     scheme = parts[claim.part]
     longer = parts.get(f"window_60_{claim.part[-1]}")
     candidate = str(claim.candidate)
@@ -407,7 +482,19 @@ def longer_window_ratios(claim: Claim, parts: Parts) -> ByBlock | None:
 
 
 def after_longest_window(scheme: Scheme, model: EvaluatedModel, test: str) -> list[Scored]:
-    """Estimate and reference where a window of `MAX_WINDOW` samples is full."""
+    """Estimate and reference where a window of `MAX_WINDOW` samples is full.
+
+    Parameters
+    ----------
+    test : str
+        Test set of the scheme.
+
+    Returns
+    -------
+    list of Scored
+        One for each range of the test set, without the samples of the first `MAX_WINDOW` intervals
+        of the range.
+    """
     spans = scheme.part.split.tests[test]
     recordings = recordings_of(scheme.part, spans)
     seconds = MAX_WINDOW / scheme.part.protocol.rate_hz + 0.5 / scheme.part.protocol.rate_hz
@@ -418,7 +505,9 @@ def after_longest_window(scheme: Scheme, model: EvaluatedModel, test: str) -> li
 
 
 def fvu_after_longest_window(scheme: Scheme, candidate: str, test: str) -> float:
-    """FVU on those samples, mean over seeds; NaN where the candidate is not there."""
+    """FVU on the samples of `after_longest_window`, mean over seeds; NaN where the candidate is not
+    trained.
+    """
     values = []
     for model in _models(scheme, candidate):
         scored = after_longest_window(scheme, model, test)

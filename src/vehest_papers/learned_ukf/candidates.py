@@ -79,12 +79,17 @@ def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
 def runs_of(part: PartArtefacts) -> pd.DataFrame:
     """One row a run, candidates in the order of Table II.
 
-    Columns: candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and for
-    each test set ``METRIC.SET`` of `ACCURACY` and `CONSISTENCY`; the latter are NaN for methods
-    without.
+    Returns
+    -------
+    DataFrame
+        Columns candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and
+        for each test set ``METRIC.SET`` of `ACCURACY` and `CONSISTENCY`; the latter are NaN for
+        methods without.
 
-    Raises:
-        DataError: a metric is missing.
+    Raises
+    ------
+    DataError
+        A metric is missing.
     """
     values = metric_values(part)
     rows = []

@@ -57,8 +57,14 @@ def loaded(model: EvaluatedModel) -> LearnedUkf:
 
 
 def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
-    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...); raises
-    `ConfigurationError` or `DataError`.
+    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...).
+
+    Raises
+    ------
+    ConfigurationError
+        The part is not scored in sequences, or at another rate than the filter's.
+    MissingError, DataError
+        A recording is missing; one is damaged.
     """
     if (
         part.protocol.sequence_seconds is None
@@ -96,12 +102,21 @@ def filtered(
     """All sequences filtered together from the true state of their first sample, as the protocol
     has it.
 
-    Args:
-        estimator: its noise is used, and its models unless another is given. model: that moves and
-        observes points instead. repair: whether covariances that lose definiteness are repaired;
-        otherwise their sequences become NaN. friction: that the filter starts from; none: as its
-        settings say. deviation: standard deviation of the friction at the start; none: what was
-        learnt.
+    Parameters
+    ----------
+    estimator
+        Its noise is used, and its models unless another is given.
+    drives
+        Sequences side by side, (B, T, ...).
+    model
+        Moves points and expects measurements instead of the estimator's models.
+    repair
+        Whether covariances that lose definiteness are repaired; otherwise their sequences become
+        NaN.
+    friction
+        Friction that the filter starts from; None: as its settings say.
+    deviation
+        Standard deviation of the friction at the start; None: as it was trained.
     """
     s = estimator.settings
     start = drives.states[:, 0].clone()
@@ -129,15 +144,30 @@ def lost_sequences(estimator: LearnedUkf, drives: Drive) -> NDArray[np.bool_]:
 
 
 def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> NonlinearFiltered:
-    """Predict with one filter's model and noise, observe with the other's model."""
+    """Filter all sequences with the model and the noise of one filter in the prediction, and the
+    model of another in the observation (Figure 6).
+    """
     with torch.no_grad():
         model = Swapped(predicting.filter.point_model(), observing.filter.point_model())
     return filtered(predicting, drives, model)
 
 
 def squares_of(means: torch.Tensor, drives: Drive, skip: int) -> FloatArray:
-    """Mean squared error of each of `MOVING` in each sequence, the first steps of it left out; (B,
-    4).
+    """Mean squared error of each of `MOVING` in each sequence.
+
+    Parameters
+    ----------
+    means : Tensor
+        Filtered states, (B, T, n).
+    drives
+        Sequences with their true states.
+    skip
+        Number of first samples of each sequence that are not scored.
+
+    Returns
+    -------
+    array, shape (B, 4)
+        In the squared units of the states.
     """
     errors = (means - drives.states)[:, skip:, : len(MOVING)].double()
     return np.asarray(errors.square().mean(dim=1).numpy(), dtype=np.float64)

@@ -63,14 +63,37 @@ class Tracks:
 
 
 def settled(outside: np.ndarray, rate_hz: float) -> FloatArray:
-    """Time after the last sample that is outside, (..., T) -> (...) [s]; 0 where none is."""
+    """Time from which nothing is outside any more.
+
+    Parameters
+    ----------
+    outside : array, shape (..., T)
+        Whether each sample is outside.
+    rate_hz
+        Of the samples [Hz].
+
+    Returns
+    -------
+    array, shape (...)
+        Time after the last sample that is outside [s]; 0 where none is.
+    """
     steps = outside.shape[-1]
     last = steps - np.argmax(outside[..., ::-1], axis=-1)
     return np.where(outside.any(axis=-1), last, 0) / rate_hz
 
 
 def tracks_of(filters: Sequence[LearnedUkf], drives: Drive, start: float) -> Tracks:
-    """Filter all sequences with every seed from a friction."""
+    """Filter all sequences with every seed, started from a friction.
+
+    Parameters
+    ----------
+    filters
+        One for each of S seeds, with the friction as their last state.
+    drives
+        B sequences of T samples.
+    start
+        Friction at the first sample [1].
+    """
     parts = [filtered(estimator, drives, friction=start).steps.filtered for estimator in filters]
     means = np.stack([part.mean[..., -1].double().numpy() for part in parts])
     variances = np.stack([part.covariance[..., -1, -1].double().numpy() for part in parts])

@@ -53,6 +53,16 @@ def compared(
 ) -> dict[str, Compared]:
     """Losses of both models as predictors and in their filters, and of all four filters that can be
     put together of them.
+
+    Parameters
+    ----------
+    pairs
+        Seed -> NNTF and NNTF_U of that seed.
+    drives
+        Test set -> its sequences.
+    protocol
+        Of which the seconds that are not scored are used; one-step predictions are scored from the
+        first sample on.
     """
     skip = round(protocol.skip_seconds * protocol.rate_hz)
     by_test = {}
@@ -80,12 +90,15 @@ def compared(
 def frames(
     by_test: Mapping[str, Compared], seeds: Sequence[int]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """What is drawn.
+    """The values behind Figures 5 and 6.
 
-    Returns:
-        One row a test set, seed, state and task: ``before``, ``after`` (mean squared errors of NNTF
-        and NNTF_U), ``decrease`` [%]. One row a test set, seed, ``predicts`` and ``observes``:
-        ``mse`` (weighted).
+    Returns
+    -------
+    states : DataFrame
+        One row a test set, seed, state and task: ``before`` and ``after``, the mean squared errors
+        of NNTF and NNTF_U, and ``decrease`` [%].
+    swaps : DataFrame
+        One row a test set, seed, ``predicts`` and ``observes``: ``mse`` (weighted).
     """
     names = (BEFORE, AFTER)
     states = []

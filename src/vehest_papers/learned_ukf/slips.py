@@ -24,9 +24,12 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
     """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves;
     (K,) [deg].
 
-    Args:
-        recordings: with ``vx_ref``, ``vy_ref``, ``yaw_rate_ref``.
-        cg_to_rear_axle: l_r [m].
+    Parameters
+    ----------
+    recordings
+        With ``vx_ref``, ``vy_ref``, ``yaw_rate_ref``.
+    cg_to_rear_axle
+        l_r [m].
 
     Source: Węgrzynowski et al. 2024, Section III-B.2.
     """

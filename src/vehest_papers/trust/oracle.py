@@ -172,14 +172,25 @@ Test = Callable[[FloatArray], FloatArray]
 
 
 def signature_test(signature: FloatArray, covariance: FloatArray) -> Test:
-    """N(s_k, S) against N(0, S): s_kᵀS⁻¹(ε_k + s_k) - ½ s_kᵀS⁻¹s_k."""
+    """Test for a known signature: N(s_k, S) against N(0, S), s_kᵀS⁻¹(ε_k + s_k) - ½ s_kᵀS⁻¹s_k.
+
+    Parameters
+    ----------
+    signature : array, shape (T, C)
+        s_k, the effect of the fault on the innovations.
+    covariance : array, shape (C, C)
+        S of the innovations.
+    """
     weighted = np.linalg.solve(covariance, signature.T).T
     half = 0.5 * np.einsum("ti,ti->t", weighted, signature)
     return lambda received: np.einsum("ti,ti->t", weighted, received) - half
 
 
 def _random_test(signature: FloatArray, covariance: FloatArray) -> Test:
-    """N(0, S + Q) against N(0, S), Q the mean of s_k s_kᵀ."""
+    """Test for a random signature: N(0, S + Q) against N(0, S), Q the mean of s_k s_kᵀ.
+
+    ½ εᵀ(S⁻¹ - (S + Q)⁻¹)ε - ½ ln(|S + Q|/|S|) at each sample; parameters as of `signature_test`.
+    """
     larger = covariance + signature.T @ signature / len(signature)
     difference = np.linalg.inv(covariance) - np.linalg.inv(larger)
     grown = 0.5 * float(np.linalg.slogdet(larger)[1] - np.linalg.slogdet(covariance)[1])
@@ -200,7 +211,18 @@ def learn_oracle(
     channels: Sequence[str],
     rate_hz: float,
 ) -> Oracle:
-    """Fit relations and autoregression to training drives at ``rate_hz`` [Hz].
+    """Fit relations and autoregression to training drives.
+
+    Parameters
+    ----------
+    train
+        Drives to which relations, autoregression and noise levels are fitted.
+    validation
+        Further healthy drives; the threshold is set on them and on ``train``.
+    channels
+        C of them, which all drives have.
+    rate_hz
+        Of all drives [Hz].
 
     Raises
     ------
@@ -242,7 +264,11 @@ def learn_oracle(
 
 
 def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:
-    """Signature in the innovations, (T, C), of one added to samples, zero before its first row."""
+    """Effect of a signature on the innovations, (T, C).
+
+    s_k = b_k - Σ_l A_l b_{k-l}, with the coefficients A_l of the autoregression and the signature b
+    of the channels, (T, C), which is zero before its first row.
+    """
     innovations = np.array(signature, dtype=np.float64)
     for lag, coefficient in enumerate(model.coefficients, start=1):
         innovations[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T

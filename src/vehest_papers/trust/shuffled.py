@@ -96,7 +96,20 @@ def share_if_shuffled(
 ) -> float:
     """Share of draws in which the interval of the test contains 0.90, with shuffled manoeuvres.
 
-    NaN with fewer than `MIN_MANOEUVRES`.
+    In each draw the manoeuvres of both are dealt anew, as many to the calibration as it has. The
+    factor of the band is their `pooled_quantile`, and the coverage of the others is tested.
+
+    Parameters
+    ----------
+    calibration, test
+        Errors over half widths on the range that bands are calibrated on, and on the test.
+    draws, seed
+        Number of draws, and seed of their random numbers.
+
+    Returns
+    -------
+    float
+        NaN with fewer than `MIN_MANOEUVRES` on either side.
     """
     if min(calibration.n_manoeuvres, test.n_manoeuvres) < MIN_MANOEUVRES:
         return float("nan")

@@ -68,11 +68,17 @@ def normalised_innovations(steps: Filtered[Tensor]) -> tuple[FloatArray, FloatAr
 
 
 class SigmaPointStepper(Stepper):
-    """The filter of such an estimator, one sample at a time."""
+    """The filter of such an estimator, one sample at a time.
+
+    Attributes
+    ----------
+    filter : UnscentedStepper or None
+        The filter with its state; None before the first sample.
+    """
 
     def __init__(self, estimator: SigmaPointEstimator) -> None:
         self._estimator = estimator
-        self._filter: UnscentedStepper | None = None
+        self.filter: UnscentedStepper | None = None
         self._memory: dict[str, Any] = {}
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -82,16 +88,16 @@ class SigmaPointStepper(Stepper):
         """
         estimator = self._estimator
         step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
-        if self._filter is None:
-            self._filter = estimator.new_filter(step)
-        dtype = self._filter.state.mean.dtype
+        if self.filter is None:
+            self.filter = estimator.new_filter(step)
+        dtype = self.filter.state.mean.dtype
         of_vy = estimator.states.index("vy")
-        mean = self._filter.step(
+        mean = self.filter.step(
             step.measurement.astype(dtype),
             step.inputs.astype(dtype),
             step.process_noise,
             step.observation_noise,
         )
         return dict(zip(estimator.states, mean.tolist(), strict=True)) | {
-            "vy_variance": float(self._filter.state.covariance[of_vy, of_vy])
+            "vy_variance": float(self.filter.state.covariance[of_vy, of_vy])
         }

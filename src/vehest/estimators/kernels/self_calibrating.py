@@ -259,7 +259,7 @@ def _update(f, residual, variance, gate, learns, states):
 
 
 @part()
-def _tanh(x):
+def precise_tanh(x):
     """tanh to 1e-15: Lambert's continued fraction n/d at x/8, then tanh(2y) = 2nd/(d² + n²) thrice.
 
     See `activation.rational_tanh`.
@@ -303,10 +303,10 @@ def _network(theta, yaw_rate_max, series, first, steps, dt):
             for q in range(n_hidden):
                 lateral = 8 + 3 * q
                 longitudinal = 8 + 3 * (n_hidden + q)
-                f1 += theta[m, lateral + 2] * _tanh(
+                f1 += theta[m, lateral + 2] * precise_tanh(
                     theta[m, lateral] * error + theta[m, lateral + 1]
                 )
-                f2 += theta[m, longitudinal + 2] * _tanh(
+                f2 += theta[m, longitudinal + 2] * precise_tanh(
                     theta[m, longitudinal] * error + theta[m, longitudinal + 1]
                 )
             next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)

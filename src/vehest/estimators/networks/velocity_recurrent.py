@@ -2,7 +2,8 @@
 
 It trains them on sequences, estimates, and runs them online.
 
-    recordings --`_Drives`--> tensors (N, C) --cut, padded--> `_Batch` --`VelocityNetwork`--> loss
+    recordings --`DriveTensors`--> tensors (N, C) --cut, padded--> `SequenceBatch`
+        --`VelocityNetwork`--> loss
     recording --run, SAMPLES_TOGETHER at a time, the state carried on--> velocities
 
 Without ``truncate_steps`` an epoch has sequences of one length at random places. With it, drives
@@ -271,13 +272,13 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     ) -> FitRecord:
         """Train on sequences."""
         train, validation = (
-            _Drives(self, part, getattr(torch, training.dtype))
+            DriveTensors(self, part, getattr(torch, training.dtype))
             for part in (data.train, data.validation)
         )
         network = self.network = self.new_network().to(getattr(torch, training.dtype))
         network.standardise(data.train, self.inputs, self.learns_from)
         network.reset(torch.Generator().manual_seed(self.fit_seed))
-        phase = _phase(network, self.settings, training, train, validation)
+        phase = sequence_phase(network, self.settings, training, train, validation)
         (record,) = train_phases(
             [phase], self.fit_seed, context, index, training.checkpoint_seconds
         )
@@ -357,8 +358,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         }
 
 
-class _Batch(NamedTuple):
-    """Sequences side by side."""
+class SequenceBatch(NamedTuple):
+    """Sequences side by side, B sequences of T samples with C channels and O outputs."""
 
     starts: Tensor  # velocities to start from, (B, O)
     inputs: Tensor  # measurements, (B, T, C)
@@ -369,7 +370,7 @@ class _Batch(NamedTuple):
     # whether the batch continues the one before, whose hidden state it starts from
     goes_on: bool = False
 
-    def stretch(self, first: int, end: int) -> _Batch:
+    def stretch(self, first: int, end: int) -> SequenceBatch:
         """The batch restricted to samples ``first`` to ``end``."""
         parts = {name: getattr(self, name) for name in ("inputs", "targets", "mask", "counted")}
         return self._replace(
@@ -377,7 +378,7 @@ class _Batch(NamedTuple):
             **{name: part[:, first:end] for name, part in parts.items() if part is not None},
         )
 
-    def scaled(self, input_factors: Tensor, output_factors: Tensor) -> _Batch:
+    def scaled(self, input_factors: Tensor, output_factors: Tensor) -> SequenceBatch:
         """The batch with channels times factors, (B, C), and outputs times factors, (B, O)."""
         return self._replace(
             inputs=self.inputs * input_factors.unsqueeze(1),
@@ -386,8 +387,18 @@ class _Batch(NamedTuple):
         )
 
 
-class _Drives:
-    """Recordings one after another as tensors, (N, …), from which sequences are cut."""
+class DriveTensors:
+    """Recordings one after another as tensors, from which sequences are cut.
+
+    Attributes
+    ----------
+    names, lengths : list
+        Id and number of samples of each recording.
+    starts, targets : Tensor
+        Measured velocities to start from and references, (N, O) [m/s, rad/s].
+    inputs : Tensor
+        Measurements, (N, C) [SI].
+    """
 
     def __init__(
         self,
@@ -413,10 +424,12 @@ class _Drives:
         places: Tensor,
         mask: Tensor | None = None,
         counted: Tensor | None = None,
-    ) -> _Batch:
+    ) -> SequenceBatch:
         """Sequences of the samples at ``places``, (T,) or (B, T), after rows ``firsts`` (B,)."""
         rows = firsts.unsqueeze(1) + places
-        return _Batch(self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted)
+        return SequenceBatch(
+            self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted
+        )
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
         """All drives, cut whole at random places into pieces of ``steps`` samples and less.
@@ -434,7 +447,7 @@ class _Drives:
             offset += length
         return torch.tensor(spans)
 
-    def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
+    def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> SequenceBatch:
         """Pieces of different lengths side by side, as long as the longest.
 
         What is beyond a piece's end does not count.
@@ -445,7 +458,7 @@ class _Drives:
         counted = ((places >= dropped) & (places < ends)).to(self.inputs.dtype)
         return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
 
-    def for_validation(self, training: SequenceSettings) -> list[_Batch]:
+    def for_validation(self, training: SequenceSettings) -> list[SequenceBatch]:
         """Sequences without overlap from the start of each recording.
 
         Of one that is too short, all of it.
@@ -467,12 +480,12 @@ class _Drives:
         return batches
 
 
-def _phase(
+def sequence_phase(
     network: VelocityNetwork,
     settings: Any,
     training: SequenceSettings,
-    train: _Drives,
-    validation: _Drives,
+    train: DriveTensors,
+    validation: DriveTensors,
 ) -> Phase:
     """Weighted squared errors over sequences at random places of the drives.
 
@@ -506,7 +519,7 @@ def _phase(
     ]
     carried: list[State] = []
 
-    def errors(batch: _Batch, dropped: int) -> Tensor:
+    def errors(batch: SequenceBatch, dropped: int) -> Tensor:
         """Weighted squared errors (B, T - dropped); remembers the last state for the next
         stretch.
         """
@@ -531,7 +544,7 @@ def _phase(
         )
         return is_active.to(dtype) / (1.0 - settings.dropout)
 
-    def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
+    def mirrored(batch: SequenceBatch, generator: torch.Generator) -> SequenceBatch:
         """A batch in which each sequence is mirrored with the probability of the settings."""
         if not training.mirrored:
             return batch
@@ -539,7 +552,7 @@ def _phase(
         inputs, outputs = (torch.where(turned, sign, 1.0) for sign in signs)
         return batch.scaled(inputs, outputs)
 
-    def batches(generator: torch.Generator) -> Iterator[_Batch]:
+    def batches(generator: torch.Generator) -> Iterator[SequenceBatch]:
         """Batches of sequences of one length, each starting from measured velocities."""
         for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):
             yield mirrored(
@@ -547,7 +560,7 @@ def _phase(
                 generator,
             )
 
-    def stretches(generator: torch.Generator) -> Iterator[_Batch]:
+    def stretches(generator: torch.Generator) -> Iterator[SequenceBatch]:
         """Batches of pieces, each yielded in parts of ``truncated`` samples that continue each
         other.
         """
@@ -565,7 +578,7 @@ def _phase(
             for first in range(0, longest, truncated):
                 yield batch.stretch(first, first + truncated)
 
-    def loss(batch: _Batch) -> Tensor:
+    def loss(batch: SequenceBatch) -> Tensor:
         """Mean weighted squared error over the samples that count."""
         if batch.counted is None:
             return errors(batch, training.dropped_steps).mean()

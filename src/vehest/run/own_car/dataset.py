@@ -141,9 +141,7 @@ def draft(examined: Examined) -> Draft:
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
     notes += _cuts(dataset, recordings)
-    used_ratio = vehicle["steering_ratio"] or (
-        ratio[0] if ratio and ratio[1] <= MAX_RATIO_UNCERTAINTY * abs(ratio[0]) else None
-    )
+    used_ratio = vehicle["steering_ratio"] or (ratio[0] if ratio and is_certain(*ratio) else None)
     if ratio and used_ratio is None:
         notes.append(
             "'steer' is left out: the steering ratio estimated from slow corners is "
@@ -177,6 +175,11 @@ def draft(examined: Examined) -> Draft:
         notes,
         {recording.id: recording.duration for recording in recordings},
     )
+
+
+def is_certain(ratio: float, uncertainty: float) -> bool:
+    """Whether an estimated steering ratio is certain enough to be used."""
+    return uncertainty <= MAX_RATIO_UNCERTAINTY * abs(ratio)
 
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
@@ -395,12 +398,10 @@ def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> di
     """
     unit = proposal.unit
     factor = proposal.factor
-    si = CHANNELS[proposal.channel].unit
     if factor == 1.0 and (header_unit := plain_unit(header)) and header_unit != unit:
-        unit, factor = (
-            header_unit,
-            float(f"{factor_to_si(unit, si) / factor_to_si(header_unit, si):.7g}"),
-        )
+        si = CHANNELS[proposal.channel].unit
+        factor = float(f"{factor_to_si(unit, si) / factor_to_si(header_unit, si):.7g}")
+        unit = header_unit
     sign = {"sign": proposal.sign} if proposal.sign != 1 else {}
     return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 

@@ -201,7 +201,7 @@ def inspect(
     ]
     shadowed = (
         [f"'{name}' is also a built-in data set; in this folder the name refers to yours"]
-        if name in choices("dataset")
+        if name in choices("dataset") and not existing
         else []
     )
     proposals = replace(
@@ -210,7 +210,7 @@ def inspect(
             *proposals.notes,
             *computed,
             *_notes(longest, logs),
-            *(shadowed if not existing else []),
+            *shadowed,
         ),
     )
     timed = longest.seconds is not None or any(
@@ -374,15 +374,13 @@ def _evidence(
         n_used = (n_rows - 2 * cut) // factor * factor
         samples = samples[:, cut : cut + n_used].reshape(len(samples), -1, factor).mean(axis=2)
         rate = rate / factor
-        samples = _busiest(samples, round(MAX_EVIDENCE_SECONDS * rate), max(round(60.0 * rate), 1))
-    columns = [
-        (column, values)
-        for column, values in zip(log.columns, samples, strict=True)
-        if column.name not in differences
-    ]
+        samples = busiest_rows(
+            samples, round(MAX_EVIDENCE_SECONDS * rate), max(round(60.0 * rate), 1)
+        )
     return [
         (column.name, plain_unit(column.unit) or "", values, column.device)
-        for column, values in columns
+        for column, values in zip(log.columns, samples, strict=True)
+        if column.name not in differences
     ], rate
 
 
@@ -391,17 +389,12 @@ def _differences(log: Log) -> dict[str, str]:
     name; no acceleration was measured.
     """
     signals = [column for column in log.columns if column.stamps is None]
-    middle = (
-        log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MAX_COMPARED_ROWS) // 2, 0)
-        if signals
-        else 0
-    )
-    rows = np.array(
-        [
-            column.values[middle : min(middle + MAX_COMPARED_ROWS, log.runs[0].stop)]
-            for column in signals
-        ]
-    )
+    if not signals:
+        return {}
+    run = log.runs[0]
+    middle = run.start + max((run.stop - run.start - MAX_COMPARED_ROWS) // 2, 0)
+    compared = slice(middle, min(middle + MAX_COMPARED_ROWS, run.stop))
+    rows = np.array([column.values[compared] for column in signals])
     velocities = [
         k
         for k, column in enumerate(signals)
@@ -424,7 +417,8 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
     timed = [(column.values, column.stamps) for column in log.columns if column.stamps is not None]
     if timed:
         sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
-        runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
+        highest_rate = max(rate_of(stamps) for _, stamps in timed)
+        runs, _ = between_pauses(sampled, 1.0 / highest_rate)
         longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
         begin, end = (
             float(
@@ -432,9 +426,7 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
             )
             for edge in (0, -1)
         )
-        rate = plain_rate(
-            min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), INTERPOLATED_TOLERANCE
-        )
+        rate = plain_rate(min(highest_rate, EVIDENCE_HZ), INTERPOLATED_TOLERANCE)
         check_limit(
             "samples",
             (end - begin) * rate,
@@ -455,7 +447,7 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
     return np.stack([np.interp(grid, stamps, values) for values in rows]), rate
 
 
-def _busiest(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
+def busiest_rows(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
     """The rows in which the columns change most, (C, at most ``max_rows``)."""
     if columns.shape[1] <= max_rows:
         return columns

@@ -325,11 +325,16 @@ def _parsed(answer: str, proposal: Proposal) -> Proposal:
     ).with_evidence("as answered")
 
 
-def _number(text: str, quantity: str) -> float:
+def _float_in(text: str) -> float:
+    """The number that a text is, with a decimal point or comma; NaN where it is none."""
     try:
-        value = float(text.replace(",", "."))
+        return float(text.replace(",", "."))
     except ValueError:
-        value = math.nan
+        return math.nan
+
+
+def _number(text: str, quantity: str) -> float:
+    value = _float_in(text)
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{quantity} must be a positive number, not '{text}'")
     return value
@@ -337,11 +342,10 @@ def _number(text: str, quantity: str) -> float:
 
 def _place_of_imu(text: str) -> float:
     """Distance of the inertial unit from the rear axle [m], within the limits of `CarValues`."""
-    try:
-        value = float(text.replace(",", "."))
-    except ValueError:
+    value = _float_in(text)
+    if math.isnan(value):
         raise ConfigurationError(
             f"{IMU_PLACE} must be a number of metres or {UNKNOWN}, not '{text}'"
-        ) from None
+        )
     validated(CarValues, {IMU_PLACE: value}, "", error=ConfigurationError)
     return value

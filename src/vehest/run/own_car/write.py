@@ -30,7 +30,7 @@ from vehest.estimators.registry import (
     estimator_classes,
     estimator_names,
 )
-from vehest.run.own_car.dataset import MAX_RATIO_UNCERTAINTY, Draft, draft
+from vehest.run.own_car.dataset import Draft, draft, is_certain
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
@@ -194,19 +194,14 @@ def write(
         if "vy_ref" in drafted.channels and not _is_too_short(drafted)
         else Plan()
     )
-    plan.lacking.update(
-        {
-            added_name: "these recordings allow no comparison"
-            for added_name in added
-            if not plan.sweeps
-        }
-    )
     texts = [_dataset_text(drafted, left)]
     if plan.sweeps:
         texts += [
             _split_text(drafted),
             _pipeline_text(name, plan, TRAINED_SHARE * drafted.seconds / 60.0, drafted.contents),
         ]
+    else:
+        plan.lacking.update(dict.fromkeys(added, "these recordings allow no comparison"))
     files = dict(zip(paths_of(name), texts, strict=False))
     # of an earlier data set of this name; these recordings do not allow them
     stale = [file for file in paths_of(name)[len(files) :] if file.exists()]
@@ -267,32 +262,27 @@ def _split_text(drafted: Draft) -> str:
     name = drafted.examined.name
     ids = _long_enough(drafted)
     cut = _divisible(drafted)
+    parts: list[Any]
     if len(cut) == len(drafted.contents):
-        blocks = {
-            "name": name,
-            "dataset": name,
-            "train": "50 %",
-            "validation": "20 %",
-            "tests": {"test": "30 %"},
-        }
-        return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
-    if cut:
-        train, validation, test = (
+        parts = ["50 %", "20 %", "30 %"]
+    elif cut:
+        parts = [
             [
                 {"recording": recording, "start": f"{start} %", "stop": f"{stop} %"}
                 for recording in cut
             ]
             for start, stop in pairwise((0, 50, 70, 100))
-        )
-        train += [{"recording": recording} for recording in ids if recording not in cut]
+        ]
+        parts[0] += [{"recording": recording} for recording in ids if recording not in cut]
     else:
         order = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
         roles = list(zip(ids, cycle(order), strict=False))
-        train, validation, test = (
+        parts = [
             [{"recording": recording} for recording, role in roles if role == part]
             for part in ROLES_OF_THREE
-        )
-    split: dict[str, Any] = {
+        ]
+    train, validation, test = parts
+    split = {
         "name": name,
         "dataset": name,
         "train": train,
@@ -376,13 +366,12 @@ def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, An
 
 def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines = []
-    if drafted.ratio is not None:
+    if drafted.ratio and is_certain(*drafted.ratio):
         value, spread = drafted.ratio
-        if spread <= MAX_RATIO_UNCERTAINTY * abs(value):
-            lines.append(
-                f"steering ratio {value:.3g} ± {spread:.2g}, estimated from slow corners and the "
-                "wheelbase"
-            )
+        lines.append(
+            f"steering ratio {value:.3g} ± {spread:.2g}, estimated from slow corners and the "
+            "wheelbase"
+        )
     lines += [f"{name}: {late.evidence}" for name, late in drafted.late.items()]
     lines += [f"note: {note}" for note in drafted.notes]
     lines += [f"warning: {remark}" for remark in drafted.remarks]
@@ -572,30 +561,30 @@ def _pipeline_of(
 def _limits(drafted: Draft) -> list[str]:
     derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
     missing = [name for name in SCORED if name not in drafted.channels | derived]
-    if not missing and _is_too_short(drafted):
+    if "vy_ref" in missing:
+        return [
+            "these recordings have no reference of lateral velocity or sideslip: nothing can be "
+            "trained or ranked on them; " + _without_reference(drafted)
+        ]
+    if missing:
+        return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
+    if _is_too_short(drafted):
         lengths = f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')}"
         return [
             f"{lengths} are too short for training, validation and a test: record two minutes or "
             "more with bends, or three drives or more, "
             f"with the reference; until then {_without_reference(drafted)}"
         ]
-    if not missing and not _divisible(drafted):
+    if not _divisible(drafted):
         return [
             "the recordings are short, so that the split uses whole recordings "
             f"({len(_long_enough(drafted))}, {drafted.seconds:.0f} s in all)"
         ]
-    if not missing:
-        text = (
-            f"{drafted.seconds:.0f} s in all, a third of it for testing, are hardly enough to rank "
-            "estimators; record some minutes more"
-        )
-        return [text] if drafted.seconds < MIN_RANKING_SECONDS else []
-    if "vy_ref" not in missing:
-        return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
-    return [
-        "these recordings have no reference of lateral velocity or sideslip: nothing can be "
-        "trained or ranked on them; " + _without_reference(drafted)
-    ]
+    text = (
+        f"{drafted.seconds:.0f} s in all, a third of it for testing, are hardly enough to rank "
+        "estimators; record some minutes more"
+    )
+    return [text] if drafted.seconds < MIN_RANKING_SECONDS else []
 
 
 def _without_reference(drafted: Draft) -> str:

@@ -338,12 +338,19 @@ def _evaluate(states, regimes, inputs, vector, frictions, lateral_ratios):
     return derivatives, forces
 
 
-class _CachedFunction:
+class CachedFunction:
     """A function of this module whose machine code is kept on disk, where a writable place is
     found.
 
     The first of several processes compiles, which takes some ten seconds; the others wait for it
     and load the code.
+
+    Attributes
+    ----------
+    dispatcher : callable
+        The function as numba compiles it; the plain function where compilation is disabled.
+    lock : Path or None
+        File that a process locks while it compiles; None without a place for machine code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -362,6 +369,7 @@ class _CachedFunction:
             self.dispatcher = numba.njit(error_model="numpy")(function)
 
     def __call__(self, *arguments: Any) -> Any:
+        """Results of the function; the first call waits while another process compiles."""
         if self._is_ready:
             return self.dispatcher(*arguments)
         with _locked(self.lock):
@@ -396,7 +404,7 @@ def _digest() -> str:
     return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
 
 
-advance = _CachedFunction(_advance)
+advance = CachedFunction(_advance)
 """advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, lateral_ratio (4,))
 -> state (29,), regime, whether it slid, lateral_ratio (4,).
 
@@ -407,7 +415,7 @@ Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need 
 rollover or NaN.
 """
 
-evaluate = _CachedFunction(_evaluate)
+evaluate = CachedFunction(_evaluate)
 """evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,),
 lateral_ratio (T, 4)) -> derivatives (T, 29), forces (T, 12).
 
