@@ -236,7 +236,7 @@ bench-launchers: $(INSTALLED) ## overhead of a task in the local launcher and in
 replay_check: $(INSTALLED) ## models on the frames of a bus against themselves offline, on the real Ferrari's test range; needs VEHEST_DATA
 	$(BIN)/python benchmarks/replay.py check
 
-replay_30min: $(INSTALLED) ## 30 minutes of a bus at 100 Hz in real time: deadlines and memory; on an idle machine (MINUTES=30)
+replay_30min: $(INSTALLED) ## 30 minutes of a bus at 100 Hz in real time: deadlines and memory; on an idle machine, or under chrt -f 50 (MINUTES=30)
 	$(BIN)/python benchmarks/replay.py soak --minutes $(MINUTES)
 
 own_car: $(INSTALLED) ## from a raw CSV of the real Ferrari to a verdict, timed: vehest new, then vehest run --minutes 15; needs VEHEST_DATA
