@@ -1712,3 +1712,91 @@ def test_a_sensor_that_freezes_for_half_of_the_drive_is_named(tmp_path, column):
     is_channel = column in {proposal.column for proposal in log_draft.examined.proposals.channels}
     expected = "constant at" if is_channel else f"'{column}' is left out"
     assert any(expected in text for text in named)
+
+
+def sliding(seconds=120.0):
+    """A drive whose lateral velocity is three times as large."""
+    d = drive(seconds)
+    slide = 2.0 * d["vy"]
+    return d | {"ay": d["ay"] + np.gradient(slide, d["t"]), "ax": d["ax"] - slide * d["r"]}
+
+
+def test_the_rate_of_a_log_without_times_is_right_though_the_car_slides(tmp_path):
+    table = usual(sliding()).drop(columns=["Time [s]", "Beta"])
+    assert proposals_of(tmp_path, table).rate_hz == 50.0
+
+
+def test_a_latitude_is_no_speed(tmp_path):
+    d = drive()
+    heading = np.cumsum(d["r"]) / 50.0
+    table = usual(d).drop(columns=["Speed", "Steer", "Beta"])
+    table["lat"] = 48.0 + np.cumsum(d["vx"] * np.sin(heading)) / 50.0 / 111_000.0
+    table["lon"] = 16.0 + np.cumsum(d["vx"] * np.cos(heading)) / 50.0 / 74_000.0
+    proposals = proposals_of(tmp_path, table)
+    assert not {"lat", "lon"} & {proposal.column for proposal in proposals.channels}
+    assert not [note for note in proposals.notes if "'lat'" in note]
+
+
+@pytest.mark.parametrize("name", ["roll", "pitch"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_tilt_whose_sign_gravity_contradicts_is_asked(tmp_path, name, sign):
+    d = drive(240.0)
+    bank = 0.05 * np.sin(2.0 * np.pi * d["t"] / 31.0)
+    slope = 0.05 * np.sin(2.0 * np.pi * d["t"] / 43.0)
+    tilted = d | {"ay": d["ay"] + G * np.sin(bank), "ax": d["ax"] + G * np.sin(slope)}
+    table = usual(tilted).drop(columns=["Steer", "Beta"])
+    signs = {"roll": 1, "pitch": 1, name: sign}
+    table["Roll [rad]"] = signs["roll"] * bank
+    table["Pitch [rad]"] = -signs["pitch"] * slope  # nose down is positive
+    by_channel = proposed(tmp_path, table)
+    assert {channel: by_channel[channel].sign for channel in signs} == signs
+    assert ("gravity" in by_channel[name].question) == (sign == -1)
+
+
+def test_of_two_accelerations_the_one_that_contains_gravity_is_measured(tmp_path):
+    d = drive(240.0)
+    bank = 0.05 * np.sin(2.0 * np.pi * d["t"] / 31.0)
+    table = usual(d).drop(columns=["Steer", "Beta", "LatAcc"])
+    table["Acceleration lateral [m/s2]"] = d["ay"]
+    table["Acceleration Yv [m/s2]"] = d["ay"] + G * np.sin(bank)
+    table["Roll [deg]"] = np.degrees(bank)
+    assert proposed(tmp_path, table)["ay"].column == "Acceleration Yv [m/s2]"
+
+
+def test_a_rare_unit_of_ax_does_not_decide_the_unit_of_speed(tmp_path):
+    d = drive()
+    frozen = np.where(d["t"] < 30.0, d["r"], d["r"][1500])
+    columns = {"time": d["t"], "speed": d["vx"], "yaw_rate": frozen, "ax": d["ax"], "ay": d["ay"]}
+    by_channel = proposed(tmp_path, pd.DataFrame(columns))
+    assert (by_channel["vx"].unit, by_channel["ax"].unit) == ("m/s", "m/s²")
+
+
+def test_of_factors_that_explain_as_well_that_of_a_unit_is_asked(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "time [s]": d["t"],
+            "v [m/s]": 3.6 * d["vx"],
+            "yaw_rate [rad/s]": d["r"],
+            "ax [m/s2]": d["ax"],
+            "ay [m/s2]": d["ay"],
+            "beta [rad]": d["sideslip"],
+        }
+    )
+    by_channel = proposed(tmp_path, table)
+    assert "its unit is km/h, not m/s" in by_channel["vx"].question
+    assert {channel: proposal.unit for channel, proposal in by_channel.items()} == {
+        "vx": "km/h",
+        "yaw_rate": "rad/s",
+        "ax": "m/s²",
+        "ay": "m/s²",
+        "sideslip_ref": "rad",
+    }
+
+
+def test_an_inline_acceleration_of_the_unit_goes_before_that_of_the_receiver(tmp_path):
+    d = drive()
+    table = usual(d).rename(columns={"LatAcc": "LateralAcc", "LongAcc": "InlineAcc"})
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(table))
+    table["GPS LonAcc"] = (d["ax"] + noise) / G
+    assert proposed(tmp_path, table)["ax"].column == "InlineAcc"

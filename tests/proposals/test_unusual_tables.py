@@ -143,6 +143,8 @@ TIMES = {
     "year of two digits": lambda at: at.strftime("%m/%d/%y %I:%M:%S.%f%p"),
     "ISO without marks": lambda at: at.strftime("%Y%m%dT%H%M%S.%fZ"),
     "underscore": lambda at: at.strftime("%Y-%m-%d_%H:%M:%S.%f"),
+    "day of the year": lambda at: at.strftime("%j:%H:%M:%S.%f"),
+    "year and its day": lambda at: at.strftime("%Y-%j-%H:%M:%S.%f"),
     "hhmmss": lambda at: at.strftime("%H%M%S.%f"),
 }
 
@@ -163,6 +165,25 @@ def test_a_row_of_units_in_brackets_has_the_unit_of_time(tmp_path):
     file.write_text("\n".join([lines[0], units, *lines[1:]]), encoding="utf-8")
     clock = inspect("my_car", [file]).log.clock
     assert (clock.unit, clock.asked) == ("s", False)
+
+
+def test_units_in_a_row_of_comment_have_the_unit_of_time(tmp_path):
+    lines = lines_of(usual(drive()).rename(columns={"Time [s]": "Time"}))
+    file = tmp_path / "lap.csv"
+    units = "# s,km/h,deg/s,g,g,deg,deg"
+    file.write_text("\n".join([f"# {lines[0]}", units, *lines[1:]]), encoding="utf-8")
+    clock = inspect("my_car", [file]).log.clock
+    assert (clock.unit, clock.asked) == ("s", False)
+
+
+def test_fixes_of_a_receiver_of_1_hz_are_bridged_though_they_jitter(tmp_path):
+    table = usual(drive(60.0))
+    fixes = np.arange(0, len(table), 50) + np.random.default_rng(0).integers(0, 3, 60)
+    has_none = ~np.isin(np.arange(len(table)), fixes)
+    table.loc[has_none, "Speed"] = np.nan
+    log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
+    assert "drop_rows" not in log_draft.dataset
+    assert recording.duration > 58.0
 
 
 def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path):

@@ -20,6 +20,7 @@ import numpy as np
 
 from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import (
+    RARE_UNITS,
     UNITS,
     Candidate,
     candidates,
@@ -44,6 +45,8 @@ from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.scales import find_wrong_scale, is_scale_wrong
 from vehest.alignment.proposals.turning import (
     CLOSE_MISMATCH,
+    FAR_MISMATCH,
+    RARITY,
     UNIT_PENALTIES,
     Search,
     Turning,
@@ -61,7 +64,7 @@ from vehest.alignment.proposals.wheels import (
     wheel_proposals,
     wheels_over_speed,
 )
-from vehest.constants import FloatArray
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import abbreviated
 
@@ -69,6 +72,8 @@ MAX_STANDSTILL_SPEED = 0.5  # m/s; a car whose speed never exceeds it did not mo
 SCORE_MARGIN = 4.0  # below the best triple, within which an agreement with ax decides
 AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's score
 MAX_AX_CANDIDATES = 40
+MIN_GRAVITY_CORRELATION = 0.7  # of an acceleration's gravity with that by an angle
+GRAVITY_WEIGHT = 4.0  # of the correlation of a roll angle with ay beyond vx·yaw_rate
 MAX_LISTED = 8
 SPEED_GAIN_RANGE = (0.97, 1.08)  # of ay over d(vy)/dt + vx·yaw_rate, with a right speed
 SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # where d(vy)/dt is not known
@@ -261,7 +266,9 @@ def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: floa
 def _best_search(
     columns: Sequence[Candidate], turnings: Sequence[Turning], rate_hz: float
 ) -> Search | None:
-    """Around the triple, among the best ones, that agrees best with an ax; else around names."""
+    """Around the triple, among the best ones, that agrees best with an ax and a roll angle; else
+    around names.
+    """
     if not turnings:
         turning = turning_by_names(columns)
         if turning is None:
@@ -269,20 +276,39 @@ def _best_search(
         return _search_around(_with_speed_by_ax(turning, columns, rate_hz), columns, rate_hz)
 
     def score(search: Search) -> float:
-        strengths = [agreement.strength for agreement in _agreements_with_ax(search)]
-        return search.turning.score + AX_WEIGHT * max(strengths, default=0.0)
+        strengths = [agreement.strength for agreement, _ in _agreements_with_ax(search)]
+        with_ax = AX_WEIGHT * max(strengths, default=0.0)
+        return search.turning.score + with_ax + GRAVITY_WEIGHT * _gravity(search)
 
     best_score = turnings[0].score
     near = [turning for turning in turnings if turning.score > best_score - SCORE_MARGIN]
     return max((_search_around(turning, columns, rate_hz) for turning in near), key=score)
 
 
-def _agreements_with_ax(search: Search, unit: str = "") -> list[Agreement]:
+def _gravity(search: Search) -> float:
+    """Correlation of ay with a roll angle, both beyond vx·yaw_rate.
+
+    Of two accelerations, a sensor's contains gravity; a level-frame one does not.
+    """
+    turning = slow_of(search.motion.turning, search.motion.rate_hz)
+    excess = _beyond(turning, slow_of(search.motion["ay"], search.motion.rate_hz))
+    rolls = [column.slow for column in search.free if column.hints.get("roll") == STRONG]
+    return max((abs(correlation(excess, _beyond(turning, roll))) for roll in rolls), default=0.0)
+
+
+def _beyond(explaining: FloatArray, samples: FloatArray) -> FloatArray:
+    """What a signal (S,) does not explain of another: neither a scale nor a body that rolls in
+    proportion to ay matters.
+    """
+    rows = np.stack([explaining, np.ones(len(explaining))], axis=1)
+    return np.asarray(samples - rows @ np.linalg.lstsq(rows, samples, rcond=None)[0])
+
+
+def _agreements_with_ax(search: Search, unit: str = "") -> list[tuple[Agreement, Candidate]]:
     """Agreements of d(vx)/dt with possible columns of ax, in ``unit`` where they have none."""
-    columns = [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
     return [
-        longitudinal(search.motion, column, [column.unit or unit] if unit else ())
-        for column in columns
+        (longitudinal(search.motion, column, [column.unit or unit] if unit else ()), column)
+        for column in [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
     ]
 
 
@@ -292,23 +318,35 @@ def _with_speed_by_ax(named: Turning, columns: Sequence[Candidate], rate_hz: flo
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
         ranked += [
-            (agreement.mismatch + UNIT_PENALTIES.get(unit, 0.0), turning)
-            for agreement in _agreements_with_ax(_search_around(turning, columns, rate_hz))
+            (
+                agreement.mismatch
+                + UNIT_PENALTIES.get(unit, 0.0)
+                + RARITY * (agreement.unit in RARE_UNITS["ax"]),
+                turning,
+            )
+            for agreement, _ in _agreements_with_ax(_search_around(turning, columns, rate_hz))
             if agreement.strength >= CLEAR_CORRELATION
         ]
     return min(ranked, key=lambda entry: entry[0])[1]
 
 
 def _rate_by_ax(search: Search) -> float | None:
-    """The plain rate at which a column, in the unit of ay, is d(vx)/dt; None where none is."""
-    best = max(
-        _agreements_with_ax(search, search.turning.units["ay"]),
-        key=lambda agreement: agreement.strength,
-        default=None,
-    )
-    if best is None or best.strength < CLEAR_CORRELATION:
+    """The plain rate at which a column, in the unit of ay, is d(vx)/dt - vy·yaw_rate; None where
+    none is.
+
+    Of a single track in steady turns, vy·yaw_rate is a sum of yaw_rate² and ay².
+    """
+    agreements = _agreements_with_ax(search, search.turning.units["ay"])
+    clear = [entry for entry in agreements if entry[0].strength >= CLEAR_CORRELATION]
+    if not clear:
         return None
-    rate_hz = search.motion.rate_hz * best.scale
+    best, column = max(clear, key=lambda entry: entry[0].strength)
+    motion = search.motion
+    signals = (motion.derivative(motion.vx), motion["yaw_rate"] ** 2, motion["ay"] ** 2)
+    regressors = [slow_of(samples, motion.rate_hz) for samples in signals]
+    regressors.append(np.ones(len(column.slow)))
+    scale = np.linalg.lstsq(np.stack(regressors, axis=1), column.slow, rcond=None)[0][0]
+    rate_hz = motion.rate_hz * abs(scale) * si_factor(best.unit, "ax")
     return float(min(PLAIN_RATES_HZ, key=lambda plain: abs(math.log(plain / rate_hz))))
 
 
@@ -350,7 +388,42 @@ def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels)
         channels |= {proposal.channel: proposal for proposal in wheel_channels}
     channels |= _channels_by_name(free, channels, is_moving=search is not None)
     proposals = Proposals(tuple(channels.values()), wheel_radius=radius, notes=notes)
-    return proposals.with_tilt_signs()
+    proposals = proposals.with_tilt_signs()
+    return _with_signs_of_gravity(proposals, search.motion, columns) if search else proposals
+
+
+def _with_signs_of_gravity(
+    proposals: Proposals, motion: Motion, columns: Sequence[Candidate]
+) -> Proposals:
+    """With the opposite sign, and a question, of a roll or pitch that gravity contradicts.
+
+    A sensor measures ay = d(vy)/dt + vx·yaw_rate + g·sin(roll) and ax = d(vx)/dt - vy·yaw_rate -
+    g·sin(pitch).
+    """
+    by_channel = proposals.by_channel
+    slow = {
+        proposal.channel: proposal.si(column.slow)
+        for column in columns
+        for proposal in proposals.channels
+        if proposal.column == column.name
+    }
+    changes = {}
+    for name, acceleration, kinematic in (
+        ("roll", "ay", motion.turning),
+        ("pitch", "ax", motion.derivative(motion.vx)),
+    ):
+        if not {name, acceleration} <= set(slow):
+            continue
+        gravity = np.sin(slow[name]) * (GRAVITY if name == "roll" else -GRAVITY)
+        expected = slow_of(kinematic, motion.rate_hz)
+        excess, gravity = (_beyond(expected, each) for each in (slow[acceleration], gravity))
+        agreement = correlation(excess, gravity)
+        gain = float(np.std(excess)) / max(float(np.std(gravity)), 1e-9)
+        if agreement < -MIN_GRAVITY_CORRELATION and abs(math.log(gain)) < FAR_MISMATCH:
+            question = f"sign: gravity in {acceleration} contradicts the axes of ax, ay, yaw_rate"
+            reversed_proposal = replace(by_channel[name], sign=-by_channel[name].sign)
+            changes[name] = reversed_proposal.questioned(question)
+    return proposals.changed(changes)
 
 
 def _channels_of_motion(
@@ -622,8 +695,8 @@ def _expected_ay(
         if reference is None or reference.is_weak:
             continue
         column = next(column for column in columns if column.name == reference.column)
-        samples = column.values * reference.sign * si_factor(reference.unit, name)
-        channels = {**motion.channels, name: np.where(motion.moving, samples, 0.0)}
+        samples = np.where(motion.moving, reference.si(column.values), 0.0)
+        channels = {**motion.channels, name: samples}
         motion = replace(motion, channels=channels, velocity=name)
         return slow_of(motion.turning + motion.sliding, motion.rate_hz), SPEED_GAIN_RANGE
     return slow_of(motion.turning, motion.rate_hz), SPEED_GAIN_RANGE_WITHOUT_VY

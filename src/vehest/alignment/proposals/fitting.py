@@ -152,9 +152,7 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
     proposals[second.proposal.channel] = second.proposal
     forward = slow_of(search.motion.vx, search.motion.rate_hz)
     moving = forward > 0.2 * forward.max()
-    lateral_speed = (
-        velocity.slow * proposals["vy_ref"].sign * si_factor(proposals["vy_ref"].unit, "vy_ref")
-    )
+    lateral_speed = proposals["vy_ref"].si(velocity.slow)
     correlation_with_atan = correlation(
         np.arctan2(lateral_speed, forward)[moving], angle.slow[moving]
     )

@@ -34,7 +34,7 @@ _STRONG = {  # over the name without blanks
         r"linearaccelerationy|yacc|glat|^gy$|quera(?!bw)|accquer|accel?lat|laterala|"
         r"beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right"
     ),
-    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
+    "ax": r"longac|inlineac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
     r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
     r"lonacc|acclon|gforcelon|axvehicle|accel?forward",

@@ -79,10 +79,13 @@ class Proposal:
             (T,), as the column has them; NaN is not impossible.
         """
         channel = CHANNELS[self.channel]
-        samples = (
-            self.sign * self.factor * factor_to_si(self.unit, channel.unit) * (values - self.offset)
-        )
+        samples = self.si(values)
         return np.asarray((samples < channel.low) | (samples > channel.high))
+
+    def si(self, values: FloatArray) -> FloatArray:
+        """Samples of the channel, (T,), of values as the column has them, (T,)."""
+        factor = self.sign * self.factor * factor_to_si(self.unit, CHANNELS[self.channel].unit)
+        return np.asarray(factor * (values - self.offset))
 
     def with_evidence(self, *evidence: str) -> Proposal:
         """The same with further evidence."""

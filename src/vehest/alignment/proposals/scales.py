@@ -182,6 +182,14 @@ def find_wrong_scale(
     best_cost, best = explanations[0]
     margin = MIN_COST_SHARE * min(abs(math.log(gain)), MAX_COST)
     rivals = [factors for cost, factors in explanations[1:] if cost < best_cost + margin]
+    by_units = [
+        factors
+        for factors in (best, *rivals)
+        if all(unit_of_factor(name, suspects[name].unit, factors[name]) for name in factors)
+    ]
+    if len(by_units) == 1 and best_cost < sum(check.cost({}) for check in checks):
+        best = by_units[0]
+        rivals = []
     factors = {name: factor for rival in (best, *rivals) for name, factor in rival.items()}
     costs = [(check.cost({}), check.cost(best), check.text) for check in checks]
     wrong = [text for now, corrected, text in costs if now > corrected]
@@ -239,10 +247,7 @@ def _checks(
     lengths by slow corners, and the wheels' radius or speed.
     """
     samples = {
-        name: by_name[proposal.column].values
-        * proposal.sign
-        * proposal.factor
-        * si_factor(proposal.unit, name)
+        name: proposal.si(by_name[proposal.column].values)
         for name, proposal in channels.items()
         if proposal.column in by_name and name not in search.turning.columns
     }

@@ -46,11 +46,11 @@ FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a
 clear name decides.
 """
-NO_RATE_OR_ACCELERATION = (
+NO_MOTION = (
     *("vx", "heading", "roll", "pitch"),
     *("latitude", "longitude", "position_x", "position_y"),
 )
-"""Roles of speeds, angles and positions, none of which is a yaw rate or an acceleration."""
+"""Roles whose columns are no yaw rate, no acceleration and, but for the first, no speed."""
 UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
 # correlation beyond which ay was computed of vx·yaw_rate, and not measured
 MIN_COMPUTED_CORRELATION = 0.9995
@@ -229,11 +229,7 @@ def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
         column
         for column in columns
         if channel in column.hints
-        or STRONG
-        not in {
-            column.hints.get(role)
-            for role in (*FOLLOWING, *(NO_RATE_OR_ACCELERATION if channel != "vx" else ()))
-        }
+        or STRONG not in {column.hints.get(role) for role in (*FOLLOWING, *NO_MOTION)}
     ]
     pool = [
         column
@@ -361,6 +357,10 @@ class Repeat(NamedTuple):
     unit: str
     sign: int
 
+    def si(self, channel: str, values: FloatArray) -> FloatArray:
+        """Samples of a channel, of values as the column has them."""
+        return values * (self.sign * si_factor(self.unit, channel))
+
     def proposal(self, channel: str, *evidence: str, **more: Any) -> Proposal:
         """The column as a channel; ``more`` are further fields of the proposal."""
         return Proposal(self.column.name, channel, self.unit, self.sign, evidence, **more)
@@ -463,9 +463,7 @@ def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
     """Whether a column holds the samples of another one, but for unit, sign and rounding."""
     if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
         return False
-    copy, samples = (
-        each.column.values * each.sign * si_factor(each.unit, channel) for each in (repeat, first)
-    )
+    copy, samples = (each.si(channel, each.column.values) for each in (repeat, first))
     return rms(copy - samples) < MAX_COPY_DIFFERENCE * rms(np.diff(samples))
 
 
@@ -496,7 +494,7 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
     if column.is_reference and not (first.column.is_reference or first.column.unit or decided):
         column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
-    speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
+    speed = first.si("vx", first.column.slow)
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)
     evidence = (
         f"correlation with '{name}' {correlation(column.slow, first.column.slow):.2f}; no unit of "

@@ -37,7 +37,8 @@ from vehest.sources.unit_spellings import plain_unit
 EVIDENCE_HZ = 50.0
 MAX_EVIDENCE_SECONDS = 1200.0  # s
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
-MAX_BRIDGED_SECONDS = 1.0  # s without a sample that straight lines bridge
+# s without a sample that straight lines bridge: as between fixes of a satellite receiver of 1 Hz
+MAX_BRIDGED_SECONDS = 1.1
 MAX_LISTED = 5
 # a column is another's difference from row to row: by so many rows from the middle of the log, the
 # share of them with the smaller steps, and the correlation

@@ -91,7 +91,7 @@ def find_clock(
     """
     candidates = []
     for name, raw in columns.items():
-        written = units.get(name, "").replace(" ", "").strip("[]()").lower()
+        written = units.get(name, "").replace(" ", "").strip("#[]()").lower()
         unit = SPELLINGS.get(written, "")
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
