@@ -49,7 +49,7 @@ class FileSource(Source):
         DataError
             Two files make one name of a recording.
         """
-        return {file.name: file for file in self._files()}
+        return {file.name: file for file in self.data_files()}
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name, without transforms.
@@ -95,11 +95,11 @@ class FileSource(Source):
         """Name of each recording -> its file and run."""
         return {
             self._name_of(file, run): (file, run)
-            for file in self._files()
+            for file in self.data_files()
             for run in self._runs_of(file)
         }
 
-    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
         """Number of each run in a file -> its rows.
 
         All rows under None where runs are not distinguished.
@@ -116,14 +116,14 @@ class FileSource(Source):
         DataError
             The file holds no run, or none of that number.
         """
-        runs = self._runs(file)
+        runs = self.runs_in(file)
         number = getattr(self.options, "run", None)
         if not runs or (number is not None and number not in runs):
             named = "between its pauses" if number is None else number
             raise DataError(f"'{file}' holds no run {named} ({listed([str(run) for run in runs])})")
         return runs if number is None else {number: runs[number]}
 
-    def _files(self) -> list[Path]:
+    def data_files(self) -> list[Path]:
         """The files that match, sorted; see `inputs` for what is raised."""
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)

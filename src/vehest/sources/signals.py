@@ -163,7 +163,7 @@ class SignalSource(FileSource):
                 f"'{options.raster}'"
             )
 
-    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
         """Times [s] of each segment in which no signal lacks samples for longer than its limit.
 
         One segment has the file's name. Limits by which most of the time would be left out, as of
@@ -175,9 +175,9 @@ class SignalSource(FileSource):
             signals = self._spanning(self._signals(file)[0])
             begin, end = self._common_span(signals, file)
         except DataError:
-            return super()._runs(file)  # reading it gives the reason
+            return super().runs_in(file)  # reading it gives the reason
         if pause is None and self.gappy.issuperset(signals):
-            return super()._runs(file)
+            return super().runs_in(file)
         max_gaps = {name: self._max_gap(name, signal) for name, signal in signals.items()}
         segments = _segments(
             [gap for name, signal in signals.items() for gap in signal.gaps(max_gaps[name])],
@@ -187,7 +187,7 @@ class SignalSource(FileSource):
         )
         if sum(part.stop - part.start for part in segments) < MIN_COVERED * (end - begin):
             if pause is None:
-                return super()._runs(file)
+                return super().runs_in(file)
             gaps = [gap for signal in signals.values() for gap in signal.gaps(pause)]
             segments = _segments(gaps, begin, end, pause)
         if pause is None and len(segments) == 1:

@@ -197,7 +197,7 @@ class TabularSource(FileSource):
         if is_stored_recording(file):
             return read_recording(file)
         columns = self._columns_of(file)
-        values = self._values(file, self.columns_read(column_names(file, self.layout)))
+        values = self.column_values(file, self.columns_read(column_names(file, self.layout)))
         rows = self._runs_of(file)[run]
         return self._recording_of(
             file, run, columns, {name: samples[rows] for name, samples in values.items()}
@@ -248,7 +248,7 @@ class TabularSource(FileSource):
             )
         return columns
 
-    def _values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
+    def column_values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
         """Columns in the order of their times, without the rows that the data set leaves out."""
         time = self.time
         sorting = [time.column] if time is not None and time.sort else []
@@ -319,28 +319,28 @@ class TabularSource(FileSource):
             provenance["held"] = self.held.description(rate)
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
-    def _files(self) -> list[Path]:
+    def data_files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
         return remaining_files(
-            super()._files(), self.options.exclude or (), self.dropped, self.location
+            super().data_files(), self.options.exclude or (), self.dropped, self.location
         )
 
-    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
         """Rows of each run without those that are left out."""
         counter = self.time.column if self.time and self._cuts else self.options.runs
         if counter is None or is_stored_recording(file):
-            return super()._runs(file)
+            return super().runs_in(file)
         require_files([file], self.name)
         if self.time is not None and self._cuts:
             names = self._spanning(file) if self.options.max_gap else []
-            values = self._values(file, [counter, *names])
+            values = self.column_values(file, [counter, *names])
             return timed_runs(
                 self.time.to_si(values[counter], "s"),
                 self.options.max_gap,
                 restarts=self.options.time_restarts,
                 columns=(values[name] for name in names),
             )
-        return counted_runs(self._values(file, [counter])[counter], counter, file)
+        return counted_runs(self.column_values(file, [counter])[counter], counter, file)
 
     def _spanning(self, file: Path) -> list[str]:
         """Columns that must have samples throughout a run: of channels that are not gappy or

@@ -48,13 +48,13 @@ class TextLogSource(TabularSource):
         missing = self.options.missing or ()
         self.layout = replace(self.layout, rows_below_names=below, missing=missing, clock=clock)
 
-    def _values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
+    def column_values(self, file: Path, selected: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out, and with lines across gaps of at
         most ``bridge`` [s].
 
         Gaps are counted by the column of times or, without one, by ``rate_hz``.
         """
-        values = super()._values(file, selected)
+        values = super().column_values(file, selected)
         longest = self.options.bridge
         if longest is None:
             return values

@@ -98,12 +98,12 @@ class VboSource(FileSource):
         self._require_pattern()
         self._log = lru_cache(1)(read_log)
 
-    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
         """Rows between pauses."""
         require_files([file], self.name)
         max_gap = self.options.max_gap
         if max_gap is None:
-            return super()._runs(file)
+            return super().runs_in(file)
         log = self._log(file)
         require_columns(
             file, list(log.columns), [column.column for column in self.columns.values()]

@@ -93,7 +93,7 @@ class RosbagSource(FileSource):
         """Archives and files of bags."""
         return {
             file.name if file == bag else f"{bag.name}/{file.name}": file
-            for bag in self._files()
+            for bag in self.data_files()
             for file in bag_files(bag)
         }
 
