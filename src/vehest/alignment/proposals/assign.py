@@ -266,8 +266,8 @@ def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: floa
 def _best_search(
     columns: Sequence[Candidate], turnings: Sequence[Turning], rate_hz: float
 ) -> Search | None:
-    """Around the triple, among the best ones, that agrees best with an ax and a roll angle; else
-    around names.
+    """Around the triple, among the best ones, that agrees best with an ax; of its accelerations,
+    the one that agrees with a roll angle too. Without triples, around names.
     """
     if not turnings:
         turning = turning_by_names(columns)
@@ -277,12 +277,24 @@ def _best_search(
 
     def score(search: Search) -> float:
         strengths = [agreement.strength for agreement, _ in _agreements_with_ax(search)]
-        with_ax = AX_WEIGHT * max(strengths, default=0.0)
-        return search.turning.score + with_ax + GRAVITY_WEIGHT * _gravity(search)
+        return search.turning.score + AX_WEIGHT * max(strengths, default=0.0)
 
     best_score = turnings[0].score
     near = [turning for turning in turnings if turning.score > best_score - SCORE_MARGIN]
-    return max((_search_around(turning, columns, rate_hz) for turning in near), key=score)
+    scores = [
+        (score(search), search)
+        for search in (_search_around(turning, columns, rate_hz) for turning in near)
+    ]
+    _, best = max(scores, key=lambda entry: entry[0])
+    other_accelerations = [
+        (points + GRAVITY_WEIGHT * _gravity(search), search)
+        for points, search in scores
+        if all(
+            search.turning.columns[name] is best.turning.columns[name]
+            for name in ("vx", "yaw_rate")
+        )
+    ]
+    return max(other_accelerations, key=lambda entry: entry[0])[1]
 
 
 def _gravity(search: Search) -> float:
