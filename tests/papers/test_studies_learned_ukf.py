@@ -31,7 +31,7 @@ from vehest.evaluation.metrics import (
 from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts, Trial
 from vehest.training.through_filter import Drive
-from vehest_papers.kit.block_errors import BlockErrors, Key, read_training
+from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of, read_training
 from vehest_papers.kit.block_rows import BlockRow, checked_training
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import metric_values
@@ -46,7 +46,7 @@ from vehest_papers.learned_ukf.candidates import (
     runs_of,
     scored_of,
 )
-from vehest_papers.learned_ukf.data_amount import extrapolated
+from vehest_papers.learned_ukf.data_amount import data_table, extrapolated
 from vehest_papers.learned_ukf.filtering import (
     drives_of,
     filtered,
@@ -276,7 +276,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
         "real": part,
         **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)},
         "likelihood": part,
-        "half_1": half_of_training(part),
+        "half_1": cut_training(part, HALF_OF_TRAINING),
     }
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
@@ -427,11 +427,24 @@ def only(part, candidate, training=None):
     return replace(part, models=retrained)
 
 
-def half_of_training(part):
-    """NNTF_UH of the part, as if trained on half of its training data."""
+def cut_training(part, stop):
+    """NNTF_UH of the part, as if trained on its training data up to a time [s]."""
     (span,) = part.split.train
-    half = replace(span, stop=HALF_OF_TRAINING)
-    return replace(only(part, "NNTF_UH"), split=replace(part.split, train=(half,)))
+    cut = replace(span, stop=stop)
+    return replace(only(part, "NNTF_UH"), split=replace(part.split, train=(cut,)))
+
+
+def test_errors_are_extrapolated_from_three_amounts_of_training_data_on(part):
+    parts = {"real": part, "half_1": cut_training(part, HALF_OF_TRAINING)}
+    parts |= {"quarter_1": cut_training(part, HALF_OF_TRAINING / 2.0)}
+    blocks = blocks_of(block_errors.error_rows(parts))
+    two, three = (
+        data_table({name: parts[name] for name in names}, blocks, "X").frame
+        for names in (("real", "half_1"), ("real", "half_1", "quarter_1"))
+    )
+    assert two["seed"].tolist() == ["0", "1", "0", "1"]
+    assert three["seed"].tolist() == ["0", "1", "0", "1", "0", "1", "extrapolated"]
+    assert three["minutes"].is_monotonic_increasing
 
 
 def test_errors_extrapolate_along_a_power_law_with_the_interval_of_regression():

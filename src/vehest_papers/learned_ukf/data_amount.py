@@ -21,13 +21,14 @@ from vehest_papers.learned_ukf.block_errors import candidate_name
 from vehest_papers.learned_ukf.candidates import SETS
 
 METRIC = "mse_weighted"
+MIN_AMOUNTS = 3  # of training data, from which on errors are extrapolated
 
 
 def data_table(
     parts: Mapping[str, PartArtefacts], blocks: Mapping[Key, BlockErrors], data: str
 ) -> Table:
-    """A row a training: minutes it learnt from, and weighted MSE on both tyres; below them the MSE
-    extrapolated to the paper's minutes.
+    """A row a training: minutes it learnt from, and weighted MSE on both tyres; below them, from
+    three amounts of data on, the MSE extrapolated to the paper's minutes.
 
     Parameters
     ----------
@@ -46,26 +47,29 @@ def data_table(
         | {test: significant(row[test]) for test in SETS}
         for row in rows
     ]
-    shown.append(
-        {"minutes": at, "seed": "extrapolated"}
-        | {
-            test: figure_in_words(
-                extrapolated(np.asarray(frame["minutes"]), np.asarray(frame[test]), at)
-            )
-            for test in SETS
-        }
+    caption = (
+        f"{paper.NNTF_UH} trained on parts of the training data, with as many steps on each. "
+        f"The paper has {paper.TABLE_I[paper.NNTF_UH].mse:g} on tyre A with {at:.1f} min. "
+        f"Data: {data}."
     )
+    if frame["minutes"].nunique() >= MIN_AMOUNTS:
+        amounts = np.asarray(frame["minutes"])
+        shown.append(
+            {"minutes": at, "seed": "extrapolated"}
+            | {
+                test: figure_in_words(extrapolated(amounts, np.asarray(frame[test]), at))
+                for test in SETS
+            }
+        )
+        caption += (
+            " Extrapolated: a straight line through the logarithms of minutes and MSE of the "
+            "trainings, with its 95 % interval."
+        )
     columns = {
         "minutes": Column("training data [min]", decimals=1),
         "seed": Column("seed"),
         **{test: Column(f"MSE (weighted), {tyre}") for test, tyre in SETS.items()},
     }
-    caption = (
-        f"{paper.NNTF_UH} trained on parts of the training data, with as many steps on each. "
-        "Extrapolated: a straight line through the logarithms of minutes and MSE of the "
-        f"trainings, with its 95 % interval at the paper's {at:.1f} min, where "
-        f"the paper has {paper.TABLE_I[paper.NNTF_UH].mse:g} on tyre A. Data: {data}."
-    )
     return Table("minutes_of_data", caption, pd.DataFrame(shown), columns)
 
 
