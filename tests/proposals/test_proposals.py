@@ -1763,6 +1763,18 @@ def test_of_two_accelerations_the_one_that_contains_gravity_is_measured(tmp_path
     assert proposed(tmp_path, table)["ay"].column == "Acceleration Yv [m/s2]"
 
 
+def test_of_two_accelerations_without_a_roll_angle_one_is_asked(tmp_path):
+    d = drive(240.0)
+    bank = 0.15 * np.sin(2.0 * np.pi * d["t"] / 31.0)
+    table = usual(d).drop(columns=["Steer", "Beta", "LatAcc"])
+    table["linear_acc_y [m/s2]"] = d["ay"]
+    table["acc_y [m/s2]"] = d["ay"] + G * np.sin(bank)
+    ay = proposed(tmp_path, table)["ay"]
+    names = {"linear_acc_y [m/s2]", "acc_y [m/s2]"}
+    assert {ay.column, *ay.alternatives} == names
+    assert "which one contains gravity?" in ay.question
+
+
 def test_a_rare_unit_of_ax_does_not_decide_the_unit_of_speed(tmp_path):
     d = drive()
     frozen = np.where(d["t"] < 30.0, d["r"], d["r"][1500])

@@ -64,6 +64,7 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
+MIN_AY_RIVAL_CORRELATION = 0.9  # with and without gravity, as telephones give it
 # of the steps from sample to sample; two sensors differ by as much as their noise
 MAX_COPY_DIFFERENCE = 0.05
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
@@ -427,6 +428,16 @@ def repeated(search: Search) -> Iterator[Proposal]:
                 "filtered",
                 is_repeated=True,
             )
+    rivals = tuple(
+        column.name
+        for column in search.free
+        if column.hints.get("ay") == STRONG
+        and not column.is_reference
+        and abs(correlation(column.slow, ay.column.slow)) > MIN_AY_RIVAL_CORRELATION
+    )
+    if rivals:
+        question = f"{' and '.join(rivals)} would fit as well; which one contains gravity?"
+        yield ay.proposal("ay", question=question, alternatives=rivals)
 
 
 def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
