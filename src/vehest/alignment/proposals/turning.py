@@ -64,7 +64,7 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "yaw_rate": 0.9,
 }
 MIN_AY_REPEAT_CORRELATION = 0.99
-MIN_AY_RIVAL_CORRELATION = 0.9  # with and without gravity, as telephones give it
+MIN_AY_RIVAL_CORRELATION = 0.7  # with and without gravity, as telephones give it
 # of the steps from sample to sample; two sensors differ by as much as their noise
 MAX_COPY_DIFFERENCE = 0.05
 MAX_REPEAT_MISMATCH = 0.35  # logarithm
