@@ -547,14 +547,17 @@ def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
 
 def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatArray:
     """Standard deviation of v along a drive [m/s], (T,)."""
-    (A, b, Q, C, d, R), prior = _model_of(drive, inputs, levels)
+    model, prior = _model_of(drive, inputs, levels)
     deviation = np.empty(len(drive.vy_ref))
     for begin in range(0, len(deviation), SAMPLES_TOGETHER):
         part = slice(begin, begin + SAMPLES_TOGETHER)
-        transition = A[part]
-        covariance = posterior_bound(LinearModel(transition, b, Q, C[part], d, R), prior)
+        part_model = model._replace(
+            transition=model.transition[part], observation=model.observation[part]
+        )
+        covariance = posterior_bound(part_model, prior)
         deviation[part] = np.sqrt(covariance[:, 0, 0])
-        prior = transition[-1] @ covariance[-1] @ transition[-1].T + Q
+        last = part_model.transition[-1]
+        prior = last @ covariance[-1] @ last.T + model.process_noise
     return deviation
 
 

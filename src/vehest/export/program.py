@@ -48,7 +48,7 @@ from vehest.trust.guard import (
     Guard,
 )
 from vehest.trust.health_kernel import Layout, Model
-from vehest.trust.named_arrays import values_by_field, views
+from vehest.trust.named_arrays import views
 from vehest.trust.tyre_check import FRICTION_SLIP
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
@@ -298,10 +298,11 @@ def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
         return None
     layout = Layout(*map(int, views(Layout, packed, ())[0]))
     model, _ = views(Model, packed, layout)
+    of_model, of_layout, settings = (part._asdict() for part in (model, layout, model.settings))
     return {
-        **values_by_field(model),
-        **values_by_field(layout),
-        **{name: float(value) for name, value in values_by_field(model.settings).items()},
+        **of_model,
+        **of_layout,
+        **{name: float(value) for name, value in settings.items()},
         "n_statistics": layout.statistics,
         "limits": model.limits.all_values,
         "inverse": model.inverse.all_values,

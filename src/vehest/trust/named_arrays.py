@@ -72,12 +72,6 @@ def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any,
     return kind(**arrays), begin
 
 
-def values_by_field(view: Any) -> dict[str, Any]:
-    """Field -> value of a named tuple that `views` returned, nested ones as they are."""
-    kind: Any = type(view)
-    return dict(zip(_fields(kind), view, strict=True))
-
-
 def allocated(kind: Any, sizes: Any) -> FloatArray:
     """A flat array of zeros for a named tuple.
 

@@ -309,8 +309,9 @@ def _gravity(search: Search) -> float:
 
 
 def _beyond(explaining: FloatArray, samples: FloatArray) -> FloatArray:
-    """What a signal (S,) does not explain of another: neither a scale nor a body that rolls in
-    proportion to ay matters.
+    """Residual of a signal's (S,) linear regression on another, (S,).
+
+    So neither a scale nor a body that rolls in proportion to ay matters.
     """
     rows = np.stack([explaining, np.ones(len(explaining))], axis=1)
     return np.asarray(samples - rows @ np.linalg.lstsq(rows, samples, rcond=None)[0])
@@ -318,9 +319,10 @@ def _beyond(explaining: FloatArray, samples: FloatArray) -> FloatArray:
 
 def _agreements_with_ax(search: Search, unit: str = "") -> list[tuple[Agreement, Candidate]]:
     """Agreements of d(vx)/dt with possible columns of ax, in ``unit`` where they have none."""
+    columns = [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
     return [
         (longitudinal(search.motion, column, [column.unit or unit] if unit else ()), column)
-        for column in [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
+        for column in columns
     ]
 
 
