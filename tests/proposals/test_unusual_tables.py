@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from mdf_log import write_mdf
 from planted_logs import G, drive, usual, write
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -18,6 +19,7 @@ from vehest.run.own_car.questions import ask
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.not_measured import codes_of_not_measured
+from vehest.sources.surveys import survey
 from vehest.sources.surveys.tables import survey_table
 
 
@@ -512,3 +514,31 @@ def test_codes_of_j1939_are_not_measured():
     code = 0xFFFF / 256.0
     assert codes_of_not_measured(np.r_[kilometres_an_hour, code, code]) == [code]
     assert codes_of_not_measured(np.r_[kilometres_an_hour, 200.25, 200.25]) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "largest"),
+    [
+        (0xFFFF / 8192.0 - 3.92, 0.6),  # rad/s
+        (np.degrees(0xFEFF / 8192.0 - 3.92), 30.0),
+        (0xFFFF / 2048.0 - 15.687, 9.0),  # m/s²
+        (round((0xFE00 / 2048.0 - 15.687) / 9.80665, 4), 0.9),  # g, at a table's digits
+        (0xFF / 10.0 - 12.5, 7.0),  # m/s²
+        (0xFFFF / 1024.0 - 31.374, 8.0),  # rad
+    ],
+)
+def test_codes_of_j1939_signals_with_an_offset_are_not_measured(code, largest):
+    measured = np.linspace(-largest, largest, 100)
+    assert codes_of_not_measured(np.r_[measured, code, code]) == [code]
+    assert codes_of_not_measured(np.r_[measured, code]) == []  # a spike
+    assert codes_of_not_measured(np.r_[measured, 1.01 * code, 1.01 * code]) == []
+    assert codes_of_not_measured(np.r_[np.linspace(-code, 0.98 * code, 100), code, code]) == []
+
+
+def test_a_measurement_of_raw_frames_is_refused_with_the_way_to_decode_them(tmp_path):
+    asammdf = pytest.importorskip("asammdf")
+    stamps = np.arange(100) / 50.0
+    identifiers = asammdf.Signal(np.full(100, 0x123), stamps, name="CAN_DataFrame.ID")
+    file = write_mdf(tmp_path / "bus.mf4", {"CAN": [identifiers]})
+    with pytest.raises(DataError, match=r"raw frames of a CAN bus.*extract_bus_logging"):
+        survey(file)

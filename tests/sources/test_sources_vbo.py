@@ -65,6 +65,17 @@ def test_time_goes_on_past_midnight_and_a_last_row_that_is_cut_off_or_late_is_le
     assert recording.provenance["rows_dropped_at_the_end"] == dropped
 
 
+def test_a_row_that_repeats_the_time_before_is_left_out_and_counted(tmp_path):
+    write_log(tmp_path / "lap.vbo")
+    expected = read(tmp_path)
+    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
+    lines = rows.splitlines(keepends=True)
+    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[399:]]))
+    recording = read(tmp_path)
+    assert recording.provenance["rows_dropped_with_repeated_times"] == 1
+    assert np.array_equal(recording["ay"], expected["ay"])
+
+
 def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(tmp_path):
     write_log(tmp_path / "lap.vbo")
     head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")

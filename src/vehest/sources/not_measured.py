@@ -4,11 +4,12 @@ as not measured.
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
 
-from vehest.constants import FloatArray
+from vehest.constants import GRAVITY, FloatArray
 
 # of integers, which a scale of a power of ten brings to 327.67 or 65.535
 _ENDS_OF_RANGE = frozenset(
@@ -19,8 +20,23 @@ _ENDS_OF_RANGE = frozenset(
 _NINES = frozenset(sign * (10**digits - 1) for digits in range(3, 10) for sign in (1, -1))
 DECIMAL_SCALES = (1.0, 10.0, 100.0, 1e3, 1e4)
 BINARY_SCALES = (16.0, 128.0, 256.0, 1024.0, 8192.0)  # of J1939: 65535 / 256 km/h is no speed
+# of SAE J1939-71, signals with an offset: steps per unit, offset, bits, and factor to another unit
+_J1939_SIGNALS = (
+    (8192.0, -3.92, 16, math.degrees(1.0)),  # yaw rate [rad/s], SPN 1808
+    (1024.0, -31.374, 16, math.degrees(1.0)),  # steering wheel angle [rad], SPN 1807
+    (2048.0, -15.687, 16, 1.0 / GRAVITY),  # lateral acceleration [m/s²], SPN 1809
+    (10.0, -12.5, 8, 1.0 / GRAVITY),  # longitudinal acceleration [m/s²], SPN 1810
+)
+_J1939_CODES = tuple(
+    factor * (raw / steps + offset)
+    for steps, offset, bits, other_unit in _J1939_SIGNALS
+    for raw in {(1 << bits) - 1, (0xFF << (bits - 8)) - 1, 0xFE << (bits - 8)}
+    for factor in (1.0, other_unit)
+)
 MIN_HUGE = 1e15  # beyond it a number of a log is a code such as 1e20 or 3.4e38
 MIN_CODES = 2  # samples; one alone may be a spike
+MIN_J1939_DISTANCE = 0.2  # of the range of the other samples; accelerations come near their codes
+MAX_J1939_DIFFERENCE = 5e-4  # relative, for a table's digits and another value of g
 
 _SYMBOLS = re.compile(r"[-–—*?]+|#[A-Z/0]+[!?]?", re.IGNORECASE)  # dashes; #VALUE!, #N/A
 _FILLERS = ("signal", "value", "data", "sensor", "is", "indicator", "code", "state")
@@ -60,7 +76,8 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
     """Numbers in a column that stand for a missing sample: -9999, 1e20, 327.67 and alike.
 
     Such a code occurs repeatedly and is further from all other values than these are from one
-    another.
+    another; a code of J1939's signals with an offset, such as a yaw rate of 4.07988 rad/s, than a
+    fifth of that.
 
     Parameters
     ----------
@@ -83,10 +100,18 @@ def codes_of_not_measured(values: FloatArray) -> list[float]:
         if len(measured) - len(samples) < MIN_CODES or len(samples) < 0.5 * len(values):
             continue
         distance = float(np.abs(samples - code).min())
-        if _looks_like_code(code) and distance > float(np.ptp(samples)) > 0.0:
+        value_range = float(np.ptp(samples))
+        if (_looks_like_code(code) and distance > value_range > 0.0) or (
+            _is_j1939_code(code) and distance > MIN_J1939_DISTANCE * value_range > 0.0
+        ):
             codes.append(code)
             measured = samples
     return codes
+
+
+def _is_j1939_code(value: float) -> bool:
+    """Whether a number is J1939's "not available" or "error" of a signal with an offset."""
+    return any(abs(value / code - 1.0) < MAX_J1939_DIFFERENCE for code in _J1939_CODES)
 
 
 def _looks_like_code(value: float) -> bool:

@@ -82,9 +82,7 @@ class Log:
     offsets: Mapping[
         str, tuple[float, float]
     ]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
-    provenance: Mapping[
-        str, Any
-    ]  # first line, offsets, and rows at the end that were cut off or came late
+    provenance: Mapping[str, Any]  # first line, offsets, and numbers of rows that were left out
 
 
 class VboSource(FileSource):
@@ -155,7 +153,7 @@ def read_log(file: Path) -> Log:
     """Everything in a log.
 
     A last row that is cut off, or comes more than half an interval late, as loggers write when they
-    are stopped, is left out.
+    are stopped, is left out, and so are rows whose time repeats that of the row before.
 
     Raises
     ------
@@ -185,8 +183,12 @@ def read_log(file: Path) -> Log:
     seconds = _seconds(columns.pop("time"), file)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
-        columns = {name: units[:-1] for name, units in columns.items()}
+        columns = {name: samples[:-1] for name, samples in columns.items()}
         seconds = seconds[:-1]
+    is_repeated = np.r_[False, np.diff(seconds) == 0.0]
+    if is_repeated.any():
+        columns = {name: samples[~is_repeated] for name, samples in columns.items()}
+        seconds = seconds[~is_repeated]
 
     units, modules = (
         _of_last_columns(names, sections.get(title, ""))
@@ -203,6 +205,8 @@ def read_log(file: Path) -> Log:
         },
         "rows_dropped_at_the_end": cut_off + late,
     }
+    if is_repeated.any():
+        provenance["rows_dropped_with_repeated_times"] = int(is_repeated.sum())
     return Log(
         columns,
         {name: unit for name, unit in {**UNITS, **units}.items() if unit},

@@ -177,8 +177,14 @@ def _survey_bag(path: Path) -> Log:
 
 
 def _survey_mdf(file: Path) -> Log:
-    """Signals of numbers, each with the times of its group."""
+    """Signals of numbers, each with the times of its group; raw frames of a bus are refused."""
     signals, skipped, about = read_measurement(file, None)
+    if signals and all("CAN_DataFrame" in name for name in signals):
+        extract = "extract_bus_logging({'CAN': [('car.dbc', 0)]})"
+        raise DataError(
+            f"'{file}' holds raw frames of a CAN bus; decode them by the bus's DBC, with asammdf "
+            f"by MDF('{file.name}').{extract}.save('{file.stem}_signals.mf4')"
+        )
     columns = []
     for key, signal in signals.items():
         place = about["signals"][key]
