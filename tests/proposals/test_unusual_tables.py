@@ -18,7 +18,7 @@ from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import ask
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
-from vehest.sources.not_measured import codes_of_not_measured
+from vehest.sources.not_measured import codes_of_not_measured, marks_not_measured
 from vehest.sources.surveys import survey
 from vehest.sources.surveys.tables import survey_table
 
@@ -507,6 +507,25 @@ def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table.assign(ay=d["ay"]))])
     with pytest.raises(ConfigurationError, match="column 'v' holds numbers with a unit"):
         ask(examined, [], interactive=False)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("SNA", "VS_SNA", "Signal Not Available", "Not Available or Not Installed"),
+        *("SignalNotDefined", "SignalError", "Out of range", "not received", "1.#INF"),
+        *("Fehlerwert", "Signal_nicht_verfuegbar", "Wert ungültig", "kein Wert"),
+    ],
+)
+def test_names_of_values_that_mark_a_missing_sample(text):
+    assert marks_not_measured(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["no error", "no", "N", "kein Fehler", "in range", "init ok", "none active", "low", "0"]
+)
+def test_names_of_values_that_are_measured(text):
+    assert not marks_not_measured(text)
 
 
 def test_codes_of_j1939_are_not_measured():

@@ -39,16 +39,25 @@ MIN_J1939_DISTANCE = 0.2  # of the range of the other samples; accelerations com
 MAX_J1939_DIFFERENCE = 5e-4  # relative, for a table's digits and another value of g
 
 _SYMBOLS = re.compile(r"[-–—*?]+|#[A-Z/0]+[!?]?", re.IGNORECASE)  # dashes; #VALUE!, #N/A
-_FILLERS = ("signal", "value", "data", "sensor", "is", "indicator", "code", "state")
+_FILLERS = (
+    *("signal", "value", "data", "sensor", "is", "indicator", "code", "state"),
+    *("wert", "signalwert", "daten"),
+)
+_NEGATIONS = (["no"], ["kein"], ["keine"])
 _WORDED_MARKS = """
     na nv nan sna snv inf ind qnan snan none null void
     missing invalid inv inval invld unknown undefined undef unavailable no
     notavailable notavail temporarilynotavailable notvalid notdefined notmeasured notknown reserved
-    error err fault faulty failure
+    notinstalled notavailableornotinstalled notsupported notreceived noreception
+    error err fault faulty failure defective defect lost timeout
+    implausible notplausible outofrange rangeexceeded overflow underflow
     init initial initialized initialised initializing initialising initialization initialisation
     notinitialized notinitialised
-    fehler ungueltig ungültig nichtgültig nichtgueltig undefiniert
-    nichtverfuegbar nichtverfügbar initialisierung
+    fehler signalfehler sensorfehler fehlerwert fehlerhaft defekt
+    ungueltig ungültig nichtgültig nichtgueltig undefiniert nichtdefiniert unplausibel
+    kein keine nichtverfuegbar nichtverfügbar nichtvorhanden nichtempfangen
+    ueberlauf überlauf unterlauf
+    initialisierung nichtinitialisiert initwert initialwert initialisierungswert
 """
 _PHRASES = frozenset(_WORDED_MARKS.split())
 
@@ -67,9 +76,11 @@ def marks_not_measured(text: str, signal: str = "") -> bool:
     """
     if _SYMBOLS.fullmatch(text.strip()):
         return True
-    words = re.findall(r"[^\W\d_]+", text.removeprefix(signal).lower())
+    worded = re.sub(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])", " ", text.removeprefix(signal)).lower()
+    words = re.findall(r"[^\W\d_]+", worded)
     phrase = [word for word in words if word not in _FILLERS]
-    return "".join(phrase) in _PHRASES and (phrase != ["no"] or len(words) > 1)
+    is_mark = "".join(phrase) in _PHRASES and (phrase not in _NEGATIONS or len(words) > 1)
+    return is_mark or "sna" in words  # signal not available, beside the name of any signal
 
 
 def codes_of_not_measured(values: FloatArray) -> list[float]:
