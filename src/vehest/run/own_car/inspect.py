@@ -90,6 +90,13 @@ class Examined:
         """The longest one."""
         return self.logs[0]
 
+    @property
+    def pose_columns(self) -> dict[str, dict[str, str]]:
+        """Part of the poses -> its column and unit, as a data set declares them."""
+        return {
+            part: {"column": column, "unit": unit} for part, column, unit in self.proposals.pose
+        }
+
     def in_words(self) -> list[str]:
         """Files and proposals for a terminal, a line each."""
         proposals = self.proposals

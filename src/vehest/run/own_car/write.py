@@ -340,7 +340,7 @@ def found_in(examined: Examined) -> dict[str, Any]:
         "time": None if examined.log.clock is None else asdict(examined.log.clock),
         "channels": [proposal.as_plain() for proposal in proposals.channels],
         "left_right": proposals.left_right or None,
-        "pose": {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose},
+        "pose": examined.pose_columns,
         "unused": list(proposals.unused),
         "vehicle": dict(examined.vehicle),
     }
