@@ -82,6 +82,11 @@ class Draft:
         return sum(self.durations.values())
 
     @property
+    def lowest_rate_hz(self) -> float:
+        """Of all recordings."""
+        return min(content.rate_hz for content in self.contents)
+
+    @property
     def channels(self) -> frozenset[str]:
         """Channels that all recordings have."""
         return common_channels(self.contents)

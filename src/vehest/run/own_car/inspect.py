@@ -106,8 +106,9 @@ class Examined:
             for proposal in proposals.channels
         ]
         lines += [f"  left/right: {proposals.left_right}"] if proposals.left_right else []
-        unused = [f"  columns without a channel: {counted(list(proposals.unused))}"]
-        return lines + (unused if proposals.unused else [])
+        if proposals.unused:
+            lines.append(f"  columns without a channel: {counted(proposals.unused)}")
+        return lines
 
 
 def inspect(
@@ -172,13 +173,12 @@ def inspect(
                 "files with the same columns"
             )
         proposals = proposals.keeping(remaining, notes)
+        assigned = {proposal.column for proposal in remaining}
         for column in longest.columns:
-            if (
-                column.name in {proposal.column for proposal in remaining}
-                and log.by_name[column.name].unit != column.unit
-            ):
+            unit = log.by_name[column.name].unit if column.name in assigned else column.unit
+            if unit != column.unit:
                 raise DataError(
-                    f"'{log.file}' has '{column.name}' in '{log.by_name[column.name].unit}', "
+                    f"'{log.file}' has '{column.name}' in '{unit}', "
                     f"'{longest.file}' in '{column.unit}'; use the same unit in both, or create a "
                     "data set for each"
                 )
@@ -196,43 +196,25 @@ def inspect(
     ]
     assigned_units = {proposal.column: proposal.unit for proposal in proposals.channels}
     foreign = [
-        column
+        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
+        f"motion it is {assigned_units[column.name]}"
         for column in longest.columns
         if column.name in assigned_units
         and column.unit.strip("-[]() 1")
         and plain_unit(column.unit) is None
-    ]
-    computed += [
-        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
-        f"motion it is {assigned_units[column.name]}"
-        for column in foreign
     ]
     shadowed = (
         [f"'{name}' is also a built-in data set; in this folder the name refers to yours"]
         if name in choices("dataset") and not existing
         else []
     )
-    proposals = replace(
-        proposals,
-        notes=(
-            *proposals.notes,
-            *computed,
-            *_notes(longest, logs),
-            *shadowed,
-        ),
-    )
-    timed = longest.seconds is not None or any(
-        column.stamps is not None for column in longest.columns
-    )
-    place = _place(files, longest.source)
-    rate = None if timed else proposals.rate_hz
     return Examined(
         name,
         tuple(files),
         (longest, *others),
-        proposals,
-        place,
-        rate,
+        proposals.with_notes(*computed, *foreign, *_notes(longest, logs), *shadowed),
+        _place(files, longest.source),
+        proposals.rate_hz,
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
 
@@ -347,11 +329,9 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     both_ways = (names, [name[::-1] for name in names])
     prefixes = map(os.path.commonprefix, both_ways)
     start, end = (prefix.rstrip("0123456789") for prefix in prefixes)
-    pattern = (
-        f"{glob.escape(start)}*{glob.escape(end[::-1])}"
-        if len(names) > 1
-        else glob.escape(names[0])
-    )
+    pattern = glob.escape(names[0])
+    if len(names) > 1:
+        pattern = f"{glob.escape(start)}*{glob.escape(end[::-1])}"
     unlisted = sorted(
         file.name for file in folder.iterdir() if file.is_file() and file.name not in names
     )

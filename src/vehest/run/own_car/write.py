@@ -196,10 +196,7 @@ def write(
     )
     texts = [_dataset_text(drafted, left)]
     if plan.sweeps:
-        texts += [
-            _split_text(drafted),
-            _pipeline_text(name, plan, TRAINED_SHARE * drafted.seconds / 60.0, drafted.contents),
-        ]
+        texts += [_split_text(drafted), _pipeline_text(drafted, plan)]
     else:
         plan.lacking.update(dict.fromkeys(added, "these recordings allow no comparison"))
     files = dict(zip(paths_of(name), texts, strict=False))
@@ -349,7 +346,7 @@ def found_in(examined: Examined) -> dict[str, Any]:
 def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
     return found_in(drafted.examined) | {
         "recordings": [content.id for content in drafted.contents],
-        "rate_hz": min(content.rate_hz for content in drafted.contents),
+        "rate_hz": drafted.lowest_rate_hz,
         "seconds": drafted.seconds,
         "open": [question.as_plain() for question in left],
         "steering_ratio_found": None
@@ -398,27 +395,17 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
     vehicle = drafted.examined.vehicle
     plan = Plan()
     values = _car(vehicle)
-    slowest = min(recording.rate_hz for recording in contents)
+    slowest = drafted.lowest_rate_hz
     cut = _divisible(drafted)
-    shares = (
-        [0.2 * drafted.durations[recording] for recording in cut]
-        if cut
-        else [drafted.durations[recording] for recording in _long_enough(drafted)]
-    )
-    seconds = min(shares, default=0.0)  # of the shortest range for validation
-    added_trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
-    trials = sorted(
-        [
-            *added_trials,
-            *(
-                (trial, name)
-                for name, family in estimator_classes().items()
-                for trial in family.trials
-            ),
-        ]
-    )
+    share = 0.2 if cut else 1.0
+    ranges = [share * drafted.durations[recording] for recording in cut or _long_enough(drafted)]
+    seconds = min(ranges, default=0.0)  # of the shortest range for validation
+    trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
+    trials += [
+        (trial, name) for name, family in estimator_classes().items() for trial in family.trials
+    ]
     sweeps: dict[tuple[str, str, int], list[str]] = {}
-    for trial, name in trials:
+    for trial, name in sorted(trials):
         sweeps.setdefault(trial[1:], []).append(name)
     for (about, overrides, samples), names in sweeps.items():
         if PRETRAINED in overrides and slowest < PRETRAINED_HZ * (1 - 1e-9):
@@ -452,15 +439,11 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
             plan.sweeps.append(([f"estimator={','.join(tried)}", *other_words, *settings], about))
             plan.estimators.extend(tried)
     tried_names = {name for names in sweeps.values() for name in names}
-    remaining = [
-        name for name in (*choices("estimator"), *estimator_names()) if name not in tried_names
-    ]
-    by_default = "not a default; add it by --with"
-    plan.lacking.update(dict.fromkeys(remaining, by_default))
-    broken = set(estimator_names()) - set(estimator_classes())
-    plan.lacking.update(
-        dict.fromkeys(broken, "it cannot be loaded; 'vehest data usable' names the reason")
-    )
+    for name in (*choices("estimator"), *estimator_names()):
+        if name not in tried_names:
+            plan.lacking[name] = "not a default; add it by --with"
+    for name in set(estimator_names()) - set(estimator_classes()):
+        plan.lacking[name] = "it cannot be loaded; 'vehest data usable' names the reason"
     return plan if plan.sweeps else Plan()
 
 
@@ -498,27 +481,24 @@ def _lack(
         usable = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error), ()
+    missing = [] if usable.settings_suffice else usable.missing.in_words()
+    lacks = [f"requires {', '.join(missing)}"] if missing else []
     min_seconds = samples / (usable.rate_hz or math.inf)
-    short = (
-        [
+    if min_seconds > seconds:
+        lacks.append(
             f"at least {min_seconds:.3g} s in each range for validation (the shortest has "
             f"{seconds:.3g} s)"
-        ]
-        if min_seconds > seconds
-        else []
-    )
-    missing = [] if usable.settings_suffice else usable.missing.in_words()
-    missing = [f"requires {', '.join(missing)}"] if missing else []
+        )
     settings = usable.settings if usable.settings_suffice else ()
-    return ", ".join([*missing, *short]) or usable.to_give, settings
+    return ", ".join(lacks) or usable.to_give, settings
 
 
-def _pipeline_of(
-    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
-) -> dict[str, Any]:
+def _pipeline_of(drafted: Draft, plan: Plan) -> dict[str, Any]:
     """A pipeline for study and split of a name: all recordings, then parts with less of the minutes
     of reference.
     """
+    name = drafted.examined.name
+    minutes = TRAINED_SHARE * drafted.seconds / 60.0
     parts: dict[str, Any] = {
         "all": {
             "title": "all recordings",
@@ -534,28 +514,25 @@ def _pipeline_of(
     ]
     for limit in MINUTES if "ksnn" in plan.estimators else ():
         if limit < 0.8 * minutes:
-            part = {
+            part = parts[f"minutes_{limit:g}"] = {
                 "title": f"{limit:g} min of reference",
                 "split": name,
                 "overrides": [f"++split.minutes={limit:g}"],
-            }
-            parts[f"minutes_{limit:g}"] = part | {
-                "sweeps": [["estimator=zero,static_map"], scratch]
+                "sweeps": [["estimator=zero,static_map"], scratch],
             }
             if any(PRETRAINED in words for words, _ in plan.sweeps):
-                tuned = {
+                parts[f"minutes_{limit:g}_tuned"] = part | {
                     "title": f"{part['title']}, trained on",
                     "sweeps": [[*scratch, PRETRAINED]],
                 }
-                parts[f"minutes_{limit:g}_tuned"] = part | tuned
-    evaluation = {"rate_hz": min([EVALUATED_HZ, *(content.rate_hz for content in contents)])}
-    study = {
+    return {
         "study": name,
         "title": f"Which estimator to trust on {name}",
         "report": "own_car",
         "publish": False,
+        "evaluation": {"rate_hz": min(EVALUATED_HZ, drafted.lowest_rate_hz)},
+        "parts": parts,
     }
-    return study | {"evaluation": evaluation, "parts": parts}
 
 
 def _limits(drafted: Draft) -> list[str]:
@@ -632,9 +609,8 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
     )
 
 
-def _pipeline_text(
-    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
-) -> str:
+def _pipeline_text(drafted: Draft, plan: Plan) -> str:
+    name = drafted.examined.name
     head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
@@ -642,7 +618,7 @@ def _pipeline_text(
         "Not included, with the reason:",
         *(f"  {estimator}: {lack}" for estimator, lack in plan.lacking.items()),
     ]
-    return _yaml(_pipeline_of(name, plan, minutes, contents), head)
+    return _yaml(_pipeline_of(drafted, plan), head)
 
 
 def _yaml(
