@@ -399,10 +399,10 @@ def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
     """
     require_no_spreadsheet(file)
     if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
-        remedy = (
-            f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
+        raise ConfigurationError(
+            f"'{file}' is no table; describe its signals once by 'vehest new NAME {file.name}', "
+            "then add dataset=NAME"
         )
-        raise ConfigurationError(f"'{file}' is no table; {remedy}")
     return open_source(dataset)
 
 
@@ -431,9 +431,9 @@ def source_class(dataset: Mapping[str, Any]) -> type[Source]:
         try:
             loaded = point.load()
         except Exception as error:  # a package may raise anything when it is imported
-            reason = f"{type(error).__name__}: {printable(first_line(error))}"
             raise ConfigurationError(
-                f"{location} of another package cannot be loaded ({reason}); repair or remove it"
+                f"{location} of another package cannot be loaded ({type(error).__name__}: "
+                f"{printable(first_line(error))}); repair or remove it"
             ) from error
         if not (isinstance(loaded, type) and issubclass(loaded, Source)):
             raise ConfigurationError(

@@ -172,8 +172,10 @@ def unevenness(stamps: FloatArray) -> str:
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
         number = number_of((steps > GAP * step).sum(), "gap")
-        gaps = f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
-        return f"{gaps} (interval {step:.6g} s)"
+        return (
+            f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s "
+            f"(interval {step:.6g} s)"
+        )
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
         return f"intervals deviate by up to {100 * jitter:.2g} % from the median of {step:.6g} s"
@@ -563,10 +565,9 @@ def common_span(spans: Mapping[str, tuple[float, float]], location: str) -> tupl
     begin = spans[late][0]
     end = spans[early][1]
     if begin >= end:
-        fault = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
         raise DataError(
-            f"{location}: {fault}: nothing is common to all; leave one out, declare it gappy or "
-            "take stamps of one clock"
+            f"{location}: {late} begins at {begin:.6g} s, {early} ends at {end:.6g} s: nothing is "
+            "common to all; leave one out, declare it gappy or take stamps of one clock"
         )
     return begin, end
 

@@ -68,11 +68,11 @@ class TablePose(PoseOptions):
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                fault = (
-                    f"pose column '{self.columns[name].column}' holds no number in {len(odd)} "
-                    f"rows of the run, first in row {odd[0] + 1}"
+                raise DataError(
+                    f"{location}: pose column '{self.columns[name].column}' holds no number in "
+                    f"{len(odd)} rows of the run, first in row {odd[0] + 1}; leave them out by "
+                    "drop_rows"
                 )
-                raise DataError(f"{location}: {fault}; leave them out by drop_rows")
         x, y, yaw = (
             clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"]))
         )

@@ -203,8 +203,10 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
     """
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
-        location = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
-        raise DataError(f"'{file}': {location}; runs are counted in whole numbers")
+        raise DataError(
+            f"'{file}': column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}; runs "
+            "are counted in whole numbers"
+        )
     runs: dict[int | None, slice] = {}
     for rows in stretches(np.diff(numbers) != 0, len(numbers)):
         run = int(numbers[rows.start])

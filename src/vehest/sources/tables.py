@@ -517,11 +517,10 @@ def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) 
     if cell is not None and layout is not None:
         name = column_names(file, layout)[int(cell[1])]
         above = layout.skip_rows + layout.rows_below_names + (layout.names is None)
-        location = (
-            f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row "
-            f"{int(cell[2]) - above}"
+        return DataError(
+            f"'{file}': column '{name}' holds the text '{printable(cell[3][:40])}' in data row "
+            f"{int(cell[2]) - above}; numbers are needed"
         )
-        return DataError(f"'{file}': {location}; numbers are needed")
     problem = (
         f"a line is longer than {BLOCK} bytes"
         if "straddl" in str(error)

@@ -241,10 +241,9 @@ class TabularSource(FileSource):
         names = column_names(file, self.layout)
         columns = self.columns_of(names)
         if not columns:
-            problem = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(
-                f"'{file}' {problem}; describe them by 'vehest new NAME {file.name}', then add "
-                "dataset=NAME"
+                f"'{file}' has no column that is named like a channel (it has {listed(names)}); "
+                f"describe them by 'vehest new NAME {file.name}', then add dataset=NAME"
             )
         return columns
 

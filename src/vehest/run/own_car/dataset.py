@@ -133,10 +133,9 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        causes = f"duplicates, text, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
         notes.append(
-            f"data rows of '{stem}' left out by drop_rows ({causes}): "
-            f"{counted([str(row) for row in rows])}"
+            f"data rows of '{stem}' left out by drop_rows (duplicates, text, or no sample for "
+            f"{MAX_BRIDGED_SECONDS:g} s or more): {counted([str(row) for row in rows])}"
         )
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:

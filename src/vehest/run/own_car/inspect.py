@@ -178,9 +178,8 @@ def inspect(
             unit = log.by_name[column.name].unit if column.name in assigned else column.unit
             if unit != column.unit:
                 raise DataError(
-                    f"'{log.file}' has '{column.name}' in '{unit}', "
-                    f"'{longest.file}' in '{column.unit}'; use the same unit in both, or create a "
-                    "data set for each"
+                    f"'{log.file}' has '{column.name}' in '{unit}', '{longest.file}' in "
+                    f"'{column.unit}'; use the same unit in both, or create a data set for each"
                 )
         proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:

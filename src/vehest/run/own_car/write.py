@@ -130,9 +130,9 @@ def registered(word: str) -> str:
             f'[project.entry-points."{ENTRY_POINTS}"], NAME = '
             f'"{word if ":" in word else "package.module:Class"}"'
         )
-        problem = f"no installed package declares the estimator '{word}'"
         raise ConfigurationError(
-            f"{problem}; its pyproject.toml needs, under {declared}; then install it with pip"
+            f"no installed package declares the estimator '{word}'; its pyproject.toml needs, "
+            f"under {declared}; then install it with pip"
         )
     if name not in choices("estimator"):
         raise ConfigurationError(_without_settings_file(name))
@@ -546,11 +546,10 @@ def _limits(drafted: Draft) -> list[str]:
     if missing:
         return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
     if _is_too_short(drafted):
-        lengths = f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')}"
         return [
-            f"{lengths} are too short for training, validation and a test: record two minutes or "
-            "more with bends, or three drives or more, "
-            f"with the reference; until then {_without_reference(drafted)}"
+            f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')} are too "
+            "short for training, validation and a test: record two minutes or more with bends, or "
+            f"three drives or more, with the reference; until then {_without_reference(drafted)}"
         ]
     if not _divisible(drafted):
         return [

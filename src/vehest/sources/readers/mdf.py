@@ -354,9 +354,9 @@ def _group_of(
         for block in described.get_data_blocks()
     )
     if present < count * record:
-        fault = f"holds {present // record} samples, its header says {count}"
         raise DataError(
-            f"'{file}': signal '{first}' of group {title} {fault}; the file is truncated or damaged"
+            f"'{file}': signal '{first}' of group {title} holds {present // record} samples, its "
+            f"header says {count}; the file is truncated or damaged"
         )
     read: dict[str, int] = {}
     location_of = {

@@ -118,9 +118,9 @@ def _survey(path: Path) -> Log:
     """
     ending = path.suffix.lower()
     if ending == ".mat":
-        table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
         raise DataError(
-            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}"
+            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by "
+            f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
         )
     if ending in CAN:
         raise DataError(

@@ -496,11 +496,10 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
             return table, [left_out, *texts] if left_out else texts
         except DAMAGE as error:
             problem = printable(first_line(error))
-    why = (
-        "is it truncated, is a line of text or a second table below its rows, or are its columns "
-        "aligned by blanks?"
+    raise DataError(
+        f"'{file}' cannot be read as a table ({problem}); is it truncated, is a line of text or a "
+        "second table below its rows, or are its columns aligned by blanks?"
     )
-    raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
 def _numbers(
