@@ -5,7 +5,7 @@ Names, units and signs are declared in conf/dataset.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -292,10 +292,13 @@ class TabularSource(FileSource):
             )
         clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         sampled_channels = () if self.held is None else self.held.channels
-        even_columns = {
-            name: column for name, column in columns.items() if name not in sampled_channels
+        channels = {
+            name: clock.align(
+                column.to_si(values[column.column], channel(name).unit), name in self.gappy
+            )
+            for name, column in columns.items()
+            if name not in sampled_channels
         }
-        channels = _on_clock(even_columns, values, clock, self.gappy)
         provenance: dict[str, Any] = (
             {"file": file.name}
             | ({} if run is None else {"run": run})
@@ -348,19 +351,6 @@ class TabularSource(FileSource):
         sparse = {*self.gappy, *(self.held.channels if self.held else ())}
         columns = self._columns_of(file)
         return list({column.column: None for name, column in columns.items() if name not in sparse})
-
-
-def _on_clock(
-    columns: Mapping[str, Column],
-    values: Mapping[str, FloatArray],
-    clock: Clock,
-    gappy: Collection[str],
-) -> dict[str, FloatArray]:
-    """Channels in SI units, a sample a tick."""
-    return {
-        name: clock.align(column.to_si(values[column.column], channel(name).unit), name in gappy)
-        for name, column in columns.items()
-    }
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:

@@ -334,16 +334,19 @@ def _group_of(
     """
     title = _title(measurement, group)
     described = measurement.groups[group]
-    first = _short_name(described.channels[next(iter(indices.values()))].name)
     clock = measurement.masters_db.get(group)
+    indices_read = {"": clock, **indices}
+    location_of = {
+        key: f"'{file}': signal '{_short_name(described.channels[index].name)}' of group {title}"
+        for key, index in indices_read.items()
+        if index is not None
+    }
+    first = location_of[next(iter(indices))]
     if (
         clock is None
         or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME
     ):
-        raise DataError(
-            f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no "
-            "master channel of time"
-        )
+        raise DataError(f"{first} has no time stamps: its group has no master channel of time")
     count = described.channel_group.cycles_nr
     check_limit("samples", count, f"'{file}': group {title} says that it holds {count} samples")
     record = described.channel_group.samples_byte_nr + (
@@ -355,15 +358,11 @@ def _group_of(
     )
     if present < count * record:
         raise DataError(
-            f"'{file}': signal '{first}' of group {title} holds {present // record} samples, its "
-            f"header says {count}; the file is truncated or damaged"
+            f"{first} holds {present // record} samples, its header says {count}; the file is "
+            "truncated or damaged"
         )
     read: dict[str, int] = {}
-    location_of = {
-        key: f"'{file}': signal '{_short_name(described.channels[index].name)}' of group {title}"
-        for key, index in {"": clock, **indices}.items()
-    }
-    for key, index in {"": clock, **indices}.items():
+    for key, index in indices_read.items():
         with _or_skip(skipped if key else None, file):
             _require_number(measurement, group, index, location_of[key])
             read[key] = index

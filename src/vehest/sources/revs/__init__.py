@@ -132,12 +132,11 @@ class RevsSource(FileSource):
         clock = uniform_clock(
             self.time.to_si(samples[self.time.column], "s"), f"'{path}'", options.clock
         )
-        values = {
-            name: clock.align(samples[name], name in self.gappy_columns)
-            for name in self.column_names
-        }
         channels = {
-            name: column.to_si(values[column.column], channel(name).unit)
+            name: column.to_si(
+                clock.align(samples[column.column], column.column in self.gappy_columns),
+                channel(name).unit,
+            )
             for name, column in self.columns.items()
         }
         provenance = {"layout": options.layout, **origin}
@@ -156,12 +155,11 @@ class RevsSource(FileSource):
         )
         if self.options.units_row == "check":
             for name, column in self.columns.items():
-                location = f"'{file}': column '{column.column}'"
                 require_unit(
                     units[column.column],
                     column,
                     channel(name).unit,
-                    location,
+                    f"'{file}': column '{column.column}'",
                     "set units_row: ignore",
                 )
         return values, about

@@ -81,13 +81,11 @@ class RosbagSource(FileSource):
         if pose := self.options.pose:
             fields += [(pose.topic, f"{pose.field}.{part}") for part in POSE_FIELDS]
         declared = self.options.topics or {}
-        self.topics = {
-            name: declared[name] for name in declared if any(topic == name for topic, _ in fields)
-        }
         self.fields = {
             name: list(dict.fromkeys(field for topic, field in fields if topic == name))
-            for name in self.topics
+            for name in declared
         }
+        self.topics = {name: topic for name, topic in declared.items() if self.fields[name]}
 
     def inputs(self) -> dict[str, str | Path]:
         """Archives and files of bags."""
@@ -128,12 +126,9 @@ class RosbagSource(FileSource):
         channels = {}
         for name, declared in self.channels.items():
             topic_series = series[declared.topic]
-            values = series[declared.topic].fields[declared.field]
-            values = self.columns[name].to_si(
-                values - declared.offset if declared.offset else values, channel(name).unit
-            )
+            values = topic_series.fields[declared.field] - declared.offset
             channels[name] = at_ticks(
-                values,
+                self.columns[name].to_si(values, channel(name).unit),
                 topic_series.times,
                 grid,
                 hold=topic_series.topic.interpolation == "hold",
