@@ -54,6 +54,9 @@ class Point:
     y: float = 0.0
 
 
+Place = Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"]
+
+
 @dataclass(frozen=True)
 class CommonOptions:
     """Options of every data set; see docs/data.md."""
@@ -71,12 +74,8 @@ class CommonOptions:
         Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None
     ) = None
     transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
-    reference_point: (
-        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
-    ) = None
-    imu_point: (
-        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
-    ) = None
+    reference_point: Place | None = None
+    imu_point: Place | None = None
 
 
 COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))

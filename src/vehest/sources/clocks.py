@@ -211,23 +211,18 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, locat
     bad = np.flatnonzero(~np.isfinite(values))
     steps = np.diff(times)
     if len(bad):
-        fault = (
-            f"{number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
-            f"{times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
-        )
         raise DataError(
-            f"{location} holds {fault}; cut the range out, or declare the channel gappy"
+            f"{location} holds {number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
+            f"{times[bad[-1]]:.6g} s that are marked invalid or no finite numbers; cut the range "
+            "out, or declare the channel gappy"
         )
     at = int(np.argmax(steps))
     if steps[at] > longest:
-        fault = (
-            f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of "
-            f"{(steps > longest).sum()} above {longest:.6g} s"
-        )
         raise DataError(
-            f"{location} has {fault}; raise its max_gap where values may be interpolated over "
-            "that time, "
-            "or end the recording there: by the data set's max_gap, or by cutting the range out"
+            f"{location} has a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of "
+            f"{(steps > longest).sum()} above {longest:.6g} s; raise its max_gap where values may "
+            "be interpolated over that time, or end the recording there: by the data set's "
+            "max_gap, or by cutting the range out"
         )
 
 
@@ -416,7 +411,7 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
             np.abs(block - block[0] - block_step * np.arange(len(block))).max()
         )  # away from the block's own line
         lines.append((count, len(block) - 1, float(block[0]), block_step, deviation))
-        count = count + len(block)
+        count += len(block)
         before = block[-1:]
     if not MIN_SAMPLES_OF_CLOCK < count < MOST_STEPS:
         return None
@@ -492,11 +487,10 @@ def uniform_times(
     step, first = _robust_line(number, stamps)
     measured_rate_hz = 1.0 / step if step > 0 else math.inf
     if not abs(measured_rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE:
-        fault = (
-            f"samples come at {measured_rate_hz:.6g} Hz, not at {rate_hz:g} Hz: samples are "
-            "missing, or the rate is another one"
+        raise DataError(
+            f"{location}: samples come at {measured_rate_hz:.6g} Hz, not at {rate_hz:g} Hz: "
+            f"samples are missing, or the rate is another one; {fix}"
         )
-        raise DataError(f"{location}: {fault}; {fix}")
     times = first + step * number
     late = stamps - times
     # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ class FileSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self._runs_of = lru_cache(None)(self._selected_runs)
+        self._runs_of = cache(self._selected_runs)
 
     def ids(self) -> list[str]:
         """Names of the recordings, in alphabetical order of the files and in that of a file's

@@ -229,7 +229,7 @@ class SignalSource(FileSource):
             It is damaged, contradicts a declared unit, or its signals leave gaps, are faster than
             the raster, or have no time in common.
         """
-        (signals, provenance) = self._signals(file)
+        signals, provenance = self._signals(file)
         number = {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():

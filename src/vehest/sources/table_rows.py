@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -67,7 +67,7 @@ def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
         Counts that go on, shape (T,).
     """
     wraps = np.cumsum(np.diff(times, prepend=times[:1]) < -0.5 * wraps_at)
-    return np.asarray(times + wraps_at * wraps, dtype=np.float64)
+    return times + wraps_at * wraps
 
 
 def dropped_rows_from_config(
@@ -112,7 +112,7 @@ def _rows(row: int | str, location: str) -> slice:
 
 
 def remaining_files(
-    files: Sequence[Path], exclude: Iterable[str], dropped: Iterable[str], location: str
+    files: Sequence[Path], exclude: Collection[str], dropped: Iterable[str], location: str
 ) -> list[Path]:
     """Files that a data set does not exclude.
 
@@ -120,7 +120,7 @@ def remaining_files(
     ----------
     files : sequence of Path
         Files of the data set.
-    exclude : iterable of str
+    exclude : collection of str
         Patterns over the files' stems, which distinguish upper and lower case.
     dropped : iterable of str
         Stems of files of which rows are left out.
@@ -132,13 +132,12 @@ def remaining_files(
     MissingError
         A pattern, or a stem of ``dropped``, matches no file, or none remains.
     """
-    patterns = list(exclude)
-    for option, names in (("exclude", patterns), ("drop_rows", dropped)):
+    for option, names in (("exclude", exclude), ("drop_rows", dropped)):
         for name in names:
             if not any(name == file.stem or fnmatchcase(file.stem, name) for file in files):
                 raise MissingError(f"{location}: {option} names '{name}', which no file is called")
     remaining = [
-        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
+        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in exclude)
     ]
     if not remaining:
         raise MissingError(f"{location}: exclude leaves none of its files")

@@ -89,13 +89,14 @@ class RevsSource(FileSource):
     def inputs(self) -> dict[str, str | Path]:
         """Every file that is read."""
         folder = self._folder()
-        files = {
+        files: dict[str, str | Path] = {
             file.relative_to(folder).as_posix(): file
             for name in self.ids()
             for file in self._files_of(name).values()
         }
-        parameters = self._parameters_file()
-        return dict(files) if parameters is None else {**files, parameters.name: parameters}
+        if parameters := self._parameters_file():
+            files[parameters.name] = parameters
+        return files
 
     def file_names(self) -> list[str]:
         """Files of the named recordings in the official layout, and the table of vehicle
@@ -140,8 +141,7 @@ class RevsSource(FileSource):
             for name, column in self.columns.items()
         }
         provenance = {"layout": options.layout, **origin}
-        parameters = self._parameters_file()
-        if parameters is not None:
+        if parameters := self._parameters_file():
             provenance["vehicle_parameters"] = read_vehicle_parameters(parameters)
         return self._recording(recording_id, f"'{path}'", clock, channels, provenance)
 
