@@ -199,11 +199,10 @@ class Source(ABC):
         if isinstance(self.reference_point, Point) and any(
             isinstance(transform, ScaleToWheelbase) for transform in self.transforms
         ):
-            problem = (
-                "reference_point does not go with scale_to_wheelbase; put the transform "
-                "reference_lever before it instead"
+            raise ConfigurationError(
+                f"{self.location}: reference_point does not go with scale_to_wheelbase; put the "
+                "transform reference_lever before it instead"
             )
-            raise ConfigurationError(f"{self.location}: {problem}")
         if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
             raise ConfigurationError(
                 f"{self.location}: source '{SIMULATED}' makes simulated recordings; leave kind out"

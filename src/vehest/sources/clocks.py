@@ -171,10 +171,9 @@ def unevenness(stamps: FloatArray) -> str:
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
-        number = number_of((steps > GAP * step).sum(), "gap")
         return (
-            f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s "
-            f"(interval {step:.6g} s)"
+            f"{number_of((steps > GAP * step).sum(), 'gap')}, the longest of "
+            f"{steps[longest]:.6g} s after {stamps[longest]:.12g} s (interval {step:.6g} s)"
         )
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
@@ -707,11 +706,8 @@ def plain_rate(rate: float, tolerance: float) -> float:
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale
         interval = round(1e3 * scale / rate) / (1e3 * scale)
-        candidates = [
-            candidate
-            for candidate in (hertz, 1.0 / interval if interval else 0.0)
-            if abs(candidate / rate - 1.0) <= tolerance
-        ]
-        if candidates:
-            return min(candidates, key=lambda candidate: abs(candidate - rate))
+        candidates = (hertz, 1.0 / interval if interval else 0.0)
+        nearest = min(candidates, key=lambda candidate: abs(candidate - rate))
+        if abs(nearest / rate - 1.0) <= tolerance:
+            return nearest
     return rate

@@ -173,8 +173,10 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
         limits = {
             resource.RLIMIT_DATA: int(order["memory"]),
             resource.RLIMIT_CPU: int(order["seconds"]),
+            resource.RLIMIT_FSIZE: 0,
+            resource.RLIMIT_CORE: 0,
         }
-        for kind, limit in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
+        for kind, limit in limits.items():
             with suppress(ValueError, OSError):
                 resource.setrlimit(kind, (limit, limit))
     try:

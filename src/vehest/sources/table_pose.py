@@ -73,12 +73,9 @@ class TablePose(PoseOptions):
                     f"{len(odd)} rows of the run, first in row {odd[0] + 1}; leave them out by "
                     "drop_rows"
                 )
-        x, y, yaw = (
-            clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"]))
-        )
-        return self.references(
-            np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, location
-        )
+        positions = np.stack([clock.align(poses[axis]) for axis in "xy"], axis=1)
+        yaw = clock.align(np.unwrap(poses["yaw"]))
+        return self.references(positions, yaw, 1.0 / clock.rate_hz, self.yaw_offset, location)
 
 
 def table_pose_from_config(entry: Any, location: str) -> TablePose:

@@ -17,6 +17,8 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.sources.clocks import bridged
 from vehest.sources.columns import Column, Positive
 
+Runs = Mapping[int | None, slice]
+"""Number of each run -> its rows; None where runs are not distinguished."""
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
 
 
@@ -178,7 +180,7 @@ def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray
     return is_remaining
 
 
-def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
+def counted_runs(numbers: FloatArray, column: str, file: Path) -> Runs:
     """Rows of each run that a column of whole numbers counts.
 
     Parameters
@@ -224,7 +226,7 @@ def timed_runs(
     *,
     restarts: bool,
     columns: Iterable[FloatArray] = (),
-) -> dict[int | None, slice]:
+) -> Runs:
     """Rows of each run of a table.
 
     Parameters

@@ -325,9 +325,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = log.by_name
     if log.source == "rosbag":
-        return dataset | _bag_options(columns, proposals.channels)
+        return dataset | _bag_options(examined)
     if log.source == "mdf":
-        return dataset | _mdf_options(columns, proposals.channels)
+        return dataset | _mdf_options(examined)
     dataset |= log.options
     clock = log.clock
     if log.source != "vbo":
@@ -446,12 +446,12 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     return gap_seconds
 
 
-def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+def _mdf_options(examined: Examined) -> dict[str, Any]:
     channels = {}
     rates = []
     paused = False
-    for proposal in proposals:
-        column = columns[proposal.column]
+    for proposal in examined.proposals.channels:
+        column = examined.log.by_name[proposal.column]
         rate, gap = _rate_and_gap(column, MAX_BRIDGED_SECONDS)
         rates.append(rate)
         paused |= gap < _rate_and_gap(column)[1]
@@ -466,12 +466,12 @@ def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     }
 
 
-def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+def _bag_options(examined: Examined) -> dict[str, Any]:
     topics: dict[str, dict[str, Any]] = {}
     channels: dict[str, dict[str, Any]] = {}
     rates = []
-    for proposal in proposals:
-        column = columns[proposal.column]
+    for proposal in examined.proposals.channels:
+        column = examined.log.by_name[proposal.column]
         place = column.place
         short = str(place["topic"]).strip("/").replace("/", "_")
         rate, gap = _rate_and_gap(column)
@@ -520,18 +520,10 @@ def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[
         for limits, samples in channels
     ):
         return []
-    assigned = {proposal.column for proposal in examined.proposals.channels}
-    rates = [
-        rate_of(column.stamps)
-        for column in examined.log.columns
-        if column.stamps is not None and column.name in assigned
-    ]
-    return [
-        {
-            "name": "bridge_impossible",
-            **({"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {}),
-        }
-    ]
+    columns = [examined.log.by_name[proposal.column] for proposal in examined.proposals.channels]
+    rates = [rate_of(column.stamps) for column in columns if column.stamps is not None]
+    beside = {"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {}
+    return [{"name": "bridge_impossible", **beside}]
 
 
 def _transforms(

@@ -10,7 +10,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -317,11 +317,11 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
             "for each folder"
         )
     names = sorted({file.name for file in files})
-    for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
-        if Path(first).stem == Path(second).stem:
-            raise ConfigurationError(
-                f"two files are called '{Path(first).stem}'; a recording's name must be unique"
-            )
+    stems = [Path(name).stem for name in names]
+    if doubled := [stem for stem in stems if stems.count(stem) > 1]:
+        raise ConfigurationError(
+            f"two files are called '{min(doubled)}'; a recording's name must be unique"
+        )
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}

@@ -194,17 +194,21 @@ def write(
         if "vy_ref" in drafted.channels and not _is_too_short(drafted)
         else Plan()
     )
-    texts = [_dataset_text(drafted, left)]
+    contents = [(_dataset_text(drafted, left), "channels, units and signs of the columns")]
     if plan.sweeps:
-        texts += [_split_text(drafted), _pipeline_text(drafted, plan)]
+        tried = ", ".join(dict.fromkeys(plan.estimators))
+        contents += [
+            (_split_text(drafted), "ranges for training, validation and test"),
+            (_pipeline_text(drafted, plan), f"estimators: {tried}"),
+        ]
     else:
         plan.lacking.update(dict.fromkeys(added, "these recordings allow no comparison"))
-    files = dict(zip(paths_of(name), texts, strict=False))
+    files = dict(zip(paths_of(name), contents, strict=False))
     # of an earlier data set of this name; these recordings do not allow them
     stale = [file for file in paths_of(name)[len(files) :] if file.exists()]
     if not dry_run:
         with ExitStack() as stack:
-            for file, text in files.items():
+            for file, (text, _) in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
         for file in stale:
             file.unlink()
@@ -215,15 +219,11 @@ def write(
         "next": following,
         "dry_run": dry_run,
     }
-    purposes = (
-        "channels, units and signs of the columns",
-        "ranges for training, validation and test",
-    )
     lines = _words(drafted, plan, left)
-    for file, purpose in zip(
-        files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False
-    ):
-        lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
+    lines += [
+        f"{'would write' if dry_run else 'wrote'} {file}: {purpose}"
+        for file, (_, purpose) in files.items()
+    ]
     lines += [
         f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it"
         for file in stale
@@ -298,33 +298,18 @@ def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
         return [*commands, f"vehest run {name} --minutes 15"]
     if file.is_dir() or not longest.channels.issuperset(FILTER_CHANNELS):
         return commands
-    file = next(
-        (
-            candidate
-            for candidate in drafted.examined.files
-            if longest.id
-            in (candidate.stem, f"{candidate.stem}_run_{longest.id.rpartition('_')[2]}")
-        ),
-        file,
-    )
-    run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
-    settings = (
-        []
-        if drafted.examined.vehicle["wheelbase"]
-        else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
-    )
-    words = [
-        "vehest",
-        "estimate",
-        str(file),
-        f"dataset={name}",
-        *run,
-        *settings,
-        "-o",
-        "estimate.parquet",
-    ]
+    number = longest.id.rpartition("_")[2]
+    for candidate in drafted.examined.files:
+        if longest.id in (candidate.stem, f"{candidate.stem}_run_{number}"):
+            file = candidate
+            break
+    words = ["vehest", "estimate", str(file), f"dataset={name}"]
+    if longest.id != file.stem:
+        words.append(f"+dataset.run={number}")
+    if not drafted.examined.vehicle["wheelbase"]:
+        words.append(f"estimator.wheelbase={ASSUMED_WHEELBASE:g}")
     # double quotes around blanks, which shells of Windows and POSIX read
-    return [*commands, list2cmdline(words)]
+    return [*commands, list2cmdline([*words, "-o", "estimate.parquet"])]
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -339,7 +324,7 @@ def found_in(examined: Examined) -> dict[str, Any]:
         "left_right": proposals.left_right or None,
         "pose": examined.pose_columns,
         "unused": list(proposals.unused),
-        "vehicle": dict(examined.vehicle),
+        "vehicle": examined.vehicle,
     }
 
 
@@ -620,9 +605,7 @@ def _pipeline_text(drafted: Draft, plan: Plan) -> str:
     return _yaml(_pipeline_of(drafted, plan), head)
 
 
-def _yaml(
-    content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None
-) -> str:
+def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] = {}) -> str:
     """YAML below a comment, with further comments behind some keys."""
     lines = yaml.safe_dump(
         dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False
@@ -633,10 +616,9 @@ def _yaml(
                 f"'{printable(line.strip()[:60])}' contains '${{', which configurations read as a "
                 "reference; rename it"
             )
-    printable_comments = {key: printable(comment) for key, comment in (comments or {}).items()}
     behind = [
-        f"{line:<44} # {printable_comments[key]}"
-        if (key := line.partition(":")[0]) in printable_comments
+        f"{line:<44} # {printable(comments[key])}"
+        if (key := line.partition(":")[0]) in comments
         else line
         for line in lines
     ]

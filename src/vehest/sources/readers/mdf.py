@@ -129,10 +129,9 @@ def read(
                     "title": _title(measurement, group),
                     "unit": unit,
                 }
-        start = measurement.header.start_time.isoformat()
         return arrays, {
             "version": measurement.version,
-            "start": start,
+            "start": measurement.header.start_time.isoformat(),
             "signals": signals,
             "skipped": skipped or [],
         }
@@ -385,8 +384,7 @@ def _require_number(measurement: Any, group: int, index: int, location: str) -> 
     """
     described = measurement.groups[group]
     channel = described.channels[index]
-    dependencies = described.channel_dependencies[index]
-    if dependencies:
+    if described.channel_dependencies[index]:
         raise DataError(
             f"{location} holds an array or structure; numbers are needed: name another signal"
         )

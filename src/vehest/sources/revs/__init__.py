@@ -72,13 +72,10 @@ class RevsSource(FileSource):
         if self.options.recordings is not None:
             return [name.removesuffix(suffix) for name in self.options.recordings]
         pattern = f"{self.options.files or '*'}{suffix}"
-        paths = [
-            path for path in sorted(self._folder().glob(pattern)) if path.is_dir() == (not suffix)
-        ]
         names = [
             path.name.removesuffix(suffix)
-            for path in paths
-            if path.name != self.options.vehicle_parameters
+            for path in sorted(self._folder().glob(pattern))
+            if path.is_dir() == (not suffix) and path.name != self.options.vehicle_parameters
         ]
         if not names:
             raise MissingError(

@@ -261,11 +261,7 @@ def _averaging(width: int) -> FloatArray:
 
     Of an even width the outermost two weigh half.
     """
-    if width % 2:
-        return np.full(width, 1.0 / width)
-    kernel = np.full(width + 1, 1.0 / width)
-    kernel[[0, -1]] /= 2.0
-    return kernel
+    return np.convolve(np.ones(width), [1.0] if width % 2 else [0.5, 0.5]) / width
 
 
 SOURCE = RosbagSource

@@ -165,10 +165,8 @@ def survey_table(file: Path) -> Log:
             f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names"
         )
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    times_and_values = {**clocks, **values}
-    stamps, seconds, runs, cuts = find_clock(
-        times_and_values, {**written, **dict.fromkeys(clocks, "s")}
-    )
+    times_and_values = clocks | values
+    stamps, seconds, runs, cuts = find_clock(times_and_values, written | dict.fromkeys(clocks, "s"))
     if stamps is not None and stamps.column in clocks:
         stamps = replace(
             stamps,
@@ -183,13 +181,13 @@ def survey_table(file: Path) -> Log:
     }
     faults = [
         _fault(name, times)
-        for name, times in {**clocks, **named}.items()
+        for name, times in (clocks | named).items()
         if stamps is None or name != stamps.column
     ]
     if stamps is not None and stamps.repair.get("sort"):
         rows = np.argsort(times_and_values[stamps.column], kind="stable")
         values = {name: samples[rows] for name, samples in values.items()}
-    options = {**options, **cuts}
+    options |= cuts
     beside = {stamps.column if stamps else None, cuts.get("runs")}
     columns = [
         RawColumn(name, written[name], samples, {"column": name})
