@@ -84,8 +84,12 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
         "seconds": seconds,
         "memory": memory,
     }
-    environment = {**os.environ, **_SINGLE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    environment = {
+        **os.environ,
+        **_SINGLE_THREAD,
+        "ARROW_DEFAULT_MEMORY_POOL": "system",
+        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+    }
     with subprocess.Popen(
         _COMMAND,
         stdin=subprocess.PIPE,
