@@ -401,10 +401,9 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
             if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)
         ]
         car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
-        words = overrides.replace("{car}", car).format(**values).split()
         words = [
             word
-            for word in words
+            for word in overrides.replace("{car}", car).format(**values).split()
             if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
         ]
         options = ", ".join(f"--{name}" for name in unknown)
