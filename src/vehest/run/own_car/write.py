@@ -477,48 +477,6 @@ def _lack(
     return ", ".join(lacks) or usable.to_give, settings
 
 
-def _pipeline_of(drafted: Draft, plan: Plan) -> dict[str, Any]:
-    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes
-    of reference.
-    """
-    name = drafted.examined.name
-    minutes = TRAINED_SHARE * drafted.seconds / 60.0
-    parts: dict[str, Any] = {
-        "all": {
-            "title": "all recordings",
-            "split": name,
-            "sweeps": [words for words, _ in plan.sweeps],
-        }
-    }
-    scratch = [
-        "estimator=ksnn",
-        "estimator.n_local=2",
-        "estimator.n_hidden=2",
-        "training.max_epochs=100",
-    ]
-    for limit in MINUTES if "ksnn" in plan.estimators else ():
-        if limit < 0.8 * minutes:
-            part = parts[f"minutes_{limit:g}"] = {
-                "title": f"{limit:g} min of reference",
-                "split": name,
-                "overrides": [f"++split.minutes={limit:g}"],
-                "sweeps": [["estimator=zero,static_map"], scratch],
-            }
-            if any(PRETRAINED in words for words, _ in plan.sweeps):
-                parts[f"minutes_{limit:g}_tuned"] = part | {
-                    "title": f"{part['title']}, trained on",
-                    "sweeps": [[*scratch, PRETRAINED]],
-                }
-    return {
-        "study": name,
-        "title": f"Which estimator to trust on {name}",
-        "report": "own_car",
-        "publish": False,
-        "evaluation": {"rate_hz": min(EVALUATED_HZ, drafted.lowest_rate_hz)},
-        "parts": parts,
-    }
-
-
 def _limits(drafted: Draft) -> list[str]:
     derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
     missing = [name for name in SCORED if name not in drafted.channels | derived]
@@ -593,6 +551,9 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
 
 
 def _pipeline_text(drafted: Draft, plan: Plan) -> str:
+    """A pipeline of study and split: all recordings, then parts with less of the minutes of
+    reference.
+    """
     name = drafted.examined.name
     head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
@@ -601,7 +562,42 @@ def _pipeline_text(drafted: Draft, plan: Plan) -> str:
         "Not included, with the reason:",
         *(f"  {estimator}: {lack}" for estimator, lack in plan.lacking.items()),
     ]
-    return _yaml(_pipeline_of(drafted, plan), head)
+    minutes = TRAINED_SHARE * drafted.seconds / 60.0
+    parts: dict[str, Any] = {
+        "all": {
+            "title": "all recordings",
+            "split": name,
+            "sweeps": [words for words, _ in plan.sweeps],
+        }
+    }
+    scratch = [
+        "estimator=ksnn",
+        "estimator.n_local=2",
+        "estimator.n_hidden=2",
+        "training.max_epochs=100",
+    ]
+    for limit in MINUTES if "ksnn" in plan.estimators else ():
+        if limit < 0.8 * minutes:
+            part = parts[f"minutes_{limit:g}"] = {
+                "title": f"{limit:g} min of reference",
+                "split": name,
+                "overrides": [f"++split.minutes={limit:g}"],
+                "sweeps": [["estimator=zero,static_map"], scratch],
+            }
+            if any(PRETRAINED in words for words, _ in plan.sweeps):
+                parts[f"minutes_{limit:g}_tuned"] = part | {
+                    "title": f"{part['title']}, trained on",
+                    "sweeps": [[*scratch, PRETRAINED]],
+                }
+    study = {
+        "study": name,
+        "title": f"Which estimator to trust on {name}",
+        "report": "own_car",
+        "publish": False,
+        "evaluation": {"rate_hz": min(EVALUATED_HZ, drafted.lowest_rate_hz)},
+        "parts": parts,
+    }
+    return _yaml(study, head)
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] = {}) -> str:

@@ -211,7 +211,8 @@ class RosbagSource(FileSource):
             )
             jitter = float(np.diff(stamps).std())
         if topic.average and rate_hz is not None:
-            kernel = _averaging(round(topic.average * rate_hz))
+            width = round(topic.average * rate_hz)  # of an even one the outermost two weigh half
+            kernel = np.convolve(np.ones(width), [1.0] if width % 2 else [0.5, 0.5]) / width
             lost = len(kernel) // 2
             if len(times) <= 2 * lost:
                 raise DataError(
@@ -254,14 +255,6 @@ class RosbagSource(FileSource):
             plane = np.stack([np.interp(grid, times, plane[:, axis]) for axis in (0, 1)], axis=1)
             times, yaw, rate_hz = grid, np.interp(grid, times, yaw), self.options.rate_hz
         return pose.references(plane, yaw, 1.0 / rate_hz, pose.yaw, location, at=(times, grid))
-
-
-def _averaging(width: int) -> FloatArray:
-    """Weights of a centred moving average over samples, which sum to 1.
-
-    Of an even width the outermost two weigh half.
-    """
-    return np.convolve(np.ones(width), [1.0] if width % 2 else [0.5, 0.5]) / width
 
 
 SOURCE = RosbagSource
