@@ -399,8 +399,12 @@ def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> di
         si = CHANNELS[proposal.channel].unit
         factor = float(f"{factor_to_si(unit, si) / factor_to_si(header_unit, si):.7g}")
         unit = header_unit
-    sign = {"sign": proposal.sign} if proposal.sign != 1 else {}
-    return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
+    entry = {**place, "unit": unit}
+    if proposal.sign != 1:
+        entry["sign"] = proposal.sign
+    if factor != 1.0:
+        entry["factor"] = factor
+    return entry
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -486,9 +490,9 @@ def _bag_options(examined: Examined) -> dict[str, Any]:
             mean_rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
             topic |= {"clock": "uniform", "rate_hz": plain_rate(mean_rate, INTERPOLATED_TOLERANCE)}
         entry = _entry(proposal, {"topic": short, "field": place["field"]})
-        channels[proposal.channel] = entry | (
-            {"offset": float(f"{proposal.offset:.5g}")} if proposal.offset else {}
-        )
+        if proposal.offset:
+            entry["offset"] = float(f"{proposal.offset:.5g}")
+        channels[proposal.channel] = entry
     return {
         "rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE),
         "topics": topics,

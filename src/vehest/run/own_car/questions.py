@@ -43,8 +43,13 @@ class Question:
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
-        plain = {"key": self.key, "question": self.text, "proposed": self.proposed or None}
-        return plain | {"candidates": list(self.candidates), "evidence": list(self.evidence)}
+        return {
+            "key": self.key,
+            "question": self.text,
+            "proposed": self.proposed or None,
+            "candidates": list(self.candidates),
+            "evidence": list(self.evidence),
+        }
 
 
 ORIGIN = Question(

@@ -436,9 +436,15 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     mass = vehicle["mass"] or 0.0
     half = 0.5 * wheelbase
     stiffness = 0.5 * STIFFNESS * mass * GRAVITY
-    values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
-    values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
-    values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
+    values = {
+        "mass": mass,
+        "yaw_inertia": mass * half * half,
+        "cg_height": HEIGHT * wheelbase,
+        "cg_to_front_axle": half,
+        "cg_to_rear_axle": half,
+        "cornering_stiffness_front": stiffness,
+        "cornering_stiffness_rear": stiffness,
+    }
     return {name: f"{value:.4g}" for name, value in values.items()} | {
         "wheelbase": f"{wheelbase:g}"
     }
