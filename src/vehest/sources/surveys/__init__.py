@@ -180,9 +180,9 @@ def _survey_mdf(file: Path) -> Log:
     columns = []
     for key, signal in signals.items():
         place = about["signals"][key]
-        entry = {"column": place["name"]} | (
-            {} if key == place["name"] else {"group": place["group"]}
-        )
+        entry = {"column": place["name"]}
+        if key != place["name"]:
+            entry["group"] = place["group"]
         columns.append(RawColumn(key, signal.unit, signal.values, entry, signal.stamps))
     return Log(file, "mdf", tuple(columns), skipped=tuple(skipped))
 

@@ -213,8 +213,8 @@ def survey_table(file: Path) -> Log:
 def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
-    back = int((steps < 0).sum())
-    n_repeats = int((steps == 0).sum())
+    back = (steps < 0).sum()
+    n_repeats = (steps == 0).sum()
     fault = (
         f"goes backwards {back} times"
         if back
