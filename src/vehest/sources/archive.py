@@ -108,13 +108,10 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
                 size = sum(entry.file_size for entry in entries)
                 max_bytes = unpacked_limit(file.stat().st_size, most_bytes)
                 if len(entries) > MOST_FILES or size > max_bytes:
-                    limits = (
-                        f"more than the limit of {MOST_FILES} entries and "
-                        f"{max_bytes / 1e9:.3g} GB; unpack it by hand"
-                    )
                     raise DataError(
                         f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, "
-                        f"{limits}"
+                        f"more than the limit of {MOST_FILES} entries and {max_bytes / 1e9:.3g} "
+                        "GB; unpack it by hand"
                     )
                 for entry in entries:
                     if entry.compress_type not in METHODS:

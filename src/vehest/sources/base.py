@@ -54,6 +54,9 @@ class Point:
     y: float = 0.0
 
 
+Place = Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"]
+
+
 @dataclass(frozen=True)
 class CommonOptions:
     """Options of every data set; see docs/data.md."""
@@ -71,12 +74,8 @@ class CommonOptions:
         Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None
     ) = None
     transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
-    reference_point: (
-        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
-    ) = None
-    imu_point: (
-        Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None
-    ) = None
+    reference_point: Place | None = None
+    imu_point: Place | None = None
 
 
 COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
@@ -200,11 +199,10 @@ class Source(ABC):
         if isinstance(self.reference_point, Point) and any(
             isinstance(transform, ScaleToWheelbase) for transform in self.transforms
         ):
-            problem = (
-                "reference_point does not go with scale_to_wheelbase; put the transform "
-                "reference_lever before it instead"
+            raise ConfigurationError(
+                f"{self.location}: reference_point does not go with scale_to_wheelbase; put the "
+                "transform reference_lever before it instead"
             )
-            raise ConfigurationError(f"{self.location}: {problem}")
         if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
             raise ConfigurationError(
                 f"{self.location}: source '{SIMULATED}' makes simulated recordings; leave kind out"
@@ -399,10 +397,10 @@ def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
     """
     require_no_spreadsheet(file)
     if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
-        remedy = (
-            f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
+        raise ConfigurationError(
+            f"'{file}' is no table; describe its signals once by 'vehest new NAME {file.name}', "
+            "then add dataset=NAME"
         )
-        raise ConfigurationError(f"'{file}' is no table; {remedy}")
     return open_source(dataset)
 
 
@@ -431,9 +429,9 @@ def source_class(dataset: Mapping[str, Any]) -> type[Source]:
         try:
             loaded = point.load()
         except Exception as error:  # a package may raise anything when it is imported
-            reason = f"{type(error).__name__}: {printable(first_line(error))}"
             raise ConfigurationError(
-                f"{location} of another package cannot be loaded ({reason}); repair or remove it"
+                f"{location} of another package cannot be loaded ({type(error).__name__}: "
+                f"{printable(first_line(error))}); repair or remove it"
             ) from error
         if not (isinstance(loaded, type) and issubclass(loaded, Source)):
             raise ConfigurationError(

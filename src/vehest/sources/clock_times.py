@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 
@@ -90,20 +89,14 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     elif not (half != "").any():
         orders.reverse()
     for order in orders:
-        _, month, day = order
-        if month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31:
-            dated = times + DAY * _days(*order)
+        years, months, days = order
+        if months.min() >= 1 and months.max() <= 12 and days.min() >= 1 and days.max() <= 31:
+            first_days = (12 * (years - 1970) + months - 1).astype("datetime64[M]")
+            since_1970 = first_days.astype("datetime64[D]").astype(np.int64) + days - 1
+            dated = times + DAY * since_1970
             if order is orders[-1] or np.abs(np.diff(dated)).max(initial=0.0) < MAX_STEP:
-                return np.asarray(dated, dtype=np.float64)
+                return dated
     return None
-
-
-def _days(
-    year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Days since 1970 of dates, (N,)."""
-    months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
-    return np.asarray((months.astype("datetime64[D]")).astype(np.int64) + day - 1)
 
 
 def past_midnight(times: FloatArray) -> FloatArray:
@@ -123,6 +116,4 @@ def past_midnight(times: FloatArray) -> FloatArray:
         The same times with a day added for each midnight before them, shape (N,) [s].
     """
     is_midnight = (times[:-1] > DAY - HOUR) & (times[1:] < HOUR)
-    return np.asarray(
-        times + DAY * np.concatenate([[0.0], np.cumsum(is_midnight)]), dtype=np.float64
-    )
+    return times + DAY * np.concatenate([[0.0], np.cumsum(is_midnight)])

@@ -171,9 +171,10 @@ def unevenness(stamps: FloatArray) -> str:
     step = float(np.median(steps))
     longest = int(np.argmax(steps))
     if steps[longest] > GAP * step:
-        number = number_of((steps > GAP * step).sum(), "gap")
-        gaps = f"{number}, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
-        return f"{gaps} (interval {step:.6g} s)"
+        return (
+            f"{number_of((steps > GAP * step).sum(), 'gap')}, the longest of "
+            f"{steps[longest]:.6g} s after {stamps[longest]:.12g} s (interval {step:.6g} s)"
+        )
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
         return f"intervals deviate by up to {100 * jitter:.2g} % from the median of {step:.6g} s"
@@ -209,23 +210,18 @@ def require_samples(values: FloatArray, times: FloatArray, longest: float, locat
     bad = np.flatnonzero(~np.isfinite(values))
     steps = np.diff(times)
     if len(bad):
-        fault = (
-            f"{number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
-            f"{times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
-        )
         raise DataError(
-            f"{location} holds {fault}; cut the range out, or declare the channel gappy"
+            f"{location} holds {number_of(len(bad), 'sample')} between {times[bad[0]]:.6g} s and "
+            f"{times[bad[-1]]:.6g} s that are marked invalid or no finite numbers; cut the range "
+            "out, or declare the channel gappy"
         )
     at = int(np.argmax(steps))
     if steps[at] > longest:
-        fault = (
-            f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of "
-            f"{(steps > longest).sum()} above {longest:.6g} s"
-        )
         raise DataError(
-            f"{location} has {fault}; raise its max_gap where values may be interpolated over "
-            "that time, "
-            "or end the recording there: by the data set's max_gap, or by cutting the range out"
+            f"{location} has a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of "
+            f"{(steps > longest).sum()} above {longest:.6g} s; raise its max_gap where values may "
+            "be interpolated over that time, or end the recording there: by the data set's "
+            "max_gap, or by cutting the range out"
         )
 
 
@@ -414,7 +410,7 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
             np.abs(block - block[0] - block_step * np.arange(len(block))).max()
         )  # away from the block's own line
         lines.append((count, len(block) - 1, float(block[0]), block_step, deviation))
-        count = count + len(block)
+        count += len(block)
         before = block[-1:]
     if not MIN_SAMPLES_OF_CLOCK < count < MOST_STEPS:
         return None
@@ -490,11 +486,10 @@ def uniform_times(
     step, first = _robust_line(number, stamps)
     measured_rate_hz = 1.0 / step if step > 0 else math.inf
     if not abs(measured_rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE:
-        fault = (
-            f"samples come at {measured_rate_hz:.6g} Hz, not at {rate_hz:g} Hz: samples are "
-            "missing, or the rate is another one"
+        raise DataError(
+            f"{location}: samples come at {measured_rate_hz:.6g} Hz, not at {rate_hz:g} Hz: "
+            f"samples are missing, or the rate is another one; {fix}"
         )
-        raise DataError(f"{location}: {fault}; {fix}")
     times = first + step * number
     late = stamps - times
     # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by
@@ -563,10 +558,9 @@ def common_span(spans: Mapping[str, tuple[float, float]], location: str) -> tupl
     begin = spans[late][0]
     end = spans[early][1]
     if begin >= end:
-        fault = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
         raise DataError(
-            f"{location}: {fault}: nothing is common to all; leave one out, declare it gappy or "
-            "take stamps of one clock"
+            f"{location}: {late} begins at {begin:.6g} s, {early} ends at {end:.6g} s: nothing is "
+            "common to all; leave one out, declare it gappy or take stamps of one clock"
         )
     return begin, end
 
@@ -712,11 +706,8 @@ def plain_rate(rate: float, tolerance: float) -> float:
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale
         interval = round(1e3 * scale / rate) / (1e3 * scale)
-        candidates = [
-            candidate
-            for candidate in (hertz, 1.0 / interval if interval else 0.0)
-            if abs(candidate / rate - 1.0) <= tolerance
-        ]
-        if candidates:
-            return min(candidates, key=lambda candidate: abs(candidate - rate))
+        candidates = (hertz, 1.0 / interval if interval else 0.0)
+        nearest = min(candidates, key=lambda candidate: abs(candidate - rate))
+        if abs(nearest / rate - 1.0) <= tolerance:
+            return nearest
     return rate

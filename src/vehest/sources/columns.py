@@ -26,6 +26,7 @@ ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
 ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 Positive = Annotated[float, Field(gt=0)]
 Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
+RunNumber = Annotated[int, Field(ge=0)]
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def measured_columns(
     """
     measured = {**values}
     for column in columns.values():
-        if isinstance(column, SampledColumn) and column.invalid and column.column in measured:
+        if isinstance(column, SampledColumn) and column.column in measured:
             measured[column.column] = column.measured(measured[column.column])
     return measured
 

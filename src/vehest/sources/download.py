@@ -185,12 +185,9 @@ class Download:
             return None
         checksum = sha256_of(path)
         if expected not in (None, checksum):
-            fault = (
-                f"'{path}' has the sha256 {checksum}, expected is {expected}: it was changed "
-                "or is damaged"
-            )
             raise DataError(
-                f"{fault}; remove the file to fetch it again, or correct download.sha256 or "
+                f"'{path}' has the sha256 {checksum}, expected is {expected}: it was changed or "
+                "is damaged; remove the file to fetch it again, or correct download.sha256 or "
                 f"{CHECKSUMS} to accept it"
             )
         return checksum

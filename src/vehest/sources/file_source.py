@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
 from vehest.sources.columns import Column, columns_from_config
+from vehest.sources.table_rows import Runs
 from vehest.sources.tables import listed
 
 
@@ -31,7 +32,7 @@ class FileSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self._runs_of = lru_cache(None)(self._selected_runs)
+        self._runs_of = cache(self._selected_runs)
 
     def ids(self) -> list[str]:
         """Names of the recordings, in alphabetical order of the files and in that of a file's
@@ -99,14 +100,14 @@ class FileSource(Source):
             for run in self._runs_of(file)
         }
 
-    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Runs:
         """Number of each run in a file -> its rows.
 
         All rows under None where runs are not distinguished.
         """
         return {None: slice(None)}
 
-    def _selected_runs(self, file: Path) -> Mapping[int | None, slice]:
+    def _selected_runs(self, file: Path) -> Runs:
         """All runs, or the one that the option ``run`` names.
 
         A source has them in the cache ``_runs_of``.

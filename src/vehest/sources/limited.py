@@ -84,8 +84,12 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
         "seconds": seconds,
         "memory": memory,
     }
-    environment = {**os.environ, **_SINGLE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    environment = {
+        **os.environ,
+        **_SINGLE_THREAD,
+        "ARROW_DEFAULT_MEMORY_POOL": "system",
+        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+    }
     with subprocess.Popen(
         _COMMAND,
         stdin=subprocess.PIPE,
@@ -173,8 +177,10 @@ def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
         limits = {
             resource.RLIMIT_DATA: int(order["memory"]),
             resource.RLIMIT_CPU: int(order["seconds"]),
+            resource.RLIMIT_FSIZE: 0,
+            resource.RLIMIT_CORE: 0,
         }
-        for kind, limit in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
+        for kind, limit in limits.items():
             with suppress(ValueError, OSError):
                 resource.setrlimit(kind, (limit, limit))
     try:

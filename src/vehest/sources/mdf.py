@@ -90,31 +90,32 @@ def read_measurement(
         The file, or a signal of ``requests``, is unusable.
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
-    reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), requests=requests)
+    arrays, about = read_limited(
+        "vehest.sources.readers.mdf:read", regular_file(file), requests=requests
+    )
     signals = {}
-    skipped = list(reading.summary["skipped"])
-    groups = {place["group"] for place in reading.summary["signals"].values()}
+    skipped = list(about["skipped"])
     faults = {
         group: clock_fault(
-            reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out"
+            arrays[f"stamps {group}"], "repair the measurement, or cut the range out"
         )
-        for group in groups
+        for group in {place["group"] for place in about["signals"].values()}
     }
-    for key, place in reading.summary["signals"].items():
+    for key, place in about["signals"].items():
         reason = faults[place["group"]]
         location = f"signal '{place['name']}' of group {place['title']}"
         if not reason:
             signals[key] = Signal(
                 f"group {place['title']}",
-                reading.arrays[f"stamps {place['group']}"],
-                reading.arrays[key],
+                arrays[f"stamps {place['group']}"],
+                arrays[key],
                 place["unit"],
             )
         elif requests is not None:
             raise DataError(f"'{file}': {location}: {reason}")
         else:
             skipped.append(f"{location}: {reason}")
-    return signals, skipped, reading.summary
+    return signals, skipped, about
 
 
 SOURCE = MdfSource

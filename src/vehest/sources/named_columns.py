@@ -140,34 +140,33 @@ def read_frame(
     DataError
         There is no time, a column holds no numbers, or the recording cannot be used.
     """
-    where = "DataFrame"
     if TIME not in columns and TIME not in frame.columns and frame.index.dtype.kind in "fMm":
         frame = frame.rename_axis(index=TIME)
     if frame.index.name is not None:
         frame = frame.reset_index()
     names = [str(name) for name in frame.columns]
-    declared = declare_columns(columns, names, frame.attrs.get("units", {}), where)
+    declared = declare_columns(columns, names, frame.attrs.get("units", {}), "DataFrame")
     source = open_source({**dataset, **declared})
     if not isinstance(source, TabularSource):
-        raise ConfigurationError(f"{where}: {source.location} describes no table")
+        raise ConfigurationError(f"DataFrame: {source.location} describes no table")
     if not source.columns_of(names):
         raise DataError(
-            f"{where}: no column is named like a channel (it has {listed(names)}); "
+            f"DataFrame: no column is named like a channel (it has {listed(names)}); "
             "name them, as in columns={'vx': 'Speed:km/h', 'ay': '-AccY:m/s²'}"
         )
-    wanted = source.columns_read(names)
-    for name in wanted:
+    columns_read = source.columns_read(names)
+    for name in columns_read:
         if names.count(name) != 1:
             raise DataError(
-                f"{where} has {names.count(name) or 'no'} columns '{printable(name)}' "
-                f"(it has {listed(names)}); rename all but one, or name another, "
-                "as in columns={'time': 'Timestamp:s'}"
+                f"DataFrame has {names.count(name) or 'no'} columns '{printable(name)}' (it has "
+                f"{listed(names)}); rename all but one, or name another, as in "
+                "columns={'time': 'Timestamp:s'}"
             )
-    table = {name: _numbers(frame.iloc[:, names.index(name)], where) for name in wanted}
+    table = {name: _numbers(frame.iloc[:, names.index(name)]) for name in columns_read}
     return source.recording_of(table, str(frame.attrs.get("name", "frame")))
 
 
-def _numbers(column: pd.Series, where: str) -> FloatArray:
+def _numbers(column: pd.Series) -> FloatArray:
     """Values of a column, of time stamps and differences in seconds; `DataError` for text."""
     if column.dtype.kind in "mM":
         return column.to_numpy().astype(f"{column.dtype.kind}8[ns]").astype(np.int64) / 1e9
@@ -175,5 +174,5 @@ def _numbers(column: pd.Series, where: str) -> FloatArray:
         return column.to_numpy(np.float64, na_value=np.nan)
     except (TypeError, ValueError):
         raise DataError(
-            f"{where}: column '{printable(str(column.name))}' contains text; numbers are needed"
+            f"DataFrame: column '{printable(str(column.name))}' contains text; numbers are needed"
         ) from None

@@ -104,10 +104,10 @@ class SampleAndHold:
             interpolated[name] = np.interp(
                 ticks, sample_times - self.delays[name], samples, left=np.nan, right=np.nan
             )
-        begin, end = (
-            times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1)
+        delays = np.array([self.delays[name] for name in columns])
+        inside = np.flatnonzero(
+            (ticks >= (times[0] - delays).max()) & (ticks <= (times[-1] - delays).min())
         )
-        inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
         if not len(inside):
             raise DataError(
                 f"{location}: no row lies between two samples of every held channel; are their "

@@ -15,10 +15,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
@@ -35,8 +34,9 @@ from vehest.sources.clocks import (
     ticks_within,
     uniform_clock,
 )
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, RunNumber
 from vehest.sources.file_source import FileSource
+from vehest.sources.table_rows import Runs
 from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
@@ -132,7 +132,7 @@ class SignalOptions:
     rate_hz: Rate | None = None
     raster: str | None = None
     max_gap: Positive | None = None
-    run: Annotated[int, Field(ge=0)] | None = None
+    run: RunNumber | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"
 
@@ -163,7 +163,7 @@ class SignalSource(FileSource):
                 f"'{options.raster}'"
             )
 
-    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Runs:
         """Times [s] of each segment in which no signal lacks samples for longer than its limit.
 
         One segment has the file's name. Limits by which most of the time would be left out, as of
@@ -229,7 +229,7 @@ class SignalSource(FileSource):
             It is damaged, contradicts a declared unit, or its signals leave gaps, are faster than
             the raster, or have no time in common.
         """
-        (signals, provenance) = self._signals(file)
+        signals, provenance = self._signals(file)
         number = {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():

@@ -88,7 +88,7 @@ class SimulatedSource(Source):
 
         super().__init__(dataset)
         options = self.options
-        rate_hz = self.options.rate_hz
+        rate_hz = options.rate_hz
         self.vehicles = self._vehicles()
         self.drives = self._drives()
         try:

@@ -68,17 +68,14 @@ class TablePose(PoseOptions):
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                fault = (
-                    f"pose column '{self.columns[name].column}' holds no number in {len(odd)} "
-                    f"rows of the run, first in row {odd[0] + 1}"
+                raise DataError(
+                    f"{location}: pose column '{self.columns[name].column}' holds no number in "
+                    f"{len(odd)} rows of the run, first in row {odd[0] + 1}; leave them out by "
+                    "drop_rows"
                 )
-                raise DataError(f"{location}: {fault}; leave them out by drop_rows")
-        x, y, yaw = (
-            clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"]))
-        )
-        return self.references(
-            np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, location
-        )
+        positions = np.stack([clock.align(poses[axis]) for axis in "xy"], axis=1)
+        yaw = clock.align(np.unwrap(poses["yaw"]))
+        return self.references(positions, yaw, 1.0 / clock.rate_hz, self.yaw_offset, location)
 
 
 def table_pose_from_config(entry: Any, location: str) -> TablePose:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -17,6 +17,8 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.sources.clocks import bridged
 from vehest.sources.columns import Column, Positive
 
+Runs = Mapping[int | None, slice]
+"""Number of each run -> its rows; None where runs are not distinguished."""
 RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
 
 
@@ -67,7 +69,7 @@ def unwrapped(times: FloatArray, wraps_at: float) -> FloatArray:
         Counts that go on, shape (T,).
     """
     wraps = np.cumsum(np.diff(times, prepend=times[:1]) < -0.5 * wraps_at)
-    return np.asarray(times + wraps_at * wraps, dtype=np.float64)
+    return times + wraps_at * wraps
 
 
 def dropped_rows_from_config(
@@ -112,7 +114,7 @@ def _rows(row: int | str, location: str) -> slice:
 
 
 def remaining_files(
-    files: Sequence[Path], exclude: Iterable[str], dropped: Iterable[str], location: str
+    files: Sequence[Path], exclude: Collection[str], dropped: Iterable[str], location: str
 ) -> list[Path]:
     """Files that a data set does not exclude.
 
@@ -120,7 +122,7 @@ def remaining_files(
     ----------
     files : sequence of Path
         Files of the data set.
-    exclude : iterable of str
+    exclude : collection of str
         Patterns over the files' stems, which distinguish upper and lower case.
     dropped : iterable of str
         Stems of files of which rows are left out.
@@ -132,13 +134,12 @@ def remaining_files(
     MissingError
         A pattern, or a stem of ``dropped``, matches no file, or none remains.
     """
-    patterns = list(exclude)
-    for option, names in (("exclude", patterns), ("drop_rows", dropped)):
+    for option, names in (("exclude", exclude), ("drop_rows", dropped)):
         for name in names:
             if not any(name == file.stem or fnmatchcase(file.stem, name) for file in files):
                 raise MissingError(f"{location}: {option} names '{name}', which no file is called")
     remaining = [
-        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)
+        file for file in files if not any(fnmatchcase(file.stem, pattern) for pattern in exclude)
     ]
     if not remaining:
         raise MissingError(f"{location}: exclude leaves none of its files")
@@ -179,7 +180,7 @@ def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray
     return is_remaining
 
 
-def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
+def counted_runs(numbers: FloatArray, column: str, file: Path) -> Runs:
     """Rows of each run that a column of whole numbers counts.
 
     Parameters
@@ -203,8 +204,10 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
     """
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
-        location = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
-        raise DataError(f"'{file}': {location}; runs are counted in whole numbers")
+        raise DataError(
+            f"'{file}': column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}; runs "
+            "are counted in whole numbers"
+        )
     runs: dict[int | None, slice] = {}
     for rows in stretches(np.diff(numbers) != 0, len(numbers)):
         run = int(numbers[rows.start])
@@ -223,7 +226,7 @@ def timed_runs(
     *,
     restarts: bool,
     columns: Iterable[FloatArray] = (),
-) -> dict[int | None, slice]:
+) -> Runs:
     """Rows of each run of a table.
 
     Parameters

@@ -77,13 +77,12 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
     else:
-        header, first_row = (*_first_rows(file, layout), [], [])[:2]
-        names = names_of(header, first_row)
+        names = names_of(*_first_rows(file, layout))
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
     return names
 
 
-def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
+def _first_rows(file: Path, layout: TextLayout) -> tuple[list[str], list[str]]:
     """Cells of the line of names, and of the first row of numbers."""
     decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
     try:
@@ -92,8 +91,8 @@ def _first_rows(file: Path, layout: TextLayout) -> list[list[str]]:
         rows = csv.reader(filled, delimiter=layout.delimiter)
         header = next(rows, [])
         with suppress(csv.Error):  # of an endless line, which the reader of the rows reports
-            return [header, next(islice(rows, layout.rows_below_names, None), [])]
-        return [header, []]
+            return header, next(islice(rows, layout.rows_below_names, None), [])
+        return header, []
     except (ValueError, csv.Error) as error:
         raise _unreadable(file, error) from None
 
@@ -178,17 +177,18 @@ def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -
                 f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all "
                 "but one"
             )
+        if count:
+            continue
         numbered = [column for column in names if re.fullmatch(rf"{re.escape(name)} #\d+", column)]
-        if not count and numbered:
+        if numbered:
             raise DataError(
                 f"'{file}' has {len(numbered)} columns called '{printable(name)}'; rename or "
                 f"remove all but one, or declare one of them: {listed(numbered)}"
             )
-        if not count:
-            raise DataError(
-                f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in "
-                "conf/dataset"
-            )
+        raise DataError(
+            f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in "
+            "conf/dataset"
+        )
 
 
 def read_columns(
@@ -227,20 +227,17 @@ def read_columns(
     if is_parquet(file):
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, selected)
-    opened = (
-        partial(table_stream, file, layout.n_bytes)
-        if text is None
-        else partial(pa.BufferReader, text)
-    )
+    opened = partial(pa.BufferReader, text)
+    if text is None:
+        opened = partial(table_stream, file, layout.n_bytes)
+        require_memory(file, layout)
     layout = with_names(file, layout)
     convert = _conversion(selected, layout)
-    if text is None:
-        require_memory(file, layout)
     try:
-        table = parse_table(opened, layout, convert)
+        table = parse_table(opened, layout, convert, [])
     except DAMAGE:
-        try:
-            table = parse_table(opened, layout, convert, threads=False)  # its errors state the row
+        try:  # errors without threads state the row
+            table = parse_table(opened, layout, convert, [], threads=False)
         except DAMAGE as error:
             raise _unreadable(file, error, layout) from None
     if not table.num_rows:
@@ -318,9 +315,9 @@ def parse_table(
     opened: Callable[[], pa.NativeFile],
     layout: TextLayout,
     convert: pc.ConvertOptions,
+    lines_of_text: list[str],
     *,
     threads: bool = True,
-    lines_of_text: list[str] | None = None,
 ) -> pa.Table:
     """Table of text as pyarrow converts it; raises what pyarrow raises.
 
@@ -332,14 +329,13 @@ def parse_table(
         Its layout.
     convert : pyarrow.csv.ConvertOptions
         Types of the columns, and which are read.
+    lines_of_text : list of str
+        Takes the lines of text between or below the rows, which are left out of the table.
     threads : bool
         Whether pyarrow may use several threads; errors state the row only without.
-    lines_of_text : list of str or None
-        Takes the lines of text between or below the rows, which are left out of the table.
     """
-    texts = [] if lines_of_text is None else lines_of_text
     with opened() as stream, decoding_failures_ignored():
-        return pc.read_csv(stream, **_options(layout, convert, texts, threads=threads))
+        return pc.read_csv(stream, **_options(layout, convert, lines_of_text, threads=threads))
 
 
 def _options(
@@ -361,16 +357,15 @@ def _options(
         lines_of_text.append(row.text)
         return "skip"
 
-    read = pc.ReadOptions(
-        use_threads=threads,
-        block_size=BLOCK,
-        encoding=layout.encoding,
-        skip_rows=layout.skip_rows,
-        skip_rows_after_names=layout.rows_below_names,
-        column_names=None if layout.names is None else list(layout.names),
-    )
     return {
-        "read_options": read,
+        "read_options": pc.ReadOptions(
+            use_threads=threads,
+            block_size=BLOCK,
+            encoding=layout.encoding,
+            skip_rows=layout.skip_rows,
+            skip_rows_after_names=layout.rows_below_names,
+            column_names=layout.names,
+        ),
         "parse_options": pc.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=handle),
         "convert_options": convert,
     }
@@ -517,11 +512,10 @@ def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) 
     if cell is not None and layout is not None:
         name = column_names(file, layout)[int(cell[1])]
         above = layout.skip_rows + layout.rows_below_names + (layout.names is None)
-        location = (
-            f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row "
-            f"{int(cell[2]) - above}"
+        return DataError(
+            f"'{file}': column '{name}' holds the text '{printable(cell[3][:40])}' in data row "
+            f"{int(cell[2]) - above}; numbers are needed"
         )
-        return DataError(f"'{file}': {location}; numbers are needed")
     problem = (
         f"a line is longer than {BLOCK} bytes"
         if "straddl" in str(error)

@@ -5,7 +5,7 @@ Names, units and signs are declared in conf/dataset.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -25,6 +25,7 @@ from vehest.sources.columns import (
     Column,
     ColumnName,
     Positive,
+    RunNumber,
     SampledColumn,
     column_from_config,
     columns_from_config,
@@ -35,6 +36,7 @@ from vehest.sources.sample_and_hold import sample_and_hold_from_config
 from vehest.sources.table_parts import even_parts, is_large
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import (
+    Runs,
     TimeColumn,
     counted_runs,
     dropped_rows_from_config,
@@ -78,7 +80,7 @@ class TabularOptions:
     runs: ColumnName | None = None
     time_restarts: bool = False
     max_gap: Positive | None = None
-    run: Annotated[int, Field(ge=0)] | None = None
+    run: RunNumber | None = None
     time: dict[str, Any] | None = None
     rate_hz: Positive | None = None
     clock: ClockPolicy = "strict"
@@ -109,7 +111,6 @@ class TabularSource(FileSource):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         options = self.options
-        location = self.location
         self.columns = (
             None
             if options.channels is None
@@ -120,28 +121,28 @@ class TabularSource(FileSource):
             if options.time is None
             else cast(
                 TimeColumn,
-                column_from_config(options.time, f"{location}: time", "s", TimeColumn),
+                column_from_config(options.time, f"{self.location}: time", "s", TimeColumn),
             )
         )
         self._cuts = options.time_restarts or options.max_gap is not None
-        self.dropped = dropped_rows_from_config(options.drop_rows or {}, location)
+        self.dropped = dropped_rows_from_config(options.drop_rows or {}, self.location)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
         self.held = (
             None
             if options.held is None
             else sample_and_hold_from_config(
-                options.held, list(self.columns or ()), f"{location}: held"
+                options.held, list(self.columns or ()), f"{self.location}: held"
             )
         )
         self.pose = (
             None
             if options.pose is None
-            else table_pose_from_config(options.pose, f"{location}: pose")
+            else table_pose_from_config(options.pose, f"{self.location}: pose")
         )
         doubled = sorted(set(self.columns or ()) & set(self.pose.channels if self.pose else ()))
         if doubled:
             raise ConfigurationError(
-                f"{location}: channel '{doubled[0]}' comes both from channels and from pose; "
+                f"{self.location}: channel '{doubled[0]}' comes both from channels and from pose; "
                 "leave one out"
             )
         self._require_pattern()
@@ -241,10 +242,9 @@ class TabularSource(FileSource):
         names = column_names(file, self.layout)
         columns = self.columns_of(names)
         if not columns:
-            problem = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(
-                f"'{file}' {problem}; describe them by 'vehest new NAME {file.name}', then add "
-                "dataset=NAME"
+                f"'{file}' has no column that is named like a channel (it has {listed(names)}); "
+                f"describe them by 'vehest new NAME {file.name}', then add dataset=NAME"
             )
         return columns
 
@@ -293,10 +293,13 @@ class TabularSource(FileSource):
             )
         clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         sampled_channels = () if self.held is None else self.held.channels
-        even_columns = {
-            name: column for name, column in columns.items() if name not in sampled_channels
+        channels = {
+            name: clock.align(
+                column.to_si(values[column.column], channel(name).unit), name in self.gappy
+            )
+            for name, column in columns.items()
+            if name not in sampled_channels
         }
-        channels = _on_clock(even_columns, values, clock, self.gappy)
         provenance: dict[str, Any] = (
             {"file": file.name}
             | ({} if run is None else {"run": run})
@@ -314,7 +317,7 @@ class TabularSource(FileSource):
                 name: column for name, column in columns.items() if name in sampled_channels
             }
             lines, inside, rate = self.held.interpolated(sampled_columns, values, clock, location)
-            channels = {name: samples[inside] for name, samples in {**channels, **lines}.items()}
+            channels = {name: samples[inside] for name, samples in (channels | lines).items()}
             clock = clock.part(inside)
             provenance["held"] = self.held.description(rate)
         return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
@@ -325,7 +328,7 @@ class TabularSource(FileSource):
             super().data_files(), self.options.exclude or (), self.dropped, self.location
         )
 
-    def runs_in(self, file: Path) -> Mapping[int | None, slice]:
+    def runs_in(self, file: Path) -> Runs:
         """Rows of each run without those that are left out."""
         counter = self.time.column if self.time and self._cuts else self.options.runs
         if counter is None or is_stored_recording(file):
@@ -349,19 +352,6 @@ class TabularSource(FileSource):
         sparse = {*self.gappy, *(self.held.channels if self.held else ())}
         columns = self._columns_of(file)
         return list({column.column: None for name, column in columns.items() if name not in sparse})
-
-
-def _on_clock(
-    columns: Mapping[str, Column],
-    values: Mapping[str, FloatArray],
-    clock: Clock,
-    gappy: Collection[str],
-) -> dict[str, FloatArray]:
-    """Channels in SI units, a sample a tick."""
-    return {
-        name: clock.align(column.to_si(values[column.column], channel(name).unit), name in gappy)
-        for name, column in columns.items()
-    }
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:

@@ -32,6 +32,7 @@ from vehest.run.own_car.inspect import EVIDENCE_HZ, MAX_BRIDGED_SECONDS, TABLES,
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
+from vehest.sources.pose import POSE_CHANNELS
 from vehest.sources.surveys import Log, RawColumn
 from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
 from vehest.sources.unit_spellings import plain_unit
@@ -81,6 +82,11 @@ class Draft:
         return sum(self.durations.values())
 
     @property
+    def lowest_rate_hz(self) -> float:
+        """Of all recordings."""
+        return min(content.rate_hz for content in self.contents)
+
+    @property
     def channels(self) -> frozenset[str]:
         """Channels that all recordings have."""
         return common_channels(self.contents)
@@ -127,10 +133,9 @@ def draft(examined: Examined) -> Draft:
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        causes = f"duplicates, text, or no sample for {MAX_BRIDGED_SECONDS:g} s or more"
         notes.append(
-            f"data rows of '{stem}' left out by drop_rows ({causes}): "
-            f"{counted([str(row) for row in rows])}"
+            f"data rows of '{stem}' left out by drop_rows (duplicates, text, or no sample for "
+            f"{MAX_BRIDGED_SECONDS:g} s or more): {counted([str(row) for row in rows])}"
         )
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
@@ -157,16 +162,13 @@ def draft(examined: Examined) -> Draft:
     transforms = _transforms(examined, longest, late, speed, used_ratio, crawl_speed)
     dataset |= {"transforms": [*bridging, *transforms]}
     recordings = _recordings(dataset)
-    channels = tuple(
-        replace(proposal, delay=late[proposal.channel].delay).with_evidence(
-            late[proposal.channel].evidence
-        )
-        if proposal.channel in late
-        else proposal
-        for proposal in proposals.channels
-    )
+    delayed = {
+        name: replace(proposal, delay=late[name].delay).with_evidence(late[name].evidence)
+        for name, proposal in proposals.by_channel.items()
+        if name in late
+    }
     return Draft(
-        replace(examined, proposals=replace(proposals, channels=channels)),
+        replace(examined, proposals=proposals.changed(delayed)),
         dataset,
         late,
         [summary_of(recording) for recording in recordings],
@@ -201,8 +203,7 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 
 
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
-    source = open_source(dataset)
-    return [source.read(name) for name in source.ids()]
+    return list(open_source(dataset).recordings())
 
 
 def _crawl_speed(recording: Recording) -> float:
@@ -324,9 +325,9 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = log.by_name
     if log.source == "rosbag":
-        return dataset | _bag_options(columns, proposals.channels)
+        return dataset | _bag_options(examined)
     if log.source == "mdf":
-        return dataset | _mdf_options(columns, proposals.channels)
+        return dataset | _mdf_options(examined)
     dataset |= log.options
     clock = log.clock
     if log.source != "vbo":
@@ -349,45 +350,41 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             )
             short = gaps[gaps <= MAX_BRIDGED_SECONDS]
             longest_bridge = max(longest_bridge, float(short.max(initial=0.0)))
+            if surveyed.seconds is None:
+                continue
             holes = true_runs(gaps.max(axis=0) > MAX_BRIDGED_SECONDS)
             has_holes |= len(holes) > 0
+            samples = (column.values for column in surveyed.columns)
+            steps = np.diff(np.nan_to_num([surveyed.seconds, *samples]), prepend=np.nan)
+            written_twice = np.flatnonzero((steps == 0.0).all(axis=0)).tolist()
             rows: list[int | str] = [
                 *surveyed.repeated_names,
                 *(f"{surveyed.file_row(a)}-{surveyed.file_row(b - 1)}" for a, b in holes),
-                *map(surveyed.file_row, _rows_written_twice(surveyed)),
+                *map(surveyed.file_row, written_twice),
             ]
             dropped |= {surveyed.file.stem: rows} if rows else {}
         if longest_bridge:
             bridge = math.ceil(100.0 * longest_bridge * 1.05) / 100.0
             dataset |= {"source": "text_log", "bridge": bridge}
-        if dropped and clock is not None:
+        if dropped:
             dataset["drop_rows"] = dropped
-        if has_holes and clock is not None and "runs" not in log.options:
+        if has_holes and "runs" not in log.options:
             dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
-    units = {
-        name: surveyed.unit if log.source == "vbo" else "" for name, surveyed in columns.items()
-    }
     dataset["channels"] = {
-        proposal.channel: _entry(proposal, columns[proposal.column].place, units[proposal.column])
+        proposal.channel: _entry(
+            proposal,
+            columns[proposal.column].place,
+            columns[proposal.column].unit if log.source == "vbo" else "",
+        )
         for proposal in proposals.channels
     }
     if proposals.pose:
-        rate = (
-            rate_of(log.seconds)
-            if log.seconds is not None
-            else float(examined.rate_hz or EVIDENCE_HZ)
-        )
-        parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
-        derived = [
-            name
-            for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
-            if name not in dataset["channels"]
-        ]
+        rate = examined.rate_hz or EVIDENCE_HZ if log.seconds is None else rate_of(log.seconds)
         dataset["pose"] = {
-            **parts,
+            **examined.pose_columns,
             "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5),
             "order": 2,
-            "channels": derived,
+            "channels": [name for name in POSE_CHANNELS if name not in dataset["channels"]],
         }
     return dataset
 
@@ -402,19 +399,12 @@ def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> di
         si = CHANNELS[proposal.channel].unit
         factor = float(f"{factor_to_si(unit, si) / factor_to_si(header_unit, si):.7g}")
         unit = header_unit
-    sign = {"sign": proposal.sign} if proposal.sign != 1 else {}
-    return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
-
-
-def _rows_written_twice(log: Log) -> list[int]:
-    """Places in the columns, from 0."""
-    rows = np.nan_to_num(
-        [
-            *([] if log.seconds is None else [log.seconds]),
-            *(column.values for column in log.columns),
-        ]
-    )
-    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0))).tolist()
+    entry = {**place, "unit": unit}
+    if proposal.sign != 1:
+        entry["sign"] = proposal.sign
+    if factor != 1.0:
+        entry["factor"] = factor
+    return entry
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -423,12 +413,12 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
     """
     signal = log.by_name[column]
     measured_rows = np.flatnonzero(np.isfinite(signal.values))
+    if not len(measured_rows):
+        return True
     if log.source in TABLES:
-        return not len(measured_rows) or (
-            log.clock is None and bool(_gaps(examined, log, column).max() > MAX_BRIDGED_SECONDS)
-        )
-    if log.source != "rosbag" or signal.stamps is None or not len(measured_rows):
-        return not len(measured_rows)
+        return log.clock is None and bool(_gaps(examined, log, column).max() > MAX_BRIDGED_SECONDS)
+    if log.source != "rosbag" or signal.stamps is None:
+        return False
     measured = signal.stamps[measured_rows]
     ends = signal.stamps[[0, -1]] == measured[[0, -1]]
     return not ends.all() or bool(
@@ -444,7 +434,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     seconds = (
         log.seconds
         if log.seconds is not None
-        else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+        else np.arange(len(values)) / (examined.rate_hz or EVIDENCE_HZ)
     )
     gap_seconds = np.zeros(len(values))
     for run in log.runs:
@@ -460,19 +450,18 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     return gap_seconds
 
 
-def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+def _mdf_options(examined: Examined) -> dict[str, Any]:
     channels = {}
     rates = []
     paused = False
-    for proposal in proposals:
-        rate, gap = _rate_and_gap(columns[proposal.column], MAX_BRIDGED_SECONDS)
+    for proposal in examined.proposals.channels:
+        column = examined.log.by_name[proposal.column]
+        rate, gap = _rate_and_gap(column, MAX_BRIDGED_SECONDS)
         rates.append(rate)
-        paused |= gap < _rate_and_gap(columns[proposal.column])[1]
-        channels[proposal.channel] = _entry(
-            proposal, columns[proposal.column].place, columns[proposal.column].unit
-        )
+        paused |= gap < _rate_and_gap(column)[1]
+        entry = channels[proposal.channel] = _entry(proposal, column.place, column.unit)
         if 3.0 / rate < gap:
-            channels[proposal.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
+            entry["max_gap"] = math.ceil(100.0 * gap) / 100.0
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
     return {
         "rate_hz": plain_rate(max(rates), INTERPOLATED_TOLERANCE),
@@ -481,28 +470,29 @@ def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     }
 
 
-def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+def _bag_options(examined: Examined) -> dict[str, Any]:
     topics: dict[str, dict[str, Any]] = {}
     channels: dict[str, dict[str, Any]] = {}
     rates = []
-    for proposal in proposals:
-        place = columns[proposal.column].place
+    for proposal in examined.proposals.channels:
+        column = examined.log.by_name[proposal.column]
+        place = column.place
         short = str(place["topic"]).strip("/").replace("/", "_")
-        rate, gap = _rate_and_gap(columns[proposal.column])
+        rate, gap = _rate_and_gap(column)
         rates.append(rate)
         topic = topics.setdefault(
             short,
             {key: place[key] for key in ("topic", "type", "stamps")} | {"max_gap": MIN_GAP_SECONDS},
         )
         topic["max_gap"] = max(topic["max_gap"], math.ceil(150.0 * gap) / 100.0)
-        stamps = columns[proposal.column].stamps
+        stamps = column.stamps
         if stamps is not None and (np.diff(stamps) == 0.0).any():  # delivered in batches
             mean_rate = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
             topic |= {"clock": "uniform", "rate_hz": plain_rate(mean_rate, INTERPOLATED_TOLERANCE)}
         entry = _entry(proposal, {"topic": short, "field": place["field"]})
-        channels[proposal.channel] = entry | (
-            {"offset": float(f"{proposal.offset:.5g}")} if proposal.offset else {}
-        )
+        if proposal.offset:
+            entry["offset"] = float(f"{proposal.offset:.5g}")
+        channels[proposal.channel] = entry
     return {
         "rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE),
         "topics": topics,
@@ -534,18 +524,10 @@ def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[
         for limits, samples in channels
     ):
         return []
-    assigned = {proposal.column for proposal in examined.proposals.channels}
-    rates = [
-        rate_of(column.stamps)
-        for column in examined.log.columns
-        if column.stamps is not None and column.name in assigned
-    ]
-    return [
-        {
-            "name": "bridge_impossible",
-            **({"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {}),
-        }
-    ]
+    columns = [examined.log.by_name[proposal.column] for proposal in examined.proposals.channels]
+    rates = [rate_of(column.stamps) for column in columns if column.stamps is not None]
+    beside = {"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {}
+    return [{"name": "bridge_impossible", **beside}]
 
 
 def _transforms(
@@ -561,10 +543,10 @@ def _transforms(
     A reference that is late is put on the others' clock; a measured channel is not, since an
     estimator in the car would get it late, too.
     """
-    references = {name: delay.delay for name, delay in late.items() if CHANNELS[name].is_reference}
     transforms: list[dict[str, Any]] = [
-        {"name": "delay_correction", "delay": delay, "channels": [name]}
-        for name, delay in references.items()
+        {"name": "delay_correction", "delay": lateness.delay, "channels": [name]}
+        for name, lateness in late.items()
+        if CHANNELS[name].is_reference
     ]
     offsets = {
         proposal.channel: float(f"{proposal.factor * proposal.sign * proposal.offset:.5g}")
@@ -575,12 +557,10 @@ def _transforms(
         transforms.append({"name": "offset_correction", "offsets": offsets})
     transforms += speed
     for name in ("vy_ref", "ax"):
-        supply = (
-            derivation_of(name, longest.channels, (), longest.rate_hz)
-            if name not in longest
-            else None
-        )
-        if supply is not None and not supply.meanings:  # no value is unknown
+        if name in longest:
+            continue
+        supply = derivation_of(name, longest.channels, (), longest.rate_hz)
+        if supply and not supply.meanings:  # no value is unknown
             transforms += map(dict, supply.transforms)
     for entry in transforms:
         if entry["name"] == "velocity_from_sideslip" and crawl_speed:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,13 @@ class Examined:
         """The longest one."""
         return self.logs[0]
 
+    @property
+    def pose_columns(self) -> dict[str, dict[str, str]]:
+        """Part of the poses -> its column and unit, as a data set declares them."""
+        return {
+            part: {"column": column, "unit": unit} for part, column, unit in self.proposals.pose
+        }
+
     def in_words(self) -> list[str]:
         """Files and proposals for a terminal, a line each."""
         proposals = self.proposals
@@ -99,8 +106,9 @@ class Examined:
             for proposal in proposals.channels
         ]
         lines += [f"  left/right: {proposals.left_right}"] if proposals.left_right else []
-        unused = [f"  columns without a channel: {counted(list(proposals.unused))}"]
-        return lines + (unused if proposals.unused else [])
+        if proposals.unused:
+            lines.append(f"  columns without a channel: {counted(proposals.unused)}")
+        return lines
 
 
 def inspect(
@@ -165,15 +173,13 @@ def inspect(
                 "files with the same columns"
             )
         proposals = proposals.keeping(remaining, notes)
+        assigned = {proposal.column for proposal in remaining}
         for column in longest.columns:
-            if (
-                column.name in {proposal.column for proposal in remaining}
-                and log.by_name[column.name].unit != column.unit
-            ):
+            unit = log.by_name[column.name].unit if column.name in assigned else column.unit
+            if unit != column.unit:
                 raise DataError(
-                    f"'{log.file}' has '{column.name}' in '{log.by_name[column.name].unit}', "
-                    f"'{longest.file}' in '{column.unit}'; use the same unit in both, or create a "
-                    "data set for each"
+                    f"'{log.file}' has '{column.name}' in '{unit}', '{longest.file}' in "
+                    f"'{column.unit}'; use the same unit in both, or create a data set for each"
                 )
         proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:
@@ -189,43 +195,25 @@ def inspect(
     ]
     assigned_units = {proposal.column: proposal.unit for proposal in proposals.channels}
     foreign = [
-        column
+        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
+        f"motion it is {assigned_units[column.name]}"
         for column in longest.columns
         if column.name in assigned_units
         and column.unit.strip("-[]() 1")
         and plain_unit(column.unit) is None
-    ]
-    computed += [
-        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
-        f"motion it is {assigned_units[column.name]}"
-        for column in foreign
     ]
     shadowed = (
         [f"'{name}' is also a built-in data set; in this folder the name refers to yours"]
         if name in choices("dataset") and not existing
         else []
     )
-    proposals = replace(
-        proposals,
-        notes=(
-            *proposals.notes,
-            *computed,
-            *_notes(longest, logs),
-            *shadowed,
-        ),
-    )
-    timed = longest.seconds is not None or any(
-        column.stamps is not None for column in longest.columns
-    )
-    place = _place(files, longest.source)
-    rate = None if timed else proposals.rate_hz
     return Examined(
         name,
         tuple(files),
         (longest, *others),
-        proposals,
-        place,
-        rate,
+        proposals.with_notes(*computed, *foreign, *_notes(longest, logs), *shadowed),
+        _place(files, longest.source),
+        proposals.rate_hz,
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
 
@@ -329,22 +317,20 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
             "for each folder"
         )
     names = sorted({file.name for file in files})
-    for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
-        if Path(first).stem == Path(second).stem:
-            raise ConfigurationError(
-                f"two files are called '{Path(first).stem}'; a recording's name must be unique"
-            )
+    stems = [Path(name).stem for name in names]
+    if doubled := [stem for stem in stems if stems.count(stem) > 1]:
+        raise ConfigurationError(
+            f"two files are called '{min(doubled)}'; a recording's name must be unique"
+        )
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
     both_ways = (names, [name[::-1] for name in names])
     prefixes = map(os.path.commonprefix, both_ways)
     start, end = (prefix.rstrip("0123456789") for prefix in prefixes)
-    pattern = (
-        f"{glob.escape(start)}*{glob.escape(end[::-1])}"
-        if len(names) > 1
-        else glob.escape(names[0])
-    )
+    pattern = glob.escape(names[0])
+    if len(names) > 1:
+        pattern = f"{glob.escape(start)}*{glob.escape(end[::-1])}"
     unlisted = sorted(
         file.name for file in folder.iterdir() if file.is_file() and file.name not in names
     )

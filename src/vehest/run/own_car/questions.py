@@ -43,8 +43,13 @@ class Question:
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
-        plain = {"key": self.key, "question": self.text, "proposed": self.proposed or None}
-        return plain | {"candidates": list(self.candidates), "evidence": list(self.evidence)}
+        return {
+            "key": self.key,
+            "question": self.text,
+            "proposed": self.proposed or None,
+            "candidates": list(self.candidates),
+            "evidence": list(self.evidence),
+        }
 
 
 ORIGIN = Question(
@@ -162,14 +167,11 @@ def questions_of(examined: Examined) -> Iterator[Question]:
                 proposal.is_impossible(log.by_name[proposal.column].values).mean()
                 for log in examined.logs
             )
-            factor = [f"{proposal.factor:.5g}"] if proposal.factor != 1.0 else []
-            declared = [
-                proposal.channel,
-                proposal.unit,
-                *([f"{proposal.sign:+d}"] if factor or proposal.sign != 1 else []),
-                *factor,
-            ]
-            proposed = " ".join(declared)
+            proposed = f"{proposal.channel} {proposal.unit}"
+            if proposal.sign != 1 or proposal.factor != 1.0:
+                proposed += f" {proposal.sign:+d}"
+            if proposal.factor != 1.0:
+                proposed += f" {proposal.factor:.5g}"
             text = f"column '{proposal.column}': {proposal.question}"
             if proposal.is_weak:
                 alternatives = (proposed, *alternatives)
@@ -185,13 +187,11 @@ def questions_of(examined: Examined) -> Iterator[Question]:
                 hint,
             )
     if proposals.wheel_radius is not None:
-        text = "rolling radius of the tyres [m], for vx from the wheel speeds"
         yield Question(
             "radius",
-            text,
+            "rolling radius of the tyres [m], for vx from the wheel speeds",
             f"{proposals.wheel_radius:g}",
-            (),
-            ("from ay/yaw_rate or the speed",),
+            evidence=("from ay/yaw_rate or the speed",),
         )
     lateral = [proposal for proposal in proposals.channels if proposal.channel in LATERAL]
     if lateral and not proposals.left_right:

@@ -130,9 +130,9 @@ def registered(word: str) -> str:
             f'[project.entry-points."{ENTRY_POINTS}"], NAME = '
             f'"{word if ":" in word else "package.module:Class"}"'
         )
-        problem = f"no installed package declares the estimator '{word}'"
         raise ConfigurationError(
-            f"{problem}; its pyproject.toml needs, under {declared}; then install it with pip"
+            f"no installed package declares the estimator '{word}'; its pyproject.toml needs, "
+            f"under {declared}; then install it with pip"
         )
     if name not in choices("estimator"):
         raise ConfigurationError(_without_settings_file(name))
@@ -194,20 +194,21 @@ def write(
         if "vy_ref" in drafted.channels and not _is_too_short(drafted)
         else Plan()
     )
-    texts = [_dataset_text(drafted, left)]
+    contents = [(_dataset_text(drafted, left), "channels, units and signs of the columns")]
     if plan.sweeps:
-        texts += [
-            _split_text(drafted),
-            _pipeline_text(name, plan, TRAINED_SHARE * drafted.seconds / 60.0, drafted.contents),
+        tried = ", ".join(dict.fromkeys(plan.estimators))
+        contents += [
+            (_split_text(drafted), "ranges for training, validation and test"),
+            (_pipeline_text(drafted, plan), f"estimators: {tried}"),
         ]
     else:
         plan.lacking.update(dict.fromkeys(added, "these recordings allow no comparison"))
-    files = dict(zip(paths_of(name), texts, strict=False))
+    files = dict(zip(paths_of(name), contents, strict=False))
     # of an earlier data set of this name; these recordings do not allow them
     stale = [file for file in paths_of(name)[len(files) :] if file.exists()]
     if not dry_run:
         with ExitStack() as stack:
-            for file, text in files.items():
+            for file, (text, _) in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
         for file in stale:
             file.unlink()
@@ -218,15 +219,11 @@ def write(
         "next": following,
         "dry_run": dry_run,
     }
-    purposes = (
-        "channels, units and signs of the columns",
-        "ranges for training, validation and test",
-    )
     lines = _words(drafted, plan, left)
-    for file, purpose in zip(
-        files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False
-    ):
-        lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
+    lines += [
+        f"{'would write' if dry_run else 'wrote'} {file}: {purpose}"
+        for file, (_, purpose) in files.items()
+    ]
     lines += [
         f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it"
         for file in stale
@@ -301,33 +298,18 @@ def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
         return [*commands, f"vehest run {name} --minutes 15"]
     if file.is_dir() or not longest.channels.issuperset(FILTER_CHANNELS):
         return commands
-    file = next(
-        (
-            candidate
-            for candidate in drafted.examined.files
-            if longest.id
-            in (candidate.stem, f"{candidate.stem}_run_{longest.id.rpartition('_')[2]}")
-        ),
-        file,
-    )
-    run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
-    settings = (
-        []
-        if drafted.examined.vehicle["wheelbase"]
-        else [f"estimator.wheelbase={ASSUMED_WHEELBASE:g}"]
-    )
-    words = [
-        "vehest",
-        "estimate",
-        str(file),
-        f"dataset={name}",
-        *run,
-        *settings,
-        "-o",
-        "estimate.parquet",
-    ]
+    number = longest.id.rpartition("_")[2]
+    for candidate in drafted.examined.files:
+        if longest.id in (candidate.stem, f"{candidate.stem}_run_{number}"):
+            file = candidate
+            break
+    words = ["vehest", "estimate", str(file), f"dataset={name}"]
+    if longest.id != file.stem:
+        words.append(f"+dataset.run={number}")
+    if not drafted.examined.vehicle["wheelbase"]:
+        words.append(f"estimator.wheelbase={ASSUMED_WHEELBASE:g}")
     # double quotes around blanks, which shells of Windows and POSIX read
-    return [*commands, list2cmdline(words)]
+    return [*commands, list2cmdline([*words, "-o", "estimate.parquet"])]
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -340,16 +322,16 @@ def found_in(examined: Examined) -> dict[str, Any]:
         "time": None if examined.log.clock is None else asdict(examined.log.clock),
         "channels": [proposal.as_plain() for proposal in proposals.channels],
         "left_right": proposals.left_right or None,
-        "pose": {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose},
+        "pose": examined.pose_columns,
         "unused": list(proposals.unused),
-        "vehicle": dict(examined.vehicle),
+        "vehicle": examined.vehicle,
     }
 
 
 def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
     return found_in(drafted.examined) | {
         "recordings": [content.id for content in drafted.contents],
-        "rate_hz": min(content.rate_hz for content in drafted.contents),
+        "rate_hz": drafted.lowest_rate_hz,
         "seconds": drafted.seconds,
         "open": [question.as_plain() for question in left],
         "steering_ratio_found": None
@@ -398,27 +380,17 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
     vehicle = drafted.examined.vehicle
     plan = Plan()
     values = _car(vehicle)
-    slowest = min(recording.rate_hz for recording in contents)
+    slowest = drafted.lowest_rate_hz
     cut = _divisible(drafted)
-    shares = (
-        [0.2 * drafted.durations[recording] for recording in cut]
-        if cut
-        else [drafted.durations[recording] for recording in _long_enough(drafted)]
-    )
-    seconds = min(shares, default=0.0)  # of the shortest range for validation
-    added_trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
-    trials = sorted(
-        [
-            *added_trials,
-            *(
-                (trial, name)
-                for name, family in estimator_classes().items()
-                for trial in family.trials
-            ),
-        ]
-    )
+    share = 0.2 if cut else 1.0
+    ranges = [share * drafted.durations[recording] for recording in cut or _long_enough(drafted)]
+    seconds = min(ranges, default=0.0)  # of the shortest range for validation
+    trials = [(ADDED, name) for name in added if not estimator_class(name).trials]
+    trials += [
+        (trial, name) for name, family in estimator_classes().items() for trial in family.trials
+    ]
     sweeps: dict[tuple[str, str, int], list[str]] = {}
-    for trial, name in trials:
+    for trial, name in sorted(trials):
         sweeps.setdefault(trial[1:], []).append(name)
     for (about, overrides, samples), names in sweeps.items():
         if PRETRAINED in overrides and slowest < PRETRAINED_HZ * (1 - 1e-9):
@@ -429,10 +401,9 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
             if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)
         ]
         car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
-        words = overrides.replace("{car}", car).format(**values).split()
         words = [
             word
-            for word in words
+            for word in overrides.replace("{car}", car).format(**values).split()
             if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
         ]
         options = ", ".join(f"--{name}" for name in unknown)
@@ -452,15 +423,11 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
             plan.sweeps.append(([f"estimator={','.join(tried)}", *other_words, *settings], about))
             plan.estimators.extend(tried)
     tried_names = {name for names in sweeps.values() for name in names}
-    remaining = [
-        name for name in (*choices("estimator"), *estimator_names()) if name not in tried_names
-    ]
-    by_default = "not a default; add it by --with"
-    plan.lacking.update(dict.fromkeys(remaining, by_default))
-    broken = set(estimator_names()) - set(estimator_classes())
-    plan.lacking.update(
-        dict.fromkeys(broken, "it cannot be loaded; 'vehest data usable' names the reason")
-    )
+    for name in (*choices("estimator"), *estimator_names()):
+        if name not in tried_names:
+            plan.lacking[name] = "not a default; add it by --with"
+    for name in set(estimator_names()) - set(estimator_classes()):
+        plan.lacking[name] = "it cannot be loaded; 'vehest data usable' names the reason"
     return plan if plan.sweeps else Plan()
 
 
@@ -469,9 +436,15 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     mass = vehicle["mass"] or 0.0
     half = 0.5 * wheelbase
     stiffness = 0.5 * STIFFNESS * mass * GRAVITY
-    values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
-    values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
-    values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
+    values = {
+        "mass": mass,
+        "yaw_inertia": mass * half * half,
+        "cg_height": HEIGHT * wheelbase,
+        "cg_to_front_axle": half,
+        "cg_to_rear_axle": half,
+        "cornering_stiffness_front": stiffness,
+        "cornering_stiffness_rear": stiffness,
+    }
     return {name: f"{value:.4g}" for name, value in values.items()} | {
         "wheelbase": f"{wheelbase:g}"
     }
@@ -498,64 +471,16 @@ def _lack(
         usable = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error), ()
+    missing = [] if usable.settings_suffice else usable.missing.in_words()
+    lacks = [f"requires {', '.join(missing)}"] if missing else []
     min_seconds = samples / (usable.rate_hz or math.inf)
-    short = (
-        [
+    if min_seconds > seconds:
+        lacks.append(
             f"at least {min_seconds:.3g} s in each range for validation (the shortest has "
             f"{seconds:.3g} s)"
-        ]
-        if min_seconds > seconds
-        else []
-    )
-    missing = [] if usable.settings_suffice else usable.missing.in_words()
-    missing = [f"requires {', '.join(missing)}"] if missing else []
+        )
     settings = usable.settings if usable.settings_suffice else ()
-    return ", ".join([*missing, *short]) or usable.to_give, settings
-
-
-def _pipeline_of(
-    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
-) -> dict[str, Any]:
-    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes
-    of reference.
-    """
-    parts: dict[str, Any] = {
-        "all": {
-            "title": "all recordings",
-            "split": name,
-            "sweeps": [words for words, _ in plan.sweeps],
-        }
-    }
-    scratch = [
-        "estimator=ksnn",
-        "estimator.n_local=2",
-        "estimator.n_hidden=2",
-        "training.max_epochs=100",
-    ]
-    for limit in MINUTES if "ksnn" in plan.estimators else ():
-        if limit < 0.8 * minutes:
-            part = {
-                "title": f"{limit:g} min of reference",
-                "split": name,
-                "overrides": [f"++split.minutes={limit:g}"],
-            }
-            parts[f"minutes_{limit:g}"] = part | {
-                "sweeps": [["estimator=zero,static_map"], scratch]
-            }
-            if any(PRETRAINED in words for words, _ in plan.sweeps):
-                tuned = {
-                    "title": f"{part['title']}, trained on",
-                    "sweeps": [[*scratch, PRETRAINED]],
-                }
-                parts[f"minutes_{limit:g}_tuned"] = part | tuned
-    evaluation = {"rate_hz": min([EVALUATED_HZ, *(content.rate_hz for content in contents)])}
-    study = {
-        "study": name,
-        "title": f"Which estimator to trust on {name}",
-        "report": "own_car",
-        "publish": False,
-    }
-    return study | {"evaluation": evaluation, "parts": parts}
+    return ", ".join(lacks) or usable.to_give, settings
 
 
 def _limits(drafted: Draft) -> list[str]:
@@ -569,11 +494,10 @@ def _limits(drafted: Draft) -> list[str]:
     if missing:
         return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
     if _is_too_short(drafted):
-        lengths = f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')}"
         return [
-            f"{lengths} are too short for training, validation and a test: record two minutes or "
-            "more with bends, or three drives or more, "
-            f"with the reference; until then {_without_reference(drafted)}"
+            f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')} are too "
+            "short for training, validation and a test: record two minutes or more with bends, or "
+            f"three drives or more, with the reference; until then {_without_reference(drafted)}"
         ]
     if not _divisible(drafted):
         return [
@@ -632,9 +556,11 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
     )
 
 
-def _pipeline_text(
-    name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]
-) -> str:
+def _pipeline_text(drafted: Draft, plan: Plan) -> str:
+    """A pipeline of study and split: all recordings, then parts with less of the minutes of
+    reference.
+    """
+    name = drafted.examined.name
     head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
@@ -642,12 +568,45 @@ def _pipeline_text(
         "Not included, with the reason:",
         *(f"  {estimator}: {lack}" for estimator, lack in plan.lacking.items()),
     ]
-    return _yaml(_pipeline_of(name, plan, minutes, contents), head)
+    minutes = TRAINED_SHARE * drafted.seconds / 60.0
+    parts: dict[str, Any] = {
+        "all": {
+            "title": "all recordings",
+            "split": name,
+            "sweeps": [words for words, _ in plan.sweeps],
+        }
+    }
+    scratch = [
+        "estimator=ksnn",
+        "estimator.n_local=2",
+        "estimator.n_hidden=2",
+        "training.max_epochs=100",
+    ]
+    for limit in MINUTES if "ksnn" in plan.estimators else ():
+        if limit < 0.8 * minutes:
+            part = parts[f"minutes_{limit:g}"] = {
+                "title": f"{limit:g} min of reference",
+                "split": name,
+                "overrides": [f"++split.minutes={limit:g}"],
+                "sweeps": [["estimator=zero,static_map"], scratch],
+            }
+            if any(PRETRAINED in words for words, _ in plan.sweeps):
+                parts[f"minutes_{limit:g}_tuned"] = part | {
+                    "title": f"{part['title']}, trained on",
+                    "sweeps": [[*scratch, PRETRAINED]],
+                }
+    study = {
+        "study": name,
+        "title": f"Which estimator to trust on {name}",
+        "report": "own_car",
+        "publish": False,
+        "evaluation": {"rate_hz": min(EVALUATED_HZ, drafted.lowest_rate_hz)},
+        "parts": parts,
+    }
+    return _yaml(study, head)
 
 
-def _yaml(
-    content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None
-) -> str:
+def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] = {}) -> str:
     """YAML below a comment, with further comments behind some keys."""
     lines = yaml.safe_dump(
         dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False
@@ -658,10 +617,9 @@ def _yaml(
                 f"'{printable(line.strip()[:60])}' contains '${{', which configurations read as a "
                 "reference; rename it"
             )
-    printable_comments = {key: printable(comment) for key, comment in (comments or {}).items()}
     behind = [
-        f"{line:<44} # {printable_comments[key]}"
-        if (key := line.partition(":")[0]) in printable_comments
+        f"{line:<44} # {printable(comments[key])}"
+        if (key := line.partition(":")[0]) in comments
         else line
         for line in lines
     ]

@@ -129,10 +129,9 @@ def read(
                     "title": _title(measurement, group),
                     "unit": unit,
                 }
-        start = measurement.header.start_time.isoformat()
         return arrays, {
             "version": measurement.version,
-            "start": start,
+            "start": measurement.header.start_time.isoformat(),
             "signals": signals,
             "skipped": skipped or [],
         }
@@ -334,16 +333,19 @@ def _group_of(
     """
     title = _title(measurement, group)
     described = measurement.groups[group]
-    first = _short_name(described.channels[next(iter(indices.values()))].name)
     clock = measurement.masters_db.get(group)
+    indices_read = {"": clock, **indices}
+    location_of = {
+        key: f"'{file}': signal '{_short_name(described.channels[index].name)}' of group {title}"
+        for key, index in indices_read.items()
+        if index is not None
+    }
+    first = location_of[next(iter(indices))]
     if (
         clock is None
         or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME
     ):
-        raise DataError(
-            f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no "
-            "master channel of time"
-        )
+        raise DataError(f"{first} has no time stamps: its group has no master channel of time")
     count = described.channel_group.cycles_nr
     check_limit("samples", count, f"'{file}': group {title} says that it holds {count} samples")
     record = described.channel_group.samples_byte_nr + (
@@ -354,16 +356,12 @@ def _group_of(
         for block in described.get_data_blocks()
     )
     if present < count * record:
-        fault = f"holds {present // record} samples, its header says {count}"
         raise DataError(
-            f"'{file}': signal '{first}' of group {title} {fault}; the file is truncated or damaged"
+            f"{first} holds {present // record} samples, its header says {count}; the file is "
+            "truncated or damaged"
         )
     read: dict[str, int] = {}
-    location_of = {
-        key: f"'{file}': signal '{_short_name(described.channels[index].name)}' of group {title}"
-        for key, index in {"": clock, **indices}.items()
-    }
-    for key, index in {"": clock, **indices}.items():
+    for key, index in indices_read.items():
         with _or_skip(skipped if key else None, file):
             _require_number(measurement, group, index, location_of[key])
             read[key] = index
@@ -386,8 +384,7 @@ def _require_number(measurement: Any, group: int, index: int, location: str) -> 
     """
     described = measurement.groups[group]
     channel = described.channels[index]
-    dependencies = described.channel_dependencies[index]
-    if dependencies:
+    if described.channel_dependencies[index]:
         raise DataError(
             f"{location} holds an array or structure; numbers are needed: name another signal"
         )

@@ -72,13 +72,10 @@ class RevsSource(FileSource):
         if self.options.recordings is not None:
             return [name.removesuffix(suffix) for name in self.options.recordings]
         pattern = f"{self.options.files or '*'}{suffix}"
-        paths = [
-            path for path in sorted(self._folder().glob(pattern)) if path.is_dir() == (not suffix)
-        ]
         names = [
             path.name.removesuffix(suffix)
-            for path in paths
-            if path.name != self.options.vehicle_parameters
+            for path in sorted(self._folder().glob(pattern))
+            if path.is_dir() == (not suffix) and path.name != self.options.vehicle_parameters
         ]
         if not names:
             raise MissingError(
@@ -89,13 +86,14 @@ class RevsSource(FileSource):
     def inputs(self) -> dict[str, str | Path]:
         """Every file that is read."""
         folder = self._folder()
-        files = {
+        files: dict[str, str | Path] = {
             file.relative_to(folder).as_posix(): file
             for name in self.ids()
             for file in self._files_of(name).values()
         }
-        parameters = self._parameters_file()
-        return dict(files) if parameters is None else {**files, parameters.name: parameters}
+        if parameters := self._parameters_file():
+            files[parameters.name] = parameters
+        return files
 
     def file_names(self) -> list[str]:
         """Files of the named recordings in the official layout, and the table of vehicle
@@ -132,17 +130,15 @@ class RevsSource(FileSource):
         clock = uniform_clock(
             self.time.to_si(samples[self.time.column], "s"), f"'{path}'", options.clock
         )
-        values = {
-            name: clock.align(samples[name], name in self.gappy_columns)
-            for name in self.column_names
-        }
         channels = {
-            name: column.to_si(values[column.column], channel(name).unit)
+            name: column.to_si(
+                clock.align(samples[column.column], column.column in self.gappy_columns),
+                channel(name).unit,
+            )
             for name, column in self.columns.items()
         }
         provenance = {"layout": options.layout, **origin}
-        parameters = self._parameters_file()
-        if parameters is not None:
+        if parameters := self._parameters_file():
             provenance["vehicle_parameters"] = read_vehicle_parameters(parameters)
         return self._recording(recording_id, f"'{path}'", clock, channels, provenance)
 
@@ -156,12 +152,11 @@ class RevsSource(FileSource):
         )
         if self.options.units_row == "check":
             for name, column in self.columns.items():
-                location = f"'{file}': column '{column.column}'"
                 require_unit(
                     units[column.column],
                     column,
                     channel(name).unit,
-                    location,
+                    f"'{file}': column '{column.column}'",
                     "set units_row: ignore",
                 )
         return values, about

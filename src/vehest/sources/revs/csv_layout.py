@@ -67,12 +67,9 @@ def read_csv(
         for line in lines[preamble_lines : preamble_lines + 2]
     )
     if time not in names:
-        problem = (
-            f"line {preamble_lines + 1} should name the columns and has no '{time}' (it has "
-            f"{listed(names)})"
-        )
         raise DataError(
-            f"'{file}': {problem}; correct preamble_lines, or is it no official Revs file?"
+            f"'{file}': line {preamble_lines + 1} should name the columns and has no '{time}' (it "
+            f"has {listed(names)}); correct preamble_lines, or is it no official Revs file?"
         )
     require_columns(file, names, columns)
     if len(units) != len(names) or any(_number(unit) is not None for unit in units):
@@ -89,13 +86,10 @@ def read_csv(
     slowest = max(starts, key=lambda name: starts[name], default=time)
     first = starts.get(slowest, 0)
     if first > LONGEST_HEAD * len(values[time]):
-        fault = (
-            f"column '{slowest}' is blank until {values[time][first]:.12g} s, more than "
-            f"{100 * LONGEST_HEAD:g} % of the rows"
-        )
         raise DataError(
-            f"'{file}': {fault}; leave its channel out of the map in conf/dataset, or declare it "
-            "in 'gappy'"
+            f"'{file}': column '{slowest}' is blank until {values[time][first]:.12g} s, more than "
+            f"{100 * LONGEST_HEAD:g} % of the rows; leave its channel out of the map in "
+            "conf/dataset, or declare it in 'gappy'"
         )
     preamble = [text for line in lines[:preamble_lines] if (text := line.rstrip(",").strip())]
     about = {"file": file.name, "preamble": preamble, "rows_dropped_at_the_head": first}

@@ -81,13 +81,11 @@ class RosbagSource(FileSource):
         if pose := self.options.pose:
             fields += [(pose.topic, f"{pose.field}.{part}") for part in POSE_FIELDS]
         declared = self.options.topics or {}
-        self.topics = {
-            name: declared[name] for name in declared if any(topic == name for topic, _ in fields)
-        }
         self.fields = {
             name: list(dict.fromkeys(field for topic, field in fields if topic == name))
-            for name in self.topics
+            for name in declared
         }
+        self.topics = {name: topic for name, topic in declared.items() if self.fields[name]}
 
     def inputs(self) -> dict[str, str | Path]:
         """Archives and files of bags."""
@@ -128,12 +126,9 @@ class RosbagSource(FileSource):
         channels = {}
         for name, declared in self.channels.items():
             topic_series = series[declared.topic]
-            values = series[declared.topic].fields[declared.field]
-            values = self.columns[name].to_si(
-                values - declared.offset if declared.offset else values, channel(name).unit
-            )
+            values = topic_series.fields[declared.field] - declared.offset
             channels[name] = at_ticks(
-                values,
+                self.columns[name].to_si(values, channel(name).unit),
                 topic_series.times,
                 grid,
                 hold=topic_series.topic.interpolation == "hold",
@@ -216,7 +211,8 @@ class RosbagSource(FileSource):
             )
             jitter = float(np.diff(stamps).std())
         if topic.average and rate_hz is not None:
-            kernel = _averaging(round(topic.average * rate_hz))
+            width = round(topic.average * rate_hz)  # of an even one the outermost two weigh half
+            kernel = np.convolve(np.ones(width), [1.0] if width % 2 else [0.5, 0.5]) / width
             lost = len(kernel) // 2
             if len(times) <= 2 * lost:
                 raise DataError(
@@ -259,18 +255,6 @@ class RosbagSource(FileSource):
             plane = np.stack([np.interp(grid, times, plane[:, axis]) for axis in (0, 1)], axis=1)
             times, yaw, rate_hz = grid, np.interp(grid, times, yaw), self.options.rate_hz
         return pose.references(plane, yaw, 1.0 / rate_hz, pose.yaw, location, at=(times, grid))
-
-
-def _averaging(width: int) -> FloatArray:
-    """Weights of a centred moving average over samples, which sum to 1.
-
-    Of an even width the outermost two weigh half.
-    """
-    if width % 2:
-        return np.full(width, 1.0 / width)
-    kernel = np.full(width + 1, 1.0 / width)
-    kernel[[0, -1]] /= 2.0
-    return kernel
 
 
 SOURCE = RosbagSource

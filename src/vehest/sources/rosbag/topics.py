@@ -82,10 +82,9 @@ def bag_files(path: Path) -> list[Path]:
             f"cannot read '{path}' ({error.strerror}); check its permissions"
         ) from None
     if not files:
-        contents = f"neither {METADATA} nor a file ending in {' or '.join(STORAGES)}"
         raise MissingError(
-            f"'{path}' holds no bag: {contents}; of other logs name the files, such as "
-            f"{path / '*.csv'}"
+            f"'{path}' holds no bag: neither {METADATA} nor a file ending in "
+            f"{' or '.join(STORAGES)}; of other logs name the files, such as {path / '*.csv'}"
         )
     return files
 

@@ -118,9 +118,9 @@ def _survey(path: Path) -> Log:
     """
     ending = path.suffix.lower()
     if ending == ".mat":
-        table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
         raise DataError(
-            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}"
+            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by "
+            f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
         )
     if ending in CAN:
         raise DataError(
@@ -150,16 +150,14 @@ def _survey(path: Path) -> Log:
 
 def _survey_bag(path: Path) -> Log:
     """Numbers in messages of ROS's own types, each field with the times of its messages."""
-    reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
-    arrays = reading.arrays
-    topics = reading.summary["topics"]
+    arrays, about = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
     columns = []
     times = {
         name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
-        for name, *_ in topics
+        for name, *_ in about["topics"]
     }
     start = min((stamps[0] for stamps in times.values() if len(stamps) > 1), default=0.0)
-    for topic, kind, fields in topics:
+    for topic, kind, fields in about["topics"]:
         clock = "header" if f"{topic}@stamped" in arrays else "received"
         for field in fields if len(times[topic]) > 1 else ():
             unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
@@ -173,7 +171,7 @@ def _survey_bag(path: Path) -> Log:
                     times[topic] - start,
                 )
             )
-    return Log(path, "rosbag", tuple(columns), skipped=tuple(reading.summary["skipped"]))
+    return Log(path, "rosbag", tuple(columns), skipped=tuple(about["skipped"]))
 
 
 def _survey_mdf(file: Path) -> Log:
@@ -188,9 +186,9 @@ def _survey_mdf(file: Path) -> Log:
     columns = []
     for key, signal in signals.items():
         place = about["signals"][key]
-        entry = {"column": place["name"]} | (
-            {} if key == place["name"] else {"group": place["group"]}
-        )
+        entry = {"column": place["name"]}
+        if key != place["name"]:
+            entry["group"] = place["group"]
         columns.append(RawColumn(key, signal.unit, signal.values, entry, signal.stamps))
     return Log(file, "mdf", tuple(columns), skipped=tuple(skipped))
 

@@ -185,12 +185,11 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
     runs = stretches(steps < 0, len(seconds))
     pauses = steps > longest
     stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
-    cut = (
-        timed_runs(seconds, longest, restarts=True)
-        if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray
-        else {}
-    )
-    return ([*cut.values()], {"max_gap": longest}) if cut else (runs, {})
+    if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray:
+        cut = timed_runs(seconds, longest, restarts=True)
+        if cut:
+            return [*cut.values()], {"max_gap": longest}
+    return runs, {}
 
 
 def plain_name(name: str) -> str:

@@ -165,9 +165,8 @@ def survey_table(file: Path) -> Log:
             f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names"
         )
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    stamps, seconds, runs, cuts = find_clock(
-        {**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")}
-    )
+    times_and_values = clocks | values
+    stamps, seconds, runs, cuts = find_clock(times_and_values, written | dict.fromkeys(clocks, "s"))
     if stamps is not None and stamps.column in clocks:
         stamps = replace(
             stamps,
@@ -182,32 +181,40 @@ def survey_table(file: Path) -> Log:
     }
     faults = [
         _fault(name, times)
-        for name, times in {**clocks, **named}.items()
+        for name, times in (clocks | named).items()
         if stamps is None or name != stamps.column
     ]
     if stamps is not None and stamps.repair.get("sort"):
-        rows = np.argsort({**clocks, **values}[stamps.column], kind="stable")
+        rows = np.argsort(times_and_values[stamps.column], kind="stable")
         values = {name: samples[rows] for name, samples in values.items()}
-    options = {**options, **cuts}
+    options |= cuts
     beside = {stamps.column if stamps else None, cuts.get("runs")}
     columns = [
         RawColumn(name, written[name], samples, {"column": name})
         for name, samples in values.items()
         if name not in beside
     ]
-    plain = not {"rows_below_names", "missing"} & set(options) and (
-        stamps is None or stamps.unit != CLOCK
+    is_text_log = {"rows_below_names", "missing"} & set(options) or (
+        stamps and stamps.unit == CLOCK
     )
-    source = "tabular" if plain else "text_log"
-    reasons = (*skipped, *faults)
-    return Log(file, source, tuple(columns), options, stamps, seconds, runs, reasons, repeated)
+    return Log(
+        file,
+        "text_log" if is_text_log else "tabular",
+        tuple(columns),
+        options,
+        stamps,
+        seconds,
+        runs,
+        (*skipped, *faults),
+        repeated,
+    )
 
 
 def _fault(name: str, times: FloatArray) -> str:
     """Why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
-    back = int((steps < 0).sum())
-    n_repeats = int((steps == 0).sum())
+    back = (steps < 0).sum()
+    n_repeats = (steps == 0).sum()
     fault = (
         f"goes backwards {back} times"
         if back
@@ -260,10 +267,12 @@ def shape_of(file: Path) -> Shape:
     ]
     tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
     require_columns_of_signals(file, lines, tables)
-    marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",")]
-    best = max(
-        (_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score
-    )
+    shapes = [
+        _shape(rows, delimiter, decimal, encoding)
+        for delimiter, rows in tables.items()
+        for decimal in (".", ",")
+    ]
+    best = max(shapes, key=lambda shape: shape.score)
     if not best.score:
         cells = [
             cell for row in [*tables[";"].values(), *tables[","].values()][-40:] for cell in row
@@ -372,19 +381,15 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
         raise DataError(
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
-    try:
-        return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(
-            head, final=len(head) < HEAD
-        )
-    except UnicodeDecodeError:
-        for encoding in (
-            ("cp932", "cp1252") if re.search(rb"[\x80-\x9f]", head) else ()
-        ):  # cp932: Shift-JIS as Windows writes it
-            with suppress(UnicodeDecodeError):
-                text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
-                if encoding == "cp1252" or WIDE.search(text):
-                    return encoding, text
-        return "latin-1", head.decode("latin-1")
+    encodings = {"utf8": "utf-8-sig"}
+    if re.search(rb"[\x80-\x9f]", head):
+        encodings |= {"cp932": "cp932", "cp1252": "cp1252"}  # Shift-JIS as Windows writes it
+    for name, encoding in encodings.items():
+        with suppress(UnicodeDecodeError):
+            text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
+            if name != "cp932" or WIDE.search(text):
+                return name, text
+    return "latin-1", head.decode("latin-1")
 
 
 def _without_texts(
@@ -491,16 +496,15 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
         lines: list[str] = []
         try:
             layout = with_names(file, shape.layout)
-            table = parse_table(opened, layout, convert, lines_of_text=lines)
+            table = parse_table(opened, layout, convert, lines)
             texts = [f"line '{printable(line.strip()[:60])}'" for line in lines]
             return table, [left_out, *texts] if left_out else texts
         except DAMAGE as error:
             problem = printable(first_line(error))
-    why = (
-        "is it truncated, is a line of text or a second table below its rows, or are its columns "
-        "aligned by blanks?"
+    raise DataError(
+        f"'{file}' cannot be read as a table ({problem}); is it truncated, is a line of text or a "
+        "second table below its rows, or are its columns aligned by blanks?"
     )
-    raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
 def _numbers(
