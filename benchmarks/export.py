@@ -268,20 +268,25 @@ def measured(
 
 
 def report(table: pd.DataFrame) -> str:
-    """The page: verdicts, then the table."""
+    """The page: verdicts, then differences and times of each model, then bytes."""
     double, single = (table[table["precision"] == kind] for kind in ("double", "float"))
     lines = ["# Models in C against Python", ""]
     ratio = double["python_over_c"]
     for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
         good = rows["largest_difference_vy"] <= limit
         beyond = ", ".join(
-            f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}"
+            f"{_name(row)} {row.largest_difference_vy:.1e} on {row.drive}"
             for row in rows[~good].itertuples()
         )
         lines.append(
             f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64"
             + (f"; beyond: {beyond}." if beyond else ".")
         )
+    other_health = "; ".join(
+        f"{_name(row)}, {row.precision}, on {row.drive}: {row.other_health_rows} of {row.steps}"
+        for row in table[table["other_health_rows"] > 0].itertuples()
+    )
+    lines.append(f"- Samples whose health differs from Python's: {other_health or 'none'}.")
     lines.append(
         f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands."
     )
@@ -297,24 +302,125 @@ def report(table: pd.DataFrame) -> str:
             lines.append(
                 f"- {start}: {double[named]['c_method_ns'].max() / 1e3:.3g} µs a step of the method; asked for were {goal:g} µs."
             )
-    columns = list(table.columns)
     lines += [
         "",
-        "| " + " | ".join(columns) + " |",
-        "| " + " | ".join("--" for _ in columns) + " |",
-    ]
-    lines += [
-        "| "
-        + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row)
-        + " |"
-        for row in table.itertuples(index=False)
-    ]
-    lines += [
+        "Every number, sizes on this machine included: [CSV](metrics.csv).",
+        "",
+        "## Difference and time of a step",
+        "",
+        "Largest difference of v from Python in float64, and microseconds a step in C, with guard, health and bands and of the",
+        "method alone, in Python and in onnxruntime. A dash: float is refused for the model, or onnxruntime has no network of it.",
+        "",
+        *_pipes(_times(double, single)),
         "",
         f"gcc {' '.join(FLAGS)}; {platform.machine()}, one core; times are those of this run and machine, their ratios travel better.",
         "",
     ]
+    if "m4f_code_bytes" in table:
+        lines += [
+            "## Bytes on a Cortex-M4F",
+            "",
+            "Flash: code and tables. RAM: state and the worst case of the stack, without what the C library takes. In kB; of a model",
+            "on several drives, the most.",
+            "",
+            *_pipes(_bytes(table)),
+            "",
+        ]
     return "\n".join(lines)
+
+
+def _name(row: Any) -> str:
+    """Family and variant of a row."""
+    return row.family if row.family == row.variant else f"{row.family} {row.variant}"
+
+
+def _times(double: pd.DataFrame, single: pd.DataFrame) -> pd.DataFrame:
+    """Cells of a model on a drive: differences and times in both precisions."""
+    both = double.merge(single, "left", ["family", "variant", "drive"], suffixes=("", "_float"))
+    differences = ("largest_difference_vy", "largest_difference_vy_float")
+    times = ("c_ns", "c_method_ns", "c_ns_float", "c_method_ns_float", "python_ns")
+    cells = [
+        [
+            _name(row),
+            row.drive,
+            *(_cell(getattr(row, name), "{:.2g}") for name in differences),
+            *(_cell(getattr(row, name) / 1e3) for name in times),
+            _cell(row.python_over_c),
+            _cell(row.onnxruntime_ns / 1e3),
+        ]
+        for row in both.itertuples()
+    ]
+    heads = [
+        "model",
+        "drive",
+        "double [m/s]",
+        "float [m/s]",
+        "C, double [µs]",
+        "method, double [µs]",
+    ]
+    heads += ["C, float [µs]", "method, float [µs]", "Python [µs]", "Python / C, double"]
+    return pd.DataFrame(cells, columns=[*heads, "onnxruntime [µs]"])
+
+
+def _bytes(table: pd.DataFrame) -> pd.DataFrame:
+    """Cells of a model: flash and RAM on a Cortex-M4F in both precisions [kB]."""
+    sizes = pd.DataFrame(
+        {
+            "model": [_name(row) for row in table.itertuples()],
+            "precision": table["precision"],
+            "flash": (table["m4f_code_bytes"] + table["m4f_tables_bytes"]) / 1e3,
+            "RAM": (table["m4f_state_bytes"] + table["m4f_stack_bytes"]) / 1e3,
+        }
+    )
+    wide = sizes.pivot_table(
+        index="model", columns="precision", values=["flash", "RAM"], aggfunc="max"
+    )
+    columns = [(kind, precision) for kind in ("flash", "RAM") for precision in ("double", "float")]
+    cells = [
+        [model, *(_cell(row.get(column, np.nan), "{:.1f}") for column in columns)]
+        for model, row in wide.iterrows()
+    ]
+    return pd.DataFrame(cells, columns=["model", *(", ".join(column) for column in columns)])
+
+
+def _cell(value: float, form: str = "") -> str:
+    """A number in a form, else with three significant digits; a dash where there is none."""
+    from vehest.report.style import significant
+
+    if not np.isfinite(value):
+        return "–"
+    return form.format(value) if form else significant(value, 3)
+
+
+def _pipes(cells: pd.DataFrame) -> list[str]:
+    """Lines of a Markdown table, numbers to the right."""
+    is_text_column = [name in ("model", "drive") for name in cells.columns]
+    lines = [list(cells.columns), [":--" if is_text else "--:" for is_text in is_text_column]]
+    return [f"| {' | '.join(line)} |" for line in [*lines, *cells.values.tolist()]]
+
+
+def redraw(out: Path) -> None:
+    """Draw report.md from the metrics.csv beside it; what its numbers follow from stays recorded."""
+    from vehest.run.table_records import RowKeys, record_tables
+
+    table = pd.read_csv(out / "metrics.csv")
+    (out / "report.md").write_text(report(table), encoding="utf-8")
+    record_tables(
+        [out / "report.md"],
+        "make export_all",
+        determined_by(table),
+        rows=RowKeys(
+            {}, {family: f"calibrate {family}" for family in sorted(set(table["family"]))}
+        ),
+    )
+
+
+def determined_by(table: pd.DataFrame) -> list[str]:
+    """What all numbers follow from, as in the names of keys."""
+    return [
+        "script benchmarks/export.py",
+        *(f"data {drive}" for drive in sorted(set(table["drive"]))),
+    ]
 
 
 def main() -> None:
@@ -328,7 +434,15 @@ def main() -> None:
     parser.add_argument(
         "--without-times", action="store_true", help="leave times empty, on a busy machine"
     )
+    parser.add_argument(
+        "--redraw",
+        action="store_true",
+        help="measure nothing; draw the page from the table in --out",
+    )
     words = parser.parse_args()
+    if words.redraw:
+        redraw(words.out)
+        return
     root = os.environ.get("VEHEST_DATA")
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
     found = [
@@ -361,10 +475,7 @@ def main() -> None:
     record_tables(
         [words.out / "metrics.csv", words.out / "report.md"],
         "make export_all",
-        [
-            "script benchmarks/export.py",
-            *(f"data {drive}" for drive in sorted(set(table["drive"]))),
-        ],
+        determined_by(table),
         rows=RowKeys(
             {family: f"calibrate {family}" for family in sorted({row["family"] for row in rows})},
             {family: f"calibrate {family}" for family in former_families},

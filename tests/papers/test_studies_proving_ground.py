@@ -285,7 +285,12 @@ def test_report_states_data_ratios_and_the_papers_figures(study, report):
     assert "seed 7" in text
     assert "vehest run pipelines/x.yaml" in text
     tables = _tables(report)
-    assert set(tables["beside_papers"]["set"]) == {"F-1", "F-2"}
+    beside_papers = report.data["beside_papers"]
+    assert set(beside_papers["set"]) == {"F-1", "F-2"}
+    assert "| quantity | F-1 | F-2 | | :-- | --: | --: |" in text
+    durations = beside_papers[beside_papers["quantity"] == "duration"]["simulated"]
+    assert durations.tolist() == pytest.approx([150.0, 60.0])
+    assert "| duration [s] | 1542 / 150 | 1086 / 60 |" in text
     vehicle = survey(study.datasets)["ferrari_250_lm"]
     ratio = vehicle.merged("simulated").quantile("ay", 0.99, absolute=True)
     ratio /= vehicle.merged("real").quantile("ay", 0.99, absolute=True)

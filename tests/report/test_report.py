@@ -515,7 +515,7 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
 def test_report_states_its_provenance_and_the_kind_of_data(artefacts, written):
     for kind, words in (("simulated", "**Simulated data:**"), ("real", "**Real data:**")):
         verdict, forest, _, busiest = comparison(replace(artefacts, kinds={"toy": kind})).blocks[:4]
-        assert f"on test set `test` ({kind}; " in forest.caption
+        assert f"on test set `test` ({kind})" in forest.caption
         assert (forest.name, busiest.name) == ("forest_test", "zoom_test")
         assert words in verdict
     text = (written / "report.md").read_text(encoding="utf-8")

@@ -719,10 +719,10 @@ def _forest(
         )
         for row in board.to_dict("records")
     ]
+    kinds = artefacts.kinds_of(artefacts.split.tests[test_set])
     caption = (
-        "RMSE(β) of every estimator over all its seeds with its 95 % interval, on "
-        f"{_describe_test_set(artefacts, test_set)}. "
-        "Filled: the best and those that are not significantly worse."
+        f"RMSE(β) of every estimator over all its seeds on test set `{test_set}` ({kinds}), with "
+        "its 95 % interval. Filled: the best and those that are not significantly worse."
     )
     return Figure(f"forest_{file_of(test_set)}", caption, forest_figure(rows))
 
@@ -842,8 +842,8 @@ def _training(
     if not runs:
         return []
     caption = (
-        "Loss over the epochs of each chosen seed: mean squared error of v on training and "
-        "validation ranges. The marker is where the "
-        "validation loss is lowest, whose weights are kept."
+        "Loss over the epochs of each chosen seed. It is the mean squared error of v on training "
+        "and validation ranges; the marker is where the validation loss is lowest, whose weights "
+        "are kept."
     )
     return ["## Training", Figure("learning", caption, figures.learning_curves(runs))]

@@ -55,11 +55,12 @@ COLUMNS = {
 """Of a table of `rows_of_curve`."""
 COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Amounts of reference with a column in the overview [min]; the last column is all of a drive."""
-FIGURE_CAPTION = (
-    "{title}, test set `{test_set}`: RMSE(β) over the minutes of recording with a reference for "
-    "training and validation; bars are 95 % intervals over blocks of the test and trainings. "
-    "Dashed: zero-sideslip baseline."
+FIGURE_CAPTION = "{title}, test set `{test_set}`: RMSE(β) over the minutes of reference."
+FIGURE_NOTE = (
+    "Minutes are those of recording with a reference for training and validation; bars are 95 % "
+    "intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
 )
+"""What holds for every figure of a curve."""
 OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
@@ -101,6 +102,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "about": artefacts.about.strip(),
         "curves": [summary_of_curve(rows) for _, rows in points.groupby("curve", sort=False)],
         "figures": figures,
+        "figure_note": FIGURE_NOTE,
         "n_models": sum(len(part.models) for part in parts),
         "data": list(
             dict.fromkeys(
@@ -354,7 +356,7 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [
         _in_words(curve),
-        Figure(f"reference_minutes_{name}", caption, _figure(curve)),
+        Figure(f"reference_minutes_{name}", f"{caption} {FIGURE_NOTE}", _figure(curve)),
         Table(
             f"reference_minutes_{name}",
             f"{curve.title}: RMSE(β) by minutes of reference. Trainings: segments of the drive "

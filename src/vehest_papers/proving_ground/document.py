@@ -11,12 +11,22 @@ from pathlib import Path
 import pandas as pd
 
 from vehest.data.errors import printable
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import (
+    REPORT,
+    Block,
+    Column,
+    Document,
+    Figure,
+    Table,
+    as_code,
+    as_text,
+    formatted,
+)
 from vehest.report.style import fixed, significant
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.proving_ground import drawing, gates
-from vehest_papers.proving_ground.papers import profile_of
+from vehest_papers.proving_ground.papers import RACE_SETS, profile_of
 from vehest_papers.proving_ground.tally import FLAGS, MIN_SPEED
 from vehest_papers.proving_ground.vehicles import DatasetTally, FlaggedDrive, VehicleData, survey
 
@@ -62,8 +72,9 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     )
     flagged = [drive for vehicle in vehicles.values() for drive in vehicle.flagged]
     blocks: list[Block] = [overview_table(vehicles), flagged_table(flagged)]
-    blocks += [papers_table(vehicles), *real_tables(vehicles)]
-    data = {"statistics": statistics(vehicles)}
+    blocks += real_tables(vehicles)
+    beside_papers = papers_frame(vehicles)
+    data = {"statistics": statistics(vehicles), "beside_papers": beside_papers}
     drives, real = gates.drives_of(artefacts.datasets)
     judged = gates.gates(drives, real) if gates.AFTER in drives else []
     if judged:
@@ -76,7 +87,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         ]
     for vehicle in vehicles.values():
         blocks += vehicle_figures(vehicle)
-    values = _values(artefacts, vehicles, flagged, judged)
+    values = _values(artefacts, vehicles, flagged, judged) | papers_cells(beside_papers)
     return {REPORT: Document(artefacts.title, fill_template(TEMPLATE, values, blocks), data)}
 
 
@@ -252,9 +263,9 @@ def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def papers_table(vehicles: Mapping[str, VehicleData]) -> Table:
-    """What the papers' tables and text state of their recordings, and ours: table
-    ``beside_papers``.
+def papers_frame(vehicles: Mapping[str, VehicleData]) -> pd.DataFrame:
+    """What the papers' tables and text state of their recordings, and ours, a row a quantity of a
+    set.
     """
     rows = []
     for vehicle in vehicles.values():
@@ -276,17 +287,36 @@ def papers_table(vehicles: Mapping[str, VehicleData]) -> Table:
                             "ratio": simulated / value,
                         }
                     )
-    columns = {
-        "vehicle": Column("vehicle"),
-        "set": Column("set of the paper"),
-        "quantity": Column("quantity"),
-        "unit": Column("unit"),
-        "paper": Column("paper, real", each=True),
-        "simulated": Column(SIMULATED, each=True),
-        "ratio": Column("simulated / paper", decimals=2),
+    columns = ["vehicle", "set", "quantity", "unit", "paper", "simulated", "ratio"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def papers_cells(frame: pd.DataFrame) -> dict[str, object]:
+    """Cells of `papers_frame` for the template.
+
+    Returns
+    -------
+    dict
+        ``race_sets``, names of the race cars' sets; ``race_rows``, a quantity in every row with
+        the pair ``paper / simulated`` of each of these sets; ``other_rows``, set, quantity, paper
+        and simulated of the other sets.
+    """
+    numbers = {"paper": Column("paper", each=True), "simulated": Column(SIMULATED, each=True)}
+    _, pairs, _ = formatted(Table("beside_papers", "", frame, numbers))
+    race_rows: dict[str, list[str]] = {}
+    other_rows = []
+    for row, pair in zip(frame.to_dict("records"), pairs, strict=True):
+        unit = "" if row["unit"] == "1" else f" [{row['unit']}]"
+        quantity = f"{row['quantity']}{unit}".replace("|", "\\|")
+        if row["set"] in RACE_SETS:
+            race_rows.setdefault(quantity, []).append(" / ".join(pair))
+        else:
+            other_rows.append([f"{row['vehicle']}, {row['set']}", quantity, *pair])
+    return {
+        "race_sets": [name for name in frame["set"].unique() if name in RACE_SETS],
+        "race_rows": [[quantity, *cells] for quantity, cells in race_rows.items()],
+        "other_rows": other_rows,
     }
-    caption = "Figures of the papers' real recordings and of the simulated drives."
-    return Table("beside_papers", caption, pd.DataFrame(rows, columns=list(columns)), columns)
 
 
 def real_tables(vehicles: Mapping[str, VehicleData]) -> list[Block]:
@@ -307,14 +337,15 @@ def real_tables(vehicles: Mapping[str, VehicleData]) -> list[Block]:
             for quantity, (value, unit) in vehicle.merged(SIMULATED).values().items()
             if quantity in QUANTITIES
         ]
+    names = list(dict.fromkeys(str(row["vehicle"]) for row in rows))
     columns = {
-        "vehicle": Column("vehicle"),
+        **({"vehicle": Column("vehicle")} if len(names) > 1 else {}),
         "quantity": Column("quantity"),
         "unit": Column("unit"),
         "real": Column("real", each=True),
         "simulated": Column(SIMULATED, each=True),
     }
-    caption = "All drives of the simulated car, and the real recording."
+    caption = f"All drives of the simulated {', '.join(names)}, and the real recording."
     return [Table("beside_real", caption, pd.DataFrame(rows), columns)] if rows else []
 
 

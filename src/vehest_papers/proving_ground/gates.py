@@ -391,7 +391,7 @@ def spectra_figure(drives: Mapping[str, Drives], real: Sequence[Recording]) -> F
             axes.set_xlabel("frequency [Hz]")
         legend_above(figure, grid[0, 0], columns=2)
     caption = (
-        "Spectra of v̇ and of the process noise, as in Figure 4 of Da Lio et al. 2023: how far the "
+        "Spectra of v̇ and of the process noise. As in Figure 4 of Da Lio et al. 2023: how far the "
         "signal exceeds what the kinematics leave unexplained. Welch's method at 20 Hz, Hann "
         "windows of 25.6 s."
     )

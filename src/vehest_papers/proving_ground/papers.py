@@ -60,6 +60,9 @@ def _race(name: str) -> PaperSet:
     return PaperSet(name, name.replace("-", "").lower(), values)
 
 
+RACE_SETS = tuple(PUBLISHED)
+"""Names of the sets of Da Lio et al. 2023, which state the same quantities."""
+
 PROFILES: Mapping[str, Profile] = {
     "corvette_grand_sport": Profile(
         title="Corvette Grand Sport-like race car",

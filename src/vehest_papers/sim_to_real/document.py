@@ -234,9 +234,9 @@ def _traces(choice: Choice) -> Figure:
         np.degrees(scored.sideslip[window]),
     )
     caption = (
-        "Lateral velocity and sideslip angle of the real Ferrari: measured (black) and estimated "
-        f"by seed {model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with "
-        "the largest mean square of the measured sideslip."
+        "Lateral velocity and sideslip angle of the real Ferrari. Black: measured; coloured: seed "
+        f"{model.seed}, trained on simulated cars alone; the {TRACE_SECONDS:.0f} s with the "
+        "largest mean square of the measured sideslip."
     )
     drawn = figures.zoom_figure(
         scored.time[window], scored.ay[window], reference, [estimate], "time [s]"

@@ -39,7 +39,7 @@ OVERVIEW_CAPTION = (
     "medians over estimators."
 )
 RELIABILITY_CAPTION = (
-    "Coverage of the bands of β over the nominal level, on cars of the training: mean over test "
+    "Coverage of the bands of β over the nominal level, on cars of the training. Mean over test "
     "sets and variants of a family; bars from the 10 to the 90 % quantile over them."
 )
 ACCELERATION_CAPTION = (

@@ -22,8 +22,8 @@ DATA_CAPTION = (
     "interval; samples outside the range of the training count."
 )
 UNDER_FAULTS_CAPTION = (
-    "Coverage of the 90 % band of β during a fault of 10 s, with the factor of health; medians "
-    "over the estimators whose error the fault changes."
+    "Coverage of the 90 % band of β during a fault of 10 s{parts}, with the factor of health; "
+    "medians over the estimators whose error the fault changes."
 )
 
 
@@ -137,8 +137,9 @@ def bands_under_faults(parts: Mapping[str, PartArtefacts], cases: pd.DataFrame) 
 
 def bands_under_faults_table(frame: pd.DataFrame) -> Table:
     """The table of `bands_under_faults`."""
+    parts = list(frame["part"].unique())
     columns = {
-        "part": Column("part"),
+        **({"part": Column("part")} if len(parts) > 1 else {}),
         "fault": Column("fault"),
         "channel": Column("channel"),
         "severity": Column("severity"),
@@ -150,4 +151,5 @@ def bands_under_faults_table(frame: pd.DataFrame) -> Table:
         "lowest": Column("lowest [%]", decimals=0),
         "unflagged": Column("while not flagged [%]", decimals=0),
     }
-    return Table("bands_under_faults", UNDER_FAULTS_CAPTION, frame, columns)
+    caption = UNDER_FAULTS_CAPTION.format(parts="" if len(parts) > 1 else f" ({parts[0]})")
+    return Table("bands_under_faults", caption, frame, columns)

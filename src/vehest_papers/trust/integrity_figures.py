@@ -23,7 +23,6 @@ from vehest.studies.kit.runs import by_name
 from vehest_papers.kit.reading import sideslip_error
 from vehest_papers.trust.faults import health_of, tests_trained_car
 from vehest_papers.trust.integrity import (
-    ALERT_LIMIT,
     HAZARDOUS,
     MISLEADING,
     NOMINAL,
@@ -53,8 +52,8 @@ INTEGRITY_CAPTION = (
     "ranges."
 )
 STANFORD_CAPTION = (
-    "Stanford diagrams of β, real cars of the training, without faults: size of the error over the "
-    f"protection level, which is the 90 % band; alert limit {ALERT_LIMIT:g}°."
+    "Stanford diagrams of β, real cars of the training, without faults. Size of the error over "
+    "the protection level."
 )
 
 

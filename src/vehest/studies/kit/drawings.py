@@ -126,9 +126,8 @@ def traces_block(signals: DriveSignals, file: str) -> Figure:
     drive = signals.reference
     return Figure(
         f"traces_{file}",
-        "Lateral velocity and sideslip over the whole test set: measured (grey) and estimated "
-        "(coloured), of each "
-        "estimator the seed chosen on validation.",
+        "Lateral velocity and sideslip over the whole test set. Grey: measured; coloured: "
+        "estimated, of each estimator the seed chosen on validation.",
         figures.traces_figure(
             drive.time,
             _reference_trace(signals),
@@ -166,7 +165,7 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
     band = _band_of_first(signals, estimates[0], inside)
     return Figure(
         f"zoom_{file}",
-        f"The {stop - start:.0f} s with the largest mean square of the measured sideslip: sideslip"
+        f"The {stop - start:.0f} s with the largest mean square of the measured sideslip. Sideslip"
         f"{f' with the calibrated 90 % band of {estimates[0].label}' if band else ''}, its error "
         "(estimate − measured), "
         f"lateral velocity{' and the measured lateral acceleration' * signals.has_ay}."
@@ -221,7 +220,7 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     ]
     agreement = Figure(
         f"agreement_{file}",
-        "Estimated over measured sideslip at evenly spaced samples of the test set; on the line "
+        "Estimated over measured sideslip at evenly spaced samples of the test set. On the line "
         "both are equal.",
         agreement_figure(reference, clouds),
     )
@@ -243,10 +242,10 @@ def behaviour_blocks(signals: DriveSignals, file: str) -> list[Figure]:
     accelerations = _accelerations(signals)
     if accelerations:
         panels.append((accelerations, "$a_y$ [m/s²]", "$a_x$ [m/s²]", True))
-    caption = "Sideslip over lateral acceleration on the test set, measured and estimated"
+    caption = "Sideslip over lateral acceleration on the test set, measured and estimated."
     if accelerations:
-        caption += "; g-g diagram: longitudinal over lateral acceleration of training and test"
-    return [agreement, Figure(f"over_ay_{file}", f"{caption}.", clouds_figure(panels))]
+        caption += " G-g diagram: longitudinal over lateral acceleration of training and test."
+    return [agreement, Figure(f"over_ay_{file}", caption, clouds_figure(panels))]
 
 
 def _accelerations(signals: DriveSignals) -> list[Cloud]:
@@ -275,7 +274,7 @@ def histogram_block(signals: DriveSignals, file: str) -> Figure:
     """Figure ``errors_FILE``: distribution of the sideslip error."""
     return Figure(
         f"errors_{file}",
-        "Distribution of the sideslip error; the few errors beyond the axis are counted in its "
+        "Distribution of the sideslip error. The few errors beyond the axis are counted in its "
         "outermost bins.",
         figures.error_histogram(_errors(signals)),
     )
@@ -286,9 +285,8 @@ def error_over_ay_block(signals: DriveSignals, file: str) -> Figure:
     drive = signals.reference
     return Figure(
         f"errors_over_ay_{file}",
-        "RMSE of sideslip over the magnitude of the measured lateral acceleration, in bins of 1 "
-        "m/s²; bins of fewer than "
-        f"{figures.MIN_SAMPLES_IN_BIN} samples show no error.",
+        "RMSE of sideslip over the magnitude of the measured lateral acceleration. Bins of 1 m/s²; "
+        f"those of fewer than {figures.MIN_SAMPLES_IN_BIN} samples show no error.",
         figures.error_over_ay(drive.ay[drive.is_sideslip_scored], _errors(signals)),
     )
 

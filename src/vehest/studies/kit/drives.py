@@ -261,9 +261,9 @@ def band_blocks(
     )
     figure = Figure(
         f"reliability_{file}",
-        f"Reliability of the bands of β on test set `{test_set}`: coverage over the nominal level, "
-        "with 95 % intervals over blocks. "
-        f"On the diagonal, coverage is as stated; above it, bands are too wide.",
+        f"Reliability of the bands of β on test set `{test_set}`. Coverage over the nominal level, "
+        "with 95 % intervals over blocks: on the diagonal, coverage is as stated; above it, bands "
+        "are too wide.",
         reliability_figure(LEVELS, drawn),
     )
     return [table, figure]
