@@ -45,7 +45,7 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (after installing, three minutes of processor time the first time, seconds when repeated)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) ## tests (6 to 9 minutes on two cores, 5 to 7 from the second time on); `make lint` has style, types and layers
+test: $(INSTALLED) ## tests (22 minutes on two idle cores); `make lint` has style, types and layers
 	$(TESTS)
 
 test-durations: $(INSTALLED) ## the same, with the 50 that take longest
