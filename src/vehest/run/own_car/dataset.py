@@ -299,14 +299,11 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
             gains.setdefault("ay", []).append(
                 rms(recording["ay"][half][is_turning]) / rms(turn[:, 1])
             )
-        for name in {"handwheel", "steer"} & set(recording.channels):
-            gains.setdefault(name, []).append(
-                abs(
-                    float(
-                        np.linalg.lstsq(turn, recording[name][half][is_turning], rcond=None)[0][0]
-                    )
-                )
-            )
+        for name in ("handwheel", "steer"):
+            if name in recording:
+                steering = recording[name][half][is_turning]
+                by_turn = np.linalg.lstsq(turn, steering, rcond=None)[0]
+                gains.setdefault(name, []).append(abs(float(by_turn[0])))
     return {name: (min(halves), max(halves)) for name, halves in gains.items() if min(halves) > 0.0}
 
 
