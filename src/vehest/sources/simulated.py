@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from vehest.data.car import CarValues
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError, MissingError, abbreviated
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.splits import check_name
@@ -152,7 +152,7 @@ class SimulatedSource(Source):
         if recording_id not in self.drives:
             raise MissingError(
                 f"{self.location} has no drive '{recording_id}' (it has "
-                f"{', '.join(list(self.drives)[:12])}, …)"
+                f"{abbreviated(list(self.drives), 12)})"
             )
         return self._simulation(recording_id, self.variations)()
 
