@@ -441,6 +441,8 @@ def main() -> None:
     )
     words = parser.parse_args()
     if words.redraw:
+        if not (words.out / "metrics.csv").is_file():
+            parser.error(f"'{words.out}' has no metrics.csv; measure first, without --redraw")
         redraw(words.out)
         return
     root = os.environ.get("VEHEST_DATA")

@@ -76,8 +76,8 @@ def marks_not_measured(text: str, signal: str = "") -> bool:
     """
     if _SYMBOLS.fullmatch(text.strip()):
         return True
-    worded = re.sub(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])", " ", text.removeprefix(signal)).lower()
-    words = re.findall(r"[^\W\d_]+", worded)
+    spaced = re.sub(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])", " ", text.removeprefix(signal)).lower()
+    words = re.findall(r"[^\W\d_]+", spaced)
     phrase = [word for word in words if word not in _FILLERS]
     is_mark = "".join(phrase) in _PHRASES and (phrase not in _NEGATIONS or len(words) > 1)
     return is_mark or "sna" in words  # signal not available, beside the name of any signal
