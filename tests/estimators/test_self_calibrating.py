@@ -340,7 +340,7 @@ def test_estimates_at_other_points_differ_by_their_distance_times_the_yaw_rate()
 
 def test_a_rolling_car_determines_v_at_the_rear_axle_but_not_at_an_unplaced_unit():
     circle = np.tile([0.4, 2.0, 0.8, 0.0], (100, 1))  # v = b ω below 3 m/s, and no parameter learns
-    shares = {"variance_share": 1.0, "error_share": 0.0, "angle_floor": 0.0}
+    shares = {"variance_share": 1.0, "error_share": 0.0, "angle_floor": 0.0, "unreached_share": 0.0}
     deviations = {}
     for point in ("imu", "rear_axle"):
         model = model_of(
@@ -364,6 +364,32 @@ def test_band_widens_while_motion_contradicts_the_estimate_and_narrows_after():
     assert largest > 5.0 * np.sqrt(calm[1000:1040, 1]).max()
     later = slice(1000 + round(8.0 * model.band_time * RATE), None)
     assert deviations[later].max() < 0.3 * largest
+
+
+def test_band_is_wide_at_accelerations_that_the_drive_has_not_reached():
+    samples, _ = drive(90.0)
+    model = model_of(unreached_share=1.0, variance_share=1e-9, error_share=0.0, angle_floor=0.0)
+    model_known = model_of(
+        unreached_share=0.0, variance_share=1e-9, error_share=0.0, angle_floor=0.0
+    )
+    outputs, _, state = model.trace(samples, model.first_state(samples[0], {}))
+    known, _, _ = model_known.trace(samples, model_known.first_state(samples[0], {}))
+    np.testing.assert_array_equal(outputs[:, 0], known[:, 0])  # the estimate stays
+    added = np.sqrt(outputs[:, 1] - known[:, 1])
+    lateral = np.zeros(len(samples))  # |ay|, low-passed, and what of it the drive has reached
+    reached = np.zeros(len(samples))
+    low, level = samples[0, 2], 0.0
+    for k, ay in enumerate(samples[:, 2]):
+        low += -np.expm1(-1.0 / RATE / model.axle_lag) * (ay - low)
+        lateral[k], reached[k] = abs(low), level
+        if samples[k, 1] > model.minimum_speed:
+            level += -np.expm1(-1.0 / RATE / model.reached_time) * max(abs(low) - level, 0.0)
+    rolling = model.numbers().point * samples[:, 0]
+    size = np.abs(rolling) + np.abs(outputs[:, 0] - rolling)
+    expected = size * np.maximum(lateral - reached, 0.0) / np.maximum(lateral, 1e-9)
+    np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-6)
+    assert added[: len(added) // 2].mean() > 1.5 * added[len(added) // 2 :].mean()
+    assert state.lags[kernel.REACHED] == pytest.approx(level, rel=1e-9)
 
 
 def test_place_of_the_unit_is_not_identified_on_a_model_car():
@@ -456,7 +482,7 @@ def test_at_the_end_of_a_drive_smoother_and_filter_agree():
     alone = {"grips": [14.0], "network_odds": 1e-12, "steady_odds": 1e-12}
     last = []
     for smoothed in (False, True):
-        shares = {"variance_share": 1.0, "error_share": 0.0}
+        shares = {"variance_share": 1.0, "error_share": 0.0, "unreached_share": 0.0}
         model = model_of(smoothed=smoothed, **shares, **alone)
         estimate, _ = model.run(samples, model.first_state(samples[0], {}))
         last.append((estimate["vy"][-1], estimate["covariance"][-1, 0, 0]))

@@ -67,7 +67,7 @@ class SelfCalibrating(SelfCalibratingSettings):
             "estimator.wheelbase={wheelbase}",
         ),
     )
-    version = "6"
+    version = "7"
     covariance_of = ("vy",)
     # ax may be absent
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]
@@ -255,6 +255,7 @@ class SelfCalibrating(SelfCalibratingSettings):
             "g_1": n.residual_time,
             "g_slow": n.slow_time,
             "g_band": n.band_time,
+            "g_reached": n.reached_time,
         }
         gains = {name: -math.expm1(-n.dt / time) for name, time in gain_times.items()}
         return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
@@ -270,6 +271,7 @@ class SelfCalibrating(SelfCalibratingSettings):
             "least_limit": kernel.MIN_GRIP_SHARE,
             "rolling": kernel.ROLLING_DEVIATION,
             "max_error_of_place": kernel.MAX_ERROR_OF_PLACE,
+            "least_ay": kernel.LEAST_AY,
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:

@@ -18,6 +18,7 @@ WHEELBASE_POWERS = {
     "residual_time": 0.5,
     "slow_time": 0.5,
     "band_time": 0.5,
+    "reached_time": 0.5,
     "memory": 0.5,
     "decision_time": 0.5,
     "minimum_speed": 0.5,
@@ -95,7 +96,7 @@ class SelfCalibratingSettings(Recursive):
     )
     place_deviation: float = setting(0.5, "its deviation", positive=True)
     point_deviation: float = setting(
-        0.07, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
+        0.05, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
@@ -135,16 +136,27 @@ class SelfCalibratingSettings(Recursive):
         3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True
     )
     variance_share: float = setting(
-        0.3, "share of the filters' and candidates' variance that is reported", positive=True
+        0.15, "share of the filters' and candidates' variance that is reported", positive=True
     )
     error_share: float = setting(
-        0.17, "share of the mean square of the axle's error s e that is reported, too", least=0.0
+        0.085, "share of the mean square of the axle's error s e that is reported, too", least=0.0
     )
     band_time: float = setting(
         1.0, "time over which that mean square is taken", unit="s", positive=True
     )
+    unreached_share: float = setting(
+        0.25,
+        "deviation of v over its parts (rolling, slip) where ay is beyond what the drive reached",
+        least=0.0,
+    )
+    reached_time: float = setting(
+        15.0,
+        "time constant at which accelerations become those that the drive has reached",
+        unit="s",
+        positive=True,
+    )
     angle_floor: float = setting(
-        0.0024, "least deviation of the sideslip angle", unit="rad", least=0.0
+        0.0022, "least deviation of the sideslip angle", unit="rad", least=0.0
     )
     residual_time: float = setting(
         1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True

@@ -32,11 +32,12 @@ STATES = 8
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
-# lagged signals: those of the axle's equation, those of the candidates' residuals, and the mean
-# square of the axle's error s e over the last moments
-LAGS = 16
+# lagged signals: those of the axle's equation, those of the candidates' residuals, the mean
+# square of the axle's error s e over the last moments, and the lateral acceleration that the drive
+# has reached
+LAGS = 17
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
-SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE = range(10, LAGS)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE, REACHED = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals,
 # and last v
 MOMENTS = 8
@@ -63,6 +64,7 @@ MIN_GRIP_SHARE = 0.3  # of a grip limit that remains at any longitudinal acceler
 ROLLING_DEVIATION = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 # of |e|, in deviations of its prior, above which b stays: a slide does not show the unit's place
 MAX_ERROR_OF_PLACE = 1.0
+LEAST_AY = 1e-9  # m/s²: avoids a division by zero
 
 
 class State(NamedTuple):
@@ -71,7 +73,7 @@ class State(NamedTuple):
     means: FloatArray  # (J, 8)
     covariances: FloatArray  # (J, 8, 8)
     log_weights: FloatArray  # (J,)
-    lags: FloatArray  # (16,)
+    lags: FloatArray  # (17,)
     candidates: FloatArray  # (3, 8)
     weights: FloatArray  # (3,), of the candidates
     last: FloatArray  # (4,), the sample before
@@ -425,6 +427,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, estimates
     g_1 = -math.expm1(-n.dt / n.residual_time)
     g_slow = -math.expm1(-n.dt / n.slow_time)
     g_band = -math.expm1(-n.dt / n.band_time)
+    g_reached = -math.expm1(-n.dt / n.reached_time)
     lags = state.lags
     log_weights = state.log_weights
     lanes = width(grips)
@@ -531,7 +534,13 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, estimates
         )
         _at_point(bank, n.is_moved, n.point, sample[0], moments)
         lags[SLIDE] += g_band * ((size * states[ERROR]) ** 2 - lags[SLIDE])
-        _combine(values, state.weights, lags[SLIDE], states, moments, sample, n, estimates[t])
+        beyond = max(abs(lags[AY]) - lags[REACHED], 0.0)
+        unreached = beyond / max(abs(lags[AY]), LEAST_AY)
+        if moving:
+            lags[REACHED] += g_reached * beyond
+        _combine(
+            values, state.weights, lags[SLIDE], unreached, states, moments, sample, n, estimates[t]
+        )
         for i in range(4):
             last[i] = sample[i]
     lags[PREDICTED] = series[4, len(samples)]
@@ -621,10 +630,13 @@ def _normalise(log_weights, weights, count):
 
 
 @part()
-def _combine(values, weights, slide, states, moments, sample, n, estimate):
+def _combine(values, weights, slide, unreached, states, moments, sample, n, estimate):
     """vy at the reference point and its variance, of the candidates by their weights.
 
-    The network has no weight where the car rolls slowly.
+    The network has no weight where the car rolls slowly. ``unreached`` is the part of the lateral
+    acceleration beyond that which the drive has reached before, over the acceleration [1]: there
+    the car is that of the priors, and v's two parts, of an axle that rolls and of its slip, are both
+    in doubt, also where they cancel.
     """
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     shares = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
@@ -642,3 +654,5 @@ def _combine(values, weights, slide, states, moments, sample, n, estimate):
     estimate[1] = n.variance_share * ((1.0 - shares[2]) * moments[1] + shares[2] * steady + spread)
     estimate[1] += n.error_share * slide + (n.angle_floor * sample[1]) ** 2
     estimate[1] += (n.point_deviation * sample[0]) ** 2
+    rolling = (n.is_moved * n.point + (1.0 - n.is_moved) * states[REAR]) * sample[0]
+    estimate[1] += (n.unreached_share * unreached * (abs(rolling) + abs(mean - rolling))) ** 2
