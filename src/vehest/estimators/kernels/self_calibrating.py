@@ -635,7 +635,7 @@ def _combine(values, weights, slide, unreached, states, moments, sample, n, esti
 
     The network has no weight where the car rolls slowly. ``unreached`` is the part of the lateral
     acceleration beyond that which the drive has reached before, over the acceleration [1]: there
-    the car is that of the priors, and v's two parts, of an axle that rolls and of its slip, are both
+    the car is that of the priors, and both parts of v, of an axle that rolls and of its slip, are
     in doubt, also where they cancel.
     """
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
