@@ -421,7 +421,12 @@ def test_compiled_code_is_reused_by_the_next_process():
 def test_smoother_matches_joint_least_squares_of_a_rolling_car():
     rng = np.random.default_rng(2)
     model = model_of(
-        smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0
+        smoothed=True,
+        leakage=0.0,
+        leakage_deviation=1e-9,
+        steady_odds=1e-12,
+        angle_floor=0.0,
+        unreached_share=0.0,
     )
     samples = np.column_stack(
         [
@@ -482,7 +487,7 @@ def test_at_the_end_of_a_drive_smoother_and_filter_agree():
     alone = {"grips": [14.0], "network_odds": 1e-12, "steady_odds": 1e-12}
     last = []
     for smoothed in (False, True):
-        shares = {"variance_share": 1.0, "error_share": 0.0, "unreached_share": 0.0}
+        shares = {"variance_share": 1.0, "error_share": 0.0, "reached_time": 1e9}
         model = model_of(smoothed=smoothed, **shares, **alone)
         estimate, _ = model.run(samples, model.first_state(samples[0], {}))
         last.append((estimate["vy"][-1], estimate["covariance"][-1, 0, 0]))

@@ -24,13 +24,15 @@ class FilterPass(NamedTuple):
     covariances: FloatArray  # (T, 8, 8)
     network: FloatArray  # v of the network [m/s], (T,)
     turning: FloatArray  # change of the low-passed yaw rate in each sample [rad/s], (T,)
+    lateral: FloatArray  # size of the low-passed ay [m/s²], (T,)
 
 
 def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
     """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
 
     The filter that is likeliest at the drive's end is smoothed, its parameters included. Network
-    and steady cornering count by their weights at the end.
+    and steady cornering count by their weights at the end, and lateral accelerations beyond what
+    the whole drive has reached widen the band.
 
     Parameters
     ----------
@@ -64,7 +66,12 @@ def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArr
     variance = smoothed[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
     angle_variance = np.square(n.angle_floor * speed)
     point_variance = np.square(n.point_deviation * yaw_rate)
-    return np.column_stack([vy, variance + angle_variance + point_variance])
+    beyond = np.maximum(filtered.lateral - last_state.lags[kernel.REACHED], 0.0)
+    unreached = beyond / np.maximum(filtered.lateral, kernel.LEAST_AY)
+    rolling = (n.is_moved * n.point + (1.0 - n.is_moved) * rear) * yaw_rate
+    parts = np.abs(rolling) + np.abs(vy - rolling)
+    unreached_variance = np.square(n.unreached_share * unreached * parts)
+    return np.column_stack([vy, variance + angle_variance + point_variance + unreached_variance])
 
 
 def _filter_pass(
@@ -89,6 +96,7 @@ def _filter_pass(
     covariances = np.empty((len(rows), kernel.STATES, kernel.STATES))
     network = np.empty(len(rows))
     turning = np.empty(len(rows))
+    lateral = np.empty(len(rows))
     scratch = (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
     for k in range(len(rows)):
         network[k] = state.lags[kernel.PREDICTED]
@@ -96,10 +104,11 @@ def _filter_pass(
         sample = rows[k : k + 1]
         kernel.scan(*estimator.recursion_arguments, estimator.network, state, sample, *scratch)
         turning[k] += state.lags[kernel.YAW_RATE]
+        lateral[k] = abs(state.lags[kernel.AY])
         means[k] = state.means[likeliest]
         covariances[k] = state.covariances[likeliest]
         rows[k] = state.last
-    return FilterPass(rows, means, covariances, network, turning)
+    return FilterPass(rows, means, covariances, network, turning, lateral)
 
 
 def _backward_pass(estimator: Any, filtered: FilterPass, before: FloatArray) -> FloatArray:
@@ -127,7 +136,7 @@ def _backward_pass(estimator: Any, filtered: FilterPass, before: FloatArray) -> 
     """
     n = estimator.numbers()
     decay = estimator.decay
-    rows, means, covariances, _, turning = filtered
+    rows, means, covariances, _, turning, _ = filtered
     middle = (np.vstack([before, rows[:-1]]) + rows) / 2.0  # yaw rate, u, ay, ax
     turn = rows[:, 0] * rows[:, 1]
     turn = (np.append(before[0] * before[1], turn[:-1]) + turn) / 2.0

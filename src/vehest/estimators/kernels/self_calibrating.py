@@ -93,7 +93,7 @@ def _rear_slip(f, lags, turning, n):
     f : array
         Rows of one vector of filters, (`BANK_ROWS` · lanes,); the first row of `SHARED` is scratch.
     lags : array
-        Low-passed signals, (16,).
+        Low-passed signals, (17,).
     turning : float
         Derivative of the low-passed yaw rate [rad/s²].
     n : namedtuple
