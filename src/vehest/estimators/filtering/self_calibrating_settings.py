@@ -146,12 +146,12 @@ class SelfCalibratingSettings(Recursive):
     )
     unreached_share: float = setting(
         0.25,
-        "deviation of v over its parts (rolling, slip) where ay is beyond what the drive reached",
+        "deviation of v over |b ω| + |v - b ω| at an ay that the drive has not reached before",
         least=0.0,
     )
     reached_time: float = setting(
         15.0,
-        "time constant at which accelerations become those that the drive has reached",
+        "time constant with which the reached ay follows a larger one",
         unit="s",
         positive=True,
     )
