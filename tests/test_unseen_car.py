@@ -19,7 +19,7 @@ DEVELOPMENT = [car for car in CARS if car.development]
 TEST = next(car for car in CARS if not car.development)
 
 
-def errors(sideslip, half_width, valid=True, turning=True):
+def errors(sideslip, half_width, valid=True, turning=True, straight=False):
     """A drive with errors of β and half widths of the band [deg]."""
     sideslip = np.asarray(sideslip, dtype=float)
     count = len(sideslip)
@@ -29,6 +29,7 @@ def errors(sideslip, half_width, valid=True, turning=True):
         half_width=np.broadcast_to(np.asarray(half_width, dtype=float), count),
         valid=np.broadcast_to(valid, count),
         turning=np.broadcast_to(turning, count),
+        straight=np.broadcast_to(straight, count),
         reference=np.zeros(count),
         time=np.arange(count) / 20.0,
         title="drive",
@@ -49,7 +50,8 @@ def test_factor_of_a_development_car_comes_from_the_others_and_a_test_car_has_1(
 
 
 def test_figures_of_a_band_against_values_worked_out_by_hand():
-    drive = errors([0.0, 0.5, 1.5, 3.0], 0.5, valid=[True, True, True, False])
+    straight = [True, False, False, True]
+    drive = errors([0.0, 0.5, 1.5, 3.0], 0.5, [True, True, True, False], straight=straight)
     figures = dict(zip(BAND_HEADS[1:], band_figures([drive], 2.0), strict=True))
     assert figures == {
         "factor": "2.00",
@@ -61,9 +63,12 @@ def test_figures_of_a_band_against_values_worked_out_by_hand():
         "valid": "0.75",
         "valid and outside the band": "0.33",
         "valid and beyond twice the band": "0.000",
+        "of these, on straights": "0.000",
     }
     assert len(drive_figures(drive, 2.0)) == len(DRIVE_BAND_HEADS)
-    assert drive_figures(drive, 0.5)[-1] == "0.333"  # errors of 0, 2 and 6 half widths
+    last = drive_figures(drive, 0.5)[-2:]
+    assert last == ["0.333", "0.000"]  # errors of 0, 2 and 6 half widths, the last in a turn
+    assert drive_figures(drive._replace(straight=~drive.straight), 0.5)[-1] == "0.333"
 
 
 def test_intervals_of_shares_are_those_of_clopper_and_pearson():

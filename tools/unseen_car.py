@@ -190,6 +190,7 @@ METHODS = (
     "map with reference",
 )
 LEVEL = 0.9  # of the bands
+STRAIGHT_AY = 1.0  # m/s², largest lateral acceleration on a straight
 MARGIN = 0.1  # deg, by which a drive may be worse than v = 0
 BAND_HEADS = (
     "car",
@@ -202,6 +203,7 @@ BAND_HEADS = (
     "valid",
     "valid and outside the band",
     "valid and beyond twice the band",
+    "of these, on straights",
 )
 DRIVE_BAND_HEADS = (*BAND_HEADS[2:4], *BAND_HEADS[5:])
 OF_A_DRIVE = {"v = 0": "v = 0", "prior map": "prior map", "cold": "self-calibrating"}
@@ -230,8 +232,9 @@ The 90 % band of β that `vehest estimate` writes, and its health. Of a developm
 other development cars, of a test car from all of them. The weights in the filter's variance and all other settings were chosen
 by hand on all development cars together: no development car has settings that were chosen without it. Turning: |yaw rate|
 above {turning} rad/s. The interval score is the mean width plus 20 times the mean excess of the errors over the band (Gneiting &
-Raftery 2007), a mean over drives. The last two columns are shares of the valid samples. Health is that of all four channels
-together: a drive without ax has none and counts as valid.
+Raftery 2007), a mean over drives. The last three columns are shares of the valid samples. Straights: yaw rate at most
+{turning} rad/s, |ay| below {straight} m/s²; tyres hardly slip there, and a sideslip of half a degree is that of the road or an error
+of the reference. Health is that of all four channels together: a drive without ax has none and counts as valid.
 
 {bands}
 
@@ -273,6 +276,7 @@ class Errors(NamedTuple):
     half_width: FloatArray  # of the 90 % band of β that `vehest estimate` writes [deg]
     valid: NDArray[np.bool_]  # by health
     turning: NDArray[np.bool_]  # |yaw rate| above TURN_YAW_RATE
+    straight: NDArray[np.bool_]  # not turning, |ay| below STRAIGHT_AY
     reference: FloatArray
     time: FloatArray
     title: str
@@ -455,6 +459,7 @@ def errors_of(
     half_width = np.degrees(judged["band_sideslip"])[moving]
     valid = (judged["health"] == 0)[moving]
     turning = (np.abs(inputs["yaw_rate"]) > TURN_YAW_RATE)[moving]
+    straight = ~turning & (np.abs(inputs["ay"]) < STRAIGHT_AY)[moving]
     time = np.arange(len(speed))[moving] / plain.rate_hz
     return Errors(
         angle,
@@ -462,6 +467,7 @@ def errors_of(
         half_width,
         valid,
         turning,
+        straight,
         truth[moving],
         time,
         recording.id,
@@ -590,6 +596,7 @@ def band_figures(drives: Sequence[Errors], factor: float) -> list[str]:
     ratios = [error_over_band(drive) / factor for drive in drives]
     ratio = np.concatenate(ratios)
     turning = np.concatenate([drive.turning for drive in drives])
+    straight = np.concatenate([drive.straight for drive in drives])
     valid = np.concatenate([drive.valid for drive in drives])
     by_drive = [
         float(np.mean(own[drive.turning] <= 1.0))
@@ -611,8 +618,9 @@ def band_figures(drives: Sequence[Errors], factor: float) -> list[str]:
         np.mean(valid),
         np.mean(ratio[valid] > 1.0) if valid.any() else np.nan,
         np.mean(ratio[valid] > 2.0) if valid.any() else np.nan,
+        np.mean((straight & (ratio > 2.0))[valid]) if valid.any() else np.nan,
     ]
-    digits = [2] * (len(figures) - 1) + [3]
+    digits = [2] * (len(figures) - 2) + [3, 3]
     return [
         fixed(float(figure), places) if np.isfinite(figure) else "–"
         for figure, places in zip(figures, digits, strict=True)
@@ -793,6 +801,7 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
         errors="\n".join(table(HEADS, rows)),
         places=worse_with_place(found),
         turning=TURN_YAW_RATE,
+        straight=STRAIGHT_AY,
         bands="\n".join(table(BAND_HEADS, bands)),
         drives_table="\n".join(
             table(["drive", *OF_A_DRIVE.values(), "FVU", *DRIVE_BAND_HEADS], by_drive)
