@@ -309,5 +309,3 @@ def test_a_study_is_published_with_its_trainings_and_names_the_missing_ones(pair
     refusal = "not published: 'results/pair' shows 3 trainings that this run lacks"
     assert refusal in " ".join(err.split())
     assert report_message(pair).encode() == complete["report.md"]
-
-
