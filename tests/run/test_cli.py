@@ -375,6 +375,7 @@ TESTED = [{"recording": "three"}]
             for words in ("seed=-1", "training.max_epochs=.inf", "downsample.transforms=[1]")
         ),
         ({}, ("run", "small", "split=quickstart"), None, ""),
+        ({}, ("downsample", "mine"), None, ""),
         (
             {},
             (*RUN, "--minutes", "0.000001"),
