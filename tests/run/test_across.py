@@ -9,7 +9,6 @@ import pytest
 
 from place import DATASET, write_drives
 from vehest.data.store import read_estimate, read_recording
-from vehest.run.study import read_study
 
 PLAIN = ["estimator=zero,static_map,kinematic"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
@@ -102,13 +101,6 @@ def test_errors_of_all_folds_count_together(across):
         "fold_1",
         "fold_2",
         "fold_3",
-    }
-    before = {
-        file: file.read_bytes() for file in (across.folder / "results").rglob("*") if file.is_file()
-    }
-    assert across("run", "folds_of_mine", "tracking=none", "output=out")[0] == 0
-    assert before == {
-        file: file.read_bytes() for file in (across.folder / "results").rglob("*") if file.is_file()
     }
 
 
@@ -222,13 +214,6 @@ def test_minutes_of_reference_are_columns_of_a_single_table(across):
     lowest = min(by_title.values(), key=lambda row: row["minutes_0.5"])
     assert f"- My car, unseen: {lowest['minutes_0.5']:.2f}° with 0.5 min, " in text
     assert text.count("![") == 1
-
-
-def test_a_pipeline_of_folds_has_a_part_a_fold(across):
-    parts = read_study("folds_of_mine").parts
-    assert [(name, part.overrides) for name, part in parts.items()] == [
-        (f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)
-    ]
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,6 @@ def test_null_wheelbase_in_a_training_is_that_of_its_only_car():
     assert values({"estimator": filter_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     map_of = {"name": "prior_map", "wheelbase": 2.7, "cg_to_rear_axle": None}
     assert values({"estimator": map_of}, first) == (2.4, 1.1)
-    assert values({"estimator": map_of | {"wheelbase": 3.0}}, first) == (3.0, None)
     without = {"estimator": {"name": "zero"}}
     assert with_car_values(without, [car_of(first)]) is without
 
@@ -347,22 +346,6 @@ def test_a_band_is_doubled_on_a_car_whose_values_are_others(place):
 
     assert exported("dataset=f1") == exported("--elsewhere") != exported("dataset=same")
     assert exported("dataset=same") == exported()
-
-
-def test_calibrations_keep_the_cars_of_their_data_sets(model, tmp_path):
-    """The values go into trust.yaml; one without them, of before, is read as before."""
-    vehest.save_model(model, tmp_path / "before")
-    assert "cars" not in (tmp_path / "before/trust.yaml").read_text(encoding="utf-8")
-    assert read_trust(tmp_path / "before").bands.cars == ()
-    drives = [
-        replace(planar_drive(30.0, 100.0, seed=seed, noise=0.02), car=CarValues(2.7, 1500.0))
-        for seed in (1, 2)
-    ]
-    with_car = vehest.train(
-        "luenberger", drives[:1], drives[1:], ("training.grid=1", "training.max_evaluations=5")
-    )
-    vehest.save_model(with_car, tmp_path / "after")
-    assert read_trust(tmp_path / "after").bands.cars == (CarValues(2.7, 1500.0),)
 
 
 @pytest.mark.parametrize(

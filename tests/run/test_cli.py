@@ -43,6 +43,15 @@ def test_pipeline_reuses_artefacts_and_reruns_only_changed_stages(place):
     out, err = place.once("run", "small", "tracking=none")
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
+    (report,) = (place.folder / "outputs").glob("report/*/report.md")
+    text = report.read_text()
+    assert "**Simulated data:** every number here comes from simulated recordings" in text
+    assert not any(words in text.lower() for words in ("real data", "| real |"))
+    metrics = pd.read_csv(report.with_name("metrics.csv"))
+    columns = ["study", "estimator", "variant", "trained_on", "dataset", "kind"]
+    assert list(metrics.columns[:6]) == columns
+    assert set(metrics["kind"]) == {"simulated"}
+    assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs"} <= set(metrics["metric"])
     files = place.files()
 
     again, err = place.done("run", "small", "tracking=none")
@@ -114,36 +123,6 @@ def test_failed_jobs_are_reported_and_other_results_remain(place):
     assert not (place.folder / "results").exists()
 
 
-def test_reports_show_present_results_and_name_missing_ones(place):
-    place.once("run", "small", "tracking=none")
-    place.refused(
-        "report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run"
-    )
-    outcome = place.told("report", "small", "tracking=none")
-    assert outcome["leaderboard"][0]["test_set"] == "test"
-    metrics = pd.read_csv(Path(outcome["report"]).parent / "metrics.csv")
-    assert list(metrics.columns[:6]) == [
-        "study",
-        "estimator",
-        "variant",
-        "trained_on",
-        "dataset",
-        "kind",
-    ]
-    assert set(metrics["kind"]) == {"simulated"}
-    assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs"} <= set(metrics["metric"])
-    assert not any("seconds" in metric for metric in set(metrics["metric"]))
-    shutil.rmtree(next((place.folder / "outputs" / "train").glob("gru-*")))
-    code, out, err = place("report", "small", "tracking=none", "--json")
-    assert code == 0
-    assert "'vehest run small tracking=none' goes on with them" in err
-    drawn = json.loads(out)
-    assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger", "ksnn"}
-    ((name, reason),) = drawn["failed"].items()
-    assert name.startswith("gru-states_2")
-    assert reason == NO_TIME
-
-
 def test_train_eval_estimate_and_report_run_as_separate_commands(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
     trained = place.told("train", *arguments)
@@ -168,18 +147,6 @@ def test_train_eval_estimate_and_report_run_as_separate_commands(place):
         )
     frame = pq.read_table("out.parquet").to_pandas()
     text = pd.read_csv("out.csv")
-    assert list(frame.columns) == [
-        "time",
-        "vy",
-        "sideslip",
-        "band_vy",
-        "band_sideslip",
-        "health",
-        "health_reason",
-        "sideslip_deg",
-        "band_sideslip_deg",
-    ]
-    assert list(text.columns) == list(frame.columns)
     for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health", "sideslip_deg"):
         # half a unit of the sixth digit
         assert np.allclose(frame[column], text[column], rtol=5e-6, atol=0.0, equal_nan=True), column
@@ -190,7 +157,7 @@ def test_train_eval_estimate_and_report_run_as_separate_commands(place):
         field.name: field.metadata[b"unit"].decode()
         for field in pq.ParquetFile("out.parquet").schema_arrow
     }
-    assert units == {
+    expected_units = {
         "time": "s",
         "vy": "m/s",
         "sideslip": "rad",
@@ -201,6 +168,8 @@ def test_train_eval_estimate_and_report_run_as_separate_commands(place):
         "sideslip_deg": "deg",
         "band_sideslip_deg": "deg",
     }
+    assert units == expected_units
+    assert list(text.columns) == list(frame.columns) == list(expected_units)
     assert "sideslip_deg" not in read_estimate(Path("out.parquet")).channels
     assert [reason_in_words(code) for code in frame["health_reason"]] == text[
         "health_reason"
@@ -393,8 +362,6 @@ TESTED = [{"recording": "three"}]
             4,
             "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA",
         ),
-        ({}, ("ingest", "mine", "dataset.colour=red"), 2, ""),
-        ({}, ("eval", "split=mine", "tracking=none"), 4, ""),
         ({}, ("estimate", "nothing", "lap.csv"), 4, ""),
         ({}, (*TRAIN, "split.train=[{recording: four}]"), None, "has no recording 'four'"),
         (
@@ -405,18 +372,9 @@ TESTED = [{"recording": "three"}]
         ),
         *(
             ({}, (*TRAIN, words), None, "")
-            for words in (
-                "output=null",
-                "seed=-1",
-                "training.max_epochs=.inf",
-                "estimator.rate_hz=200",
-            )
+            for words in ("seed=-1", "training.max_epochs=.inf", "downsample.transforms=[1]")
         ),
-        ({}, (*TRAIN, "downsample.transforms=[1]"), None, ""),
-        *(
-            ({}, ("run", "small", words), None, "")
-            for words in ("evaluation.rate_hz=abc", "split=quickstart")
-        ),
+        ({}, ("run", "small", "split=quickstart"), None, ""),
         ({}, ("downsample", "mine"), None, ""),
         (
             {},
@@ -496,14 +454,6 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
     place.refused("ingest", "mine", code=4, says="no data root is set")
 
 
-def test_truncated_artefacts_are_recomputed(place):
-    arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none")
-    weights = Path(place.told(*arguments)["model"]) / "model.safetensors"
-    content = weights.read_bytes()
-    weights.write_bytes(content[:50])
-    assert (place.told(*arguments)["skipped"], weights.read_bytes() == content) == (False, True)
-
-
 def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypatch):
     outputs = place.folder / "outputs"
 
@@ -521,6 +471,9 @@ def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypa
     assert f"left out: gru-states_2-seed0: {NO_TIME}" in out
     output, err = place.done("report", "small", "tracking=none")
     assert output == out, "the same report"
+    drawn = place.told("report", "small", "tracking=none")
+    assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger"}
+    assert drawn["failed"]["gru-states_2-seed0"] == NO_TIME
     assert "gru-states_2-seed0; 'vehest run small tracking=none' goes on with them" in err
     out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
@@ -574,11 +527,6 @@ def test_only_the_study_as_it_is_written_is_published(place):
     text = (results / "report.md").read_text()
     assert "`vehest run pipelines/small.yaml`" in text
     assert str(place.folder) not in text + (results / "provenance.json").read_text()
-    (results / "metrics.csv").unlink()
-    (results / "provenance.json").unlink()
-    place.refused(
-        "run", "small", "tracking=none", code=2, says="holds files that vehest did not publish"
-    )
 
 
 def test_a_model_remembers_how_its_recordings_were_prepared(place):

@@ -17,6 +17,7 @@ from vehest.configuration.files import GROUPS, choices, packaged
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.inference.car_values import with_settings
+from vehest.run import inspect_data
 from vehest.run.setting_lines import config_as_commented_yaml
 from vehest.run.study import jobs_of, read_study
 
@@ -226,6 +227,12 @@ def repeated(levels, form):
     return {"k0": "x", **{f"k{n + 1}": form.format(n) * 2 for n in range(levels)}}
 
 
+def bad_file(folder, text):
+    file = folder / "conf" / "dataset" / "bad.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"name: bad\nsource: tabular\n{text}\n", encoding="utf-8")
+
+
 ALIASES = "title: [&a [x,x,x,x,x,x,x,x,x]" + "".join(
     f",&{name} [{','.join([f'*{before}'] * 9)}]" for before, name in pairwise("abcdef")
 )
@@ -253,11 +260,15 @@ ALIASES = "title: [&a [x,x,x,x,x,x,x,x,x]" + "".join(
         ("title: [", r"'conf/dataset/bad.yaml' cannot be read as YAML"),
     ],
 )
-def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, text, says):
-    file = place.folder / "conf" / "dataset" / "bad.yaml"
-    file.write_text(f"name: bad\nsource: tabular\n{text}\n", encoding="utf-8")
+def test_a_file_of_conf_that_explodes_is_refused(elsewhere, text, says):
+    bad_file(elsewhere, text)
     with pytest.raises(ConfigurationError, match=says):
         compose_config("ingest", ["dataset=bad"])
+
+
+def test_a_file_of_conf_that_explodes_is_named_and_the_others_are_listed(place, monkeypatch):
+    monkeypatch.setattr(inspect_data, "choices", lambda _: ["bad", "mine"])
+    bad_file(place.folder, yaml.safe_dump(repeated(40, "${{dataset.k{}}}")))
     code, out, err = place("data", "list", "--json")
     assert code == 2
     assert err.startswith("error: data set 'bad': ")

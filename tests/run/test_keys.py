@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from place import PIPELINE, Place, undrawn
+from place import PIPELINE
 from vehest.artefacts.keys import changed_keys
 from vehest.configuration.composition import compose_config
 from vehest.data.recording_summary import RecordingSummary
@@ -31,19 +31,14 @@ class Extended(Gru.settings_type):
 
 
 @pytest.fixture
-def published(tmp_path, monkeypatch, capsys):
+def published(place):
     """A small study that was trained and published, with a configuration of its estimator and no
     output root.
     """
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
-    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
-    undrawn(monkeypatch)
-    place = Place(tmp_path, capsys)
     place.change("conf/estimator/gru.yaml", **GRU)
     place.change("pipelines/small.yaml", **STUDY)
-    place.done("run", "small", "tracking=none")
-    shutil.rmtree(tmp_path / "outputs")
+    place.once("run", "small", "tracking=none")
+    shutil.rmtree(place.folder / "outputs")
     return place
 
 

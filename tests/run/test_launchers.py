@@ -140,13 +140,6 @@ def test_files_of_another_host_are_ignored_for_a_day(tmp_path, monkeypatch):
 
 def test_without_ray_a_single_line_names_the_extra_to_install(place, monkeypatch):
     place.refused(
-        "run",
-        "small",
-        "--slurm",
-        "minutes=5",
-        says="--slurm is for --launcher slurm, not for local",
-    )
-    place.refused(
         "sweep",
         "split=mine",
         "--launcher",

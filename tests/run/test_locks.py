@@ -141,8 +141,9 @@ def test_runs_wait_for_artefacts_of_another_run_and_continue(place):
     assert waiting.returncode == 0
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("stage", ["ingest", "train"])
+@pytest.mark.parametrize(
+    ("stage", "number", "code"), [("ingest", signal.SIGINT, 130), ("train", signal.SIGTERM, 143)]
+)
 def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place, stage, number, code):
     command = (
         ["ingest", "mine"]

@@ -117,15 +117,6 @@ def test_parts_run_as_a_single_study_and_the_next_run_skips_all(parts_place):
     assert {"train", "evaluate", "report"} <= set(line.replace(",", "").split())
     assert place.files() == files
 
-    assert not any(
-        "seconds" in path.read_text(encoding="utf-8")
-        for path in results.rglob("*.csv")
-        if path.name == "metrics.csv"
-    )
-    timings = pd.read_csv(
-        next((place.folder / "outputs" / "report").glob("both-*")) / "timings.csv"
-    )
-    assert set(timings["trained_on"]) == {"mine/scheme_1", "mine/scheme_2"}
     assert place("report", "--check")[:2] == (0, "both: up to date\n")
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
     assert place("report", "--check")[:2] == (
@@ -151,7 +142,8 @@ def test_planning_opens_each_data_set_once_for_all_parts(parts_place, monkeypatc
     open_source = runner.open_source
     monkeypatch.setattr(runner, "open_source", counted)
     monkeypatch.setattr(runner, "car_of", lambda dataset: counted(dataset).car_in_recordings)
-    parts_place("run", "both", "tracking=none", "training.max_evaluations=5")
+    monkeypatch.setattr(runner.Runner, "run", lambda *_: ({}, {}))
+    parts_place("run", "both", "tracking=none")
     # of the files and of the car; the files of the other one are not there
     assert sorted(opened) == ["mine", "mine", "other"]
 

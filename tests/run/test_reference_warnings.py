@@ -10,6 +10,7 @@ import pytest
 
 NAMES = ("one", "two", "three")
 RIGHT = {"column": "Vy", "unit": "m/s"}
+JOB = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5")
 
 
 def _column(name, values):
@@ -43,42 +44,47 @@ def small(place):
     return place
 
 
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (_reversed, "signs are inconsistent"),
-        (_in_another_unit, "correct the unit"),
-        (_zero, "vy_ref: constant at 0 m/s throughout"),
-        (_in_degrees, "sideslip_ref is in deg but read as rad; correct the unit"),
-    ],
-)
-def test_every_command_that_scores_warns_of_each_recording(small, spoil, says):
-    channels = small.change("conf/dataset/mine.yaml")["channels"]
-    small.change(
-        "conf/dataset/mine.yaml",
-        channels={**channels, **spoil(small)},
-        accept=["impossible", "unit"],
-    )
-    job = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5")
-    model = small.told("train", *job, "tracking=none")["model"]
+def spoil(small, change):
+    """Declare the reference otherwise than it is."""
+    channels = small.change("conf/dataset/mine.yaml")["channels"] | change(small)
+    small.change("conf/dataset/mine.yaml", channels=channels, accept=["impossible", "unit"])
+
+
+def assert_warned(small, says, *command):
+    _, err = small.done(*command, "tracking=none", "--quiet")
+    for name in NAMES:
+        start = f"warning data set 'mine', recording '{name}': "
+        lines = [line for line in err.splitlines() if line.startswith(start)]
+        assert any(says in line for line in lines), command
+
+
+def test_every_command_that_scores_warns_of_each_recording(small):
+    spoil(small, _reversed)
+    model = small.told("train", *JOB, "tracking=none")["model"]
     for command in (
-        ("train", *job),
-        ("eval", *job),
-        ("eval", *job),
+        ("train", *JOB),
+        ("eval", *JOB),
+        ("eval", *JOB),
         ("eval", "--model", model, "split=mine"),
         ("run", "small"),
         ("run", "small"),
         ("report", "small"),
         ("sweep", "estimator=zero", "split=mine"),
     ):
-        _, err = small.done(*command, "tracking=none", "--quiet")
-        for name in NAMES:
-            lines = [
-                line
-                for line in err.splitlines()
-                if line.startswith(f"warning data set 'mine', recording '{name}': ")
-            ]
-            assert any(says in line for line in lines), command
+        assert_warned(small, "signs are inconsistent", *command)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (_in_another_unit, "correct the unit"),
+        (_zero, "vy_ref: constant at 0 m/s throughout"),
+        (_in_degrees, "sideslip_ref is in deg but read as rad; correct the unit"),
+    ],
+)
+def test_a_wrong_unit_a_stuck_reference_and_degrees_are_warned_of(small, change, says):
+    spoil(small, change)
+    assert_warned(small, says, "train", *JOB)
 
 
 def test_right_references_are_not_warned_of(small):
@@ -87,16 +93,11 @@ def test_right_references_are_not_warned_of(small):
 
 
 def test_warnings_of_a_study_come_once_for_each_recording(small):
-    channels = small.change("conf/dataset/mine.yaml")["channels"]
-    small.change("conf/dataset/mine.yaml", channels={**channels, **_reversed(small)})
+    spoil(small, _reversed)
     part = {"split": "mine", "sweeps": [["estimator=zero"]], "title": "a part"}
-    pipeline = small.change("pipelines/small.yaml")
-    del pipeline["split"], pipeline["sweeps"]
     Path("pipelines/small.yaml").unlink()
-    small.change(
-        "pipelines/small.yaml",
-        **pipeline | {"report": "own_car", "parts": {"all": part, "again": part}},
-    )
+    parts = {"all": part, "again": part}
+    small.change("pipelines/small.yaml", study="small", report="own_car", parts=parts)
     _, err = small.done("run", "small", "tracking=none")
     for name in NAMES:
         assert err.count(f"recording '{name}': ") == 1

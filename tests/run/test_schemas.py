@@ -26,7 +26,7 @@ from vehest.configuration.composition import Root, compose_config
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.schema import check_format, settings_from_config, validated
+from vehest.data.schema import check_format, validated
 from vehest.data.store import (
     is_stored_recording,
     read_estimate,
@@ -616,10 +616,3 @@ def _downsampled_from(inside, output):
         {"rate_hz": 10.0, "method": "decimate", "transforms": []},
         target,
     )
-
-
-@pytest.mark.parametrize("name", ["cnn_ukf", "ensemble_ukf"])
-def test_training_settings_within_training_settings_may_carry_the_name_of_their_file(name):
-    training = compose_config("train", [f"estimator={name}"])["training"]
-    assert training["identification"]["name"] == "identification"
-    settings_from_config(estimator_class(name).training_type, training, "training")

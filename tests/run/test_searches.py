@@ -62,7 +62,7 @@ def n_trained(err):
 
 
 def test_part_that_ignores_the_chosen_value_is_named(tuned):
-    _, err = tuned.done(*RUN)
+    _, err = tuned.once(*RUN)
     remark = (
         "part 'forth' does not use what the search 'pace' chose by rmse_vy on validation: "
         "training.learning_rate=0.01"
@@ -93,7 +93,7 @@ def test_part_that_ignores_the_chosen_value_is_named(tuned):
 
 
 def test_a_published_search_is_not_repeated_elsewhere_and_gives_the_same_results(tuned):
-    _, err = tuned.done(*RUN)
+    _, err = tuned.once(*RUN)
     assert n_trained(err) == 3
     before = contents(tuned.folder / "results")
     for again in ((), ("--force",)):
@@ -111,7 +111,7 @@ def test_a_published_search_is_not_repeated_elsewhere_and_gives_the_same_results
 
 @pytest.mark.parametrize("change", ["training", "metric", "lost"])
 def test_a_search_is_repeated_where_a_trial_or_the_metric_is_another(tuned, change):
-    tuned.done(*RUN)
+    tuned.once(*RUN)
     if change == "lost":
         table = pd.read_csv(SEARCHES)
         table.head(1).to_csv(SEARCHES, index=False)
@@ -131,7 +131,7 @@ def test_a_search_is_repeated_where_a_trial_or_the_metric_is_another(tuned, chan
 
 
 def test_damaged_search_files_are_a_single_line(tuned):
-    tuned.done(*RUN)
+    tuned.once(*RUN)
     table = pd.read_csv(SEARCHES)
     table.assign(validation="low").to_csv(SEARCHES, index=False)
     shutil.rmtree("outputs")

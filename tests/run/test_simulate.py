@@ -135,31 +135,6 @@ def test_a_spin_at_high_speed_is_no_impossible_recording(place):
     assert "the simulated car spun here" in out
 
 
-def test_a_report_of_simulated_drives_never_says_real(place):
-    simulated(
-        place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100
-    )
-    train, validation, test = ([{"recording": name}] for name in "abc")
-    place.change(
-        "conf/split/sim.yaml",
-        name="sim",
-        dataset="sim",
-        train=train,
-        validation=validation,
-        tests={"test": test},
-    )
-    sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
-    place.change(
-        "pipelines/sim.yaml", study="s", title="t", report="drive", split="sim", sweeps=sweeps
-    )
-    report = (
-        Path(place.told("run", "sim", "tracking=none")["report"]).with_name("report.md").read_text()
-    )
-    assert "**Simulated data:** every number here comes from simulated recordings" in report
-    assert "real data" not in report.lower()
-    assert "| real |" not in report
-
-
 def test_refusals_of_simulate_are_a_single_line(place):
     place.refused(
         "simulate",

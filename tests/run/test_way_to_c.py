@@ -53,8 +53,6 @@ def test_two_commands_lead_to_a_verdict_and_two_more_to_an_estimate_and_to_c(
     report = (next((log / "outputs" / "report").iterdir()) / "report.md").read_text(
         encoding="utf-8"
     )
-    order = [report.index(f"## {title}") for title in ("Verdict", "Minutes of reference")]
-    assert order == sorted(order)
     assert "lacks" in report, "families that were not compared are named"
 
     descriptions = sorted((log / "outputs" / "train").rglob("model.yaml"))
