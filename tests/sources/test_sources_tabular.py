@@ -233,7 +233,7 @@ def packed_rows(folder, name, row, size):
     """A table of one repeated row, ``size`` bytes of it, packed."""
     head = b"time,vx,ay\n"
     content = head + row * (size // len(row))
-    packed = bz2.compress(content) if name.endswith(".bz2") else gzip.compress(content, 1)
+    packed = bz2.compress(content) if name.endswith(".bz2") else gzip.compress(content, 6)
     return written(folder, packed, name)
 
 
