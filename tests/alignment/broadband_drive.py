@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
 
 NOISE = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "steer": 0.001}
@@ -115,7 +116,24 @@ def without(recording, *names):
     return recording.select([name for name in recording.channels if name not in names])
 
 
-def changed(recording, **changes):
-    """The same drive with some channels changed: channel -> function of its samples."""
-    channels = {name: change(recording[name]) for name, change in changes.items()}
-    return replace(recording, channels={**recording.channels, **channels})
+def changed(recording, gappy=(), **changes):
+    """The same drive with channels of other samples: channel -> these, or a function of its own."""
+    channels = {
+        name: change(recording[name]) if callable(change) else change
+        for name, change in changes.items()
+    }
+    return replace(recording, channels={**recording.channels, **channels}, gappy=frozenset(gappy))
+
+
+def found_by(check, recording):
+    """What one check reports: channel -> finding."""
+    return {
+        finding.channel: finding
+        for finding in checks_of_recording(recording)
+        if finding.check == check
+    }
+
+
+def warned(recording):
+    """Findings that are more than notes."""
+    return [finding for finding in checks_of_recording(recording) if finding.level != "note"]

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from broadband_drive import changed, without
 from refusals import refusal
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
@@ -152,15 +153,6 @@ def assert_recovered(alignment, truth, names):
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
-def test_cross_correlation_finds_a_delay_alone(motion, reference_rate):
-    alignment = align(
-        recorded(motion, {"delay": 0.040}, reference_rate=reference_rate),
-        AlignmentSettings(("delay",)),
-    )
-    assert alignment.correlation.peak == pytest.approx(0.040, abs=0.010)
-
-
-@pytest.mark.parametrize("reference_rate", [False, True])
 def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, reference_rate):
     """Gravity through roll is 6 % of ay here, through pitch 4 % of ax: taken for motion it would
     shift rotation and offset of ay.
@@ -168,6 +160,7 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, ref
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=reference_rate)
     alignment = align(recording, AlignmentSettings(IMU))
     assert_recovered(alignment, PLANTED, tuple(PLANTED))
+    assert not reference_rate or alignment.correlation.peak == pytest.approx(0.04, abs=0.01)
     assert any(
         re.search(r"3\.[567] % in ax and 5\.[789] % in ay", note) for note in alignment.notes
     )
@@ -183,9 +176,7 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, ref
 
 def test_measured_roll_and_pitch_take_gravity_off_and_a_sensor_mounted_crosswise_is_found(motion):
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=True)
-    recording = replace(
-        recording, channels={**recording.channels, "roll": motion.roll, "pitch": motion.pitch}
-    )
+    recording = changed(recording, roll=motion.roll, pitch=motion.pitch)
     alignment = align(recording, AlignmentSettings(IMU))
     assert_recovered(alignment, PLANTED, tuple(PLANTED))
     assert alignment["offset_ax"].value == pytest.approx(0.15, abs=0.003)  # without the mean pitch
@@ -201,11 +192,6 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
     for aligned, residual in zip(clean.residuals, alignment.residuals, strict=True):
         assert residual.rms["before"] > 5 * aligned.rms["before"]
         assert residual.rms["after"] == pytest.approx(aligned.rms["before"], rel=0.1)
-    assert [transform["name"] for transform in alignment.transforms] == [
-        "delay_correction",
-        "offset_correction",
-        "mounting_correction",
-    ]
 
 
 def test_what_may_be_zero_is_not_corrected(motion):
@@ -221,6 +207,8 @@ def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     alignment = align(recorded(motion, truth), AlignmentSettings((quantity,)))
     assert tuple(parameter.name for parameter in alignment.parameters) == QUANTITIES[quantity]
     assert_recovered(alignment, truth, QUANTITIES[quantity])
+    if quantity == "delay":
+        assert alignment.correlation.peak == pytest.approx(0.040, abs=0.010)
     (transform,) = alignment.transforms
     names = {
         "lever_arm": "mounting_correction",
@@ -355,8 +343,7 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
         DataError, match=r"lever_y and offset_ay cannot be separated .*\(condition number"
     ):
         align(circle, AlignmentSettings(("lever_arm", "offsets")))
-    constant = weaving(0, varying=False)
-    constant = constant.select([name for name in constant.channels if name != "yaw_rate_ref"])
+    constant = without(weaving(0, varying=False), "yaw_rate_ref")
     with pytest.raises(
         DataError, match=r"offset_ay and offset_yaw_rate cannot be separated .*\(condition"
     ):
@@ -369,9 +356,7 @@ def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
         DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"
     ):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
-    ours = weaving(0)
-    other_drive = weaving(1)
-    mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other_drive["yaw_rate_ref"]})
+    mixed = changed(weaving(0), yaw_rate_ref=weaving(1)["yaw_rate_ref"])
     with pytest.raises(DataError, match=r"has a correlation of at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
     with pytest.raises(DataError, match="raise max_delay"):
@@ -398,22 +383,14 @@ def test_low_pass_differentiates_and_keeps_the_right_samples(order):
 
 @pytest.mark.parametrize("missing", ["vy_ref", "ax", "ay", "yaw_rate"])
 def test_missing_channel_is_one_clear_line(motion, missing):
-    recording = recorded(motion, {})
-    refused = refusal(
-        lambda: align(
-            recording.select([name for name in recording.channels if name != missing]),
-            AlignmentSettings(IMU),
-        )
-    )
+    recording = without(recorded(motion, {}), missing)
+    refused = refusal(lambda: align(recording, AlignmentSettings(IMU)))
     assert re.search(f"no (reference )?channel '{missing}'", refused)
 
 
 def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion):
-    recording = recorded(motion, PLANTED)
-    alignment = align(
-        recording.select([name for name in recording.channels if name != "vx_ref"]),
-        AlignmentSettings(("offsets", "mounting")),
-    )
+    recording = without(recorded(motion, PLANTED), "vx_ref")
+    alignment = align(recording, AlignmentSettings(("offsets", "mounting")))
     assert any("No vx_ref" in note for note in alignment.notes)
 
 
@@ -421,7 +398,7 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
     recording = weaving(0)
     gap = recording["ax"].copy()
     gap[100] = np.nan
-    holed = replace(recording, channels={**recording.channels, "ax": gap}, gappy=frozenset({"ax"}))
+    holed = changed(recording, gappy={"ax"}, ax=gap)
     assert "'ax' has gaps" in refusal(lambda: align(holed, COVERED))
     assert "needs at least" in refusal(lambda: align(recording.cut(0.0, 15.0), COVERED))
     assert "too high for 50 Hz; use at most" in refusal(
@@ -432,11 +409,6 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"estimate": ()},
-            "name what to estimate: one or more of lever_arm, mounting, delay, offsets, "
-            "steering_ratio",
-        ),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
     ],
@@ -508,27 +480,6 @@ def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio, offset):
     (transform,) = alignment.transforms
     assert (transform["name"], transform["channel"]) == ("steering_ratio", "handwheel")
     assert alignment.residuals == ()
-
-
-def test_steering_intervals_contain_the_truth():
-    """Twenty drives: by a binomial law of 95 % fewer than 16 have a chance of 0.3 %."""
-    road = single_track(15.5, 0.05)
-    generator = np.random.default_rng(0)
-    inside = 0
-    for _ in range(20):
-        wander = lfilter(
-            [0.05 * math.sqrt(1 - 0.998**2)],
-            [1.0, -0.998],
-            generator.standard_normal(len(road) + 5000),
-        )[5000:]  # 5 s
-        recording = replace(
-            road, channels={**road.channels, "handwheel": road["handwheel"] + wander}
-        )
-        ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))[
-            "steering_ratio"
-        ]
-        inside += ratio.low <= 15.5 <= ratio.high
-    assert inside >= 16
 
 
 def understeering(seed):
@@ -628,7 +579,7 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     )
     noise = np.random.default_rng(0).standard_normal(len(road))
     with pytest.raises(DataError, match="does not follow the curvature"):
-        align(replace(road, channels={**road.channels, "handwheel": noise}), settings)
+        align(changed(road, handwheel=noise), settings)
 
 
 def sine(delay, frequency, rate=100.0):

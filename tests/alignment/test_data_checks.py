@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from broadband_drive import changed, found_by, warned, without
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
@@ -35,16 +36,6 @@ def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
     return Recording("lap", "car", rate, 10.0, {**channels, **references})
 
 
-def changed(recording, **changes):
-    return replace(
-        recording,
-        channels={
-            **recording.channels,
-            **{name: change(recording[name]) for name, change in changes.items()},
-        },
-    )
-
-
 def with_standstill(recording, start, stop, **resting):
     """The car stands for a while: speeds and angles rest, the inertial sensors show their noise."""
     inside = slice(*recording.index_range(start, stop))
@@ -66,18 +57,13 @@ def stuck(value, start, stop):
 
 
 def complaints(recording):
-    return [
-        (finding.level, finding.check, finding.channel)
-        for finding in checks_of_recording(recording)
-        if finding.level != "note"
-    ]
+    return [(finding.level, finding.check, finding.channel) for finding in warned(recording)]
 
 
 def only_complaint(recording):
-    findings = [finding for finding in checks_of_recording(recording) if finding.level != "note"]
-    assert len(findings) == 1, findings
-    assert "\n" not in findings[0].message
-    return findings[0]
+    (finding,) = warned(recording)
+    assert "\n" not in finding.message
+    return finding
 
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0 / 3.0])
@@ -131,10 +117,7 @@ def test_kinematics_are_judged_on_moving_cars_alone():
 def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_silent():
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["vy_ref"], np.nan)
-    gappy = replace(
-        recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"})
-    )
-    findings = checks_of_recording(gappy)
+    findings = checks_of_recording(changed(recording, gappy={"vy_ref"}, vy_ref=slow))
     assert [(finding.level, finding.check, finding.channel) for finding in findings] == [
         ("note", "nan", "vy_ref")
     ]
@@ -155,11 +138,7 @@ def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
     slow[2000:2500:5] = 0.03
-    finding = only_complaint(
-        replace(
-            recording, channels={**recording.channels, "steer": slow}, gappy=frozenset({"steer"})
-        )
-    )
+    finding = only_complaint(changed(recording, gappy={"steer"}, steer=slow))
     assert (finding.check, finding.channel) == ("stuck", "steer")
     assert "4.96 s" in finding.message
 
@@ -170,13 +149,9 @@ def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
 
 
 def test_stuck_channels_are_told_from_standstill():
-    findings = [
-        finding
-        for finding in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000)))
-        if finding.check == "stuck"
-    ]
-    assert [finding.channel for finding in findings] == ["vx"]
-    assert "constant at 0 m/s for 10 s from t = 30 s" in findings[0].message
+    findings = found_by("stuck", changed(clean_drive(), vx=stuck(0.0, 2000, 3000)))
+    assert findings.keys() == {"vx"}
+    assert "constant at 0 m/s for 10 s from t = 30 s" in findings["vx"].message
     findings = only_complaint(
         changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200))
     )
@@ -191,18 +166,12 @@ def test_stuck_channels_are_told_from_standstill():
 def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
     findings = [
         finding
-        for finding in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high)))
-        if finding.level != "note"
-    ]
-    assert {
-        (finding.level, finding.check, finding.channel)
-        for finding in findings
+        for finding in warned(changed(clean_drive(), ay=lambda ay: ay.clip(low, high)))
         if finding.check == "saturated"
-    } == {("warning", "saturated", "ay")}
-    assert sum(finding.check == "saturated" for finding in findings) == sides
+    ]
+    assert [(finding.level, finding.channel) for finding in findings] == [("warning", "ay")] * sides
     for finding in findings:
-        if finding.check == "saturated":
-            assert ("highest" in finding.message) == (f", {high:g} m/s²" in finding.message)
+        assert ("highest" in finding.message) == (f", {high:g} m/s²" in finding.message)
 
 
 def test_quantised_resting_and_stepped_channels_are_not_saturated():
@@ -232,7 +201,7 @@ def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_na
     ]
     drive = clean_drive()
     wheels = {f"wheel_speed_{wheel}": drive["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
-    full_drive = replace(drive, channels={**drive.channels, **wheels})
+    full_drive = changed(drive, **wheels)
     assert not complaints(full_drive)
     dropped = changed(full_drive, wheel_speed_rl=stuck(0.0, 2000, 2060))
     assert complaints(dropped) == [("warning", "dropout", "wheel_speed_rl")]
@@ -249,11 +218,11 @@ def backwards(recording, *stretches, speed=-2.0):
     for samples in slow.values():
         for start, stop in stretches:
             samples[start:stop] = np.linspace(0.6 * speed, speed, stop - start)
-    return replace(recording, channels={**recording.channels, **slow})
+    return changed(recording, **slow)
 
 
 def reversing(recording):
-    return [finding for finding in checks_of_recording(recording) if finding.check == "reverse"]
+    return list(found_by("reverse", recording).values())
 
 
 def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
@@ -275,12 +244,8 @@ def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measure
         (finding.level, "unsigned: positive while the car reverses in 1 segment" in finding.message)
         for finding in reversing(forwards)
     ] == [("warning", True)]
-    without = replace(
-        forwards,
-        channels={name: samples for name, samples in forwards.channels.items() if name != "vx"},
-    )
-    assert [finding.channel for finding in reversing(without)] == ["vx_ref"]
-    assert not reversing(without.select(["yaw_rate", "ay"]))
+    assert found_by("reverse", without(forwards, "vx")).keys() == {"vx_ref"}
+    assert not reversing(forwards.select(["yaw_rate", "ay"]))
 
 
 @pytest.mark.parametrize(
@@ -290,6 +255,16 @@ def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length, speed, 
     assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted
 
 
+def spikes(recording=None, **channels):
+    """Messages about spikes by channel where channels of a clean drive have other samples."""
+    drive = changed(recording or clean_drive(), gappy=channels, **channels)
+    return {name: finding.message for name, finding in found_by("spike", drive).items()}
+
+
+def steering_wheel():
+    return 15.0 * clean_drive()["steer"]
+
+
 @pytest.mark.parametrize(
     ("length", "value", "is_found"),
     [(1, 7.3, True), (20, 7.3, True), (300, 7.3, False), (1, 0.05, False)],
@@ -297,16 +272,13 @@ def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length, speed, 
 )
 def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_found):
     """419° at a steering wheel is possible, but not for one sample."""
-    drive = clean_drive()
-    handwheel = 15.0 * drive["steer"]
+    handwheel = steering_wheel()
     handwheel[3000 : 3000 + length] = value
-    drive = replace(drive, channels={**drive.channels, "handwheel": handwheel})
-    spikes = [finding for finding in checks_of_recording(drive) if finding.check == "spike"]
-    assert [finding.channel for finding in spikes] == ["handwheel"] * is_found
-    assert all(
-        "1 spike of" in finding.message and "7.3 rad at t = 40 s" in finding.message
-        for finding in spikes
-    )
+    found = spikes(handwheel=handwheel)
+    assert list(found) == ["handwheel"] * is_found
+    for message in found.values():
+        assert "1 spike of" in message
+        assert "7.3 rad at t = 40 s" in message
 
 
 @pytest.mark.parametrize(
@@ -317,77 +289,52 @@ def test_a_short_jump_far_beyond_the_usual_range_is_found(length, value, is_foun
 def test_a_speed_that_jumps_to_one_value_and_back_is_found_within_its_usual_range(
     length, value, is_found
 ):
-    drive = clean_drive()
-    speed = drive["vx"].copy()
+    speed = clean_drive()["vx"].copy()
     speed[:1000] += np.linspace(60.0, 0.0, 1000)  # so that the code is no unusual speed
     speed[3000 : 3000 + length] = value
-    found = checks_of_recording(replace(drive, channels={**drive.channels, "vx": speed}))
-    messages = [one.message for one in found if (one.check, one.channel) == ("spike", "vx")]
-    assert len(messages) == is_found
-    assert all(
-        f"jumps away and back 1 time within 1 s, the longest to {value:.4g} m/s" in text
-        for text in messages
-    )
+    message = spikes(vx=speed).get("vx", "")
+    jump = f"jumps away and back 1 time within 1 s, the longest to {value:.4g} m/s"
+    assert (jump if is_found else "") in message
+    assert bool(message) == is_found
 
 
 @pytest.mark.parametrize(
     "rows", [slice(0, 1), slice(0, 2), slice(1, 2), slice(-2, -1), slice(-1, None)]
 )
-@pytest.mark.parametrize(("value", "words"), [(7.3, "1 spike of"), (0.0, "jumps away and back 1")])
-def test_a_spike_in_the_first_or_last_samples_is_found(rows, value, words):
-    drive = clean_drive()
-    angle = 2.0 + 15.0 * drive["steer"] if value == 0.0 else 15.0 * drive["steer"]
-    channels = {**drive.channels, "handwheel": angle.copy()}
-    assert "spike" not in [
-        one.check for one in checks_of_recording(replace(drive, channels=channels))
-    ]
-    channels["handwheel"][rows] = value
-    found = checks_of_recording(replace(drive, channels=channels))
-    spikes = [one for one in found if one.check == "spike"]
-    assert [one.channel for one in spikes] == ["handwheel"]
-    assert words in spikes[0].message
+@pytest.mark.parametrize(
+    ("mean", "value", "words"), [(0.0, 7.3, "1 spike of"), (2.0, 0.0, "jumps away and back 1")]
+)
+def test_a_spike_in_the_first_or_last_samples_is_found(rows, mean, value, words):
+    angle = mean + steering_wheel()
+    assert not spikes(handwheel=angle)
+    angle[rows] = value
+    found = spikes(handwheel=angle)
+    assert list(found) == ["handwheel"]
+    assert words in found["handwheel"]
 
 
-def test_a_spike_with_a_missing_sample_inside_is_stated_by_its_largest_sample():
-    drive = clean_drive()
-    angle = 15.0 * drive["steer"]
+def test_spikes_with_and_beside_missing_samples_are_found_and_a_swerve_at_the_start_is_none():
+    angle = steering_wheel()
     angle[3000:3003] = [7.1, np.nan, 7.3]
-    channels = {**drive.channels, "handwheel": angle}
-    recording = replace(drive, channels=channels, gappy=frozenset({"handwheel"}))
-    found = checks_of_recording(recording)
-    (message,) = [one.message for one in found if one.check == "spike"]
-    assert f"the largest 7.3 rad at t = {drive.time[3002]:.12g} s" in message
-
-
-def test_a_spike_beside_missing_samples_is_found_and_a_manoeuvre_at_the_start_is_none():
-    drive = clean_drive()
-    gappy = 15.0 * drive["steer"]
-    gappy[2990:3000] = np.nan
-    gappy[3000] = 7.3
-    swerve = 15.0 * drive["steer"]
+    time = clean_drive().time[3002]
+    assert f"the largest 7.3 rad at t = {time:.12g} s" in spikes(handwheel=angle)["handwheel"]
+    angle[2990:3000] = np.nan
+    angle[3000:3003] = [7.3, *steering_wheel()[3001:3003]]
+    assert list(spikes(handwheel=angle)) == ["handwheel"]
+    swerve = steering_wheel()
     swerve[:20] += 4.0 * np.cos(np.linspace(0.0, 0.5 * np.pi, 20))
-    for angle, expected in ((gappy, ["handwheel"]), (swerve, [])):
-        recording = replace(
-            drive,
-            channels={**drive.channels, "handwheel": angle},
-            gappy=frozenset({"handwheel"}),
-        )
-        found = checks_of_recording(recording)
-        assert [one.channel for one in found if one.check == "spike"] == expected
+    assert not spikes(handwheel=swerve)
 
 
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():
     drive = clean_drive()
     shaking = 5.0 * (-1.0) ** np.arange(len(drive))
     shaking[3000] = 22.0  # by 27 m/s², two of its ranges, but not three of its steps of 10 m/s²
-    standing_car = {name: samples.copy() for name, samples in drive.channels.items()}
-    for samples in standing_car.values():
-        samples[3000:3400] = 0.0
-    standing_car["sideslip_ref"] = 0.02 * np.sin(0.01 * np.arange(len(drive)))
-    standing_car["sideslip_ref"][3200] = 3.0
-    for channels in ({**drive.channels, "ax": shaking}, standing_car):
-        findings = checks_of_recording(replace(drive, channels=channels))
-        assert "spike" not in [finding.check for finding in findings]
+    assert not spikes(ax=shaking)
+    sideslip = 0.02 * np.sin(0.01 * np.arange(len(drive)))
+    sideslip[3200] = 3.0
+    standing_car = changed(drive, **dict.fromkeys(drive.channels, stuck(0.0, 3000, 3400)))
+    assert not spikes(standing_car, sideslip_ref=sideslip)
 
 
 def test_an_acceleration_that_a_transform_made_of_the_speed_is_not_called_late(tmp_path):
@@ -410,6 +357,5 @@ def test_an_acceleration_that_a_transform_made_of_the_speed_is_not_called_late(t
         "transforms": [{"name": "acceleration_from_speed"}],
     }
     recording = open_source(dataset).read("lap")
-    as_measured = replace(recording, provenance={})
-    assert ("delay", "ax") in {(f.check, f.channel) for f in checks_of_recording(as_measured)}
-    assert "delay" not in {found.check for found in checks_of_recording(recording)}
+    assert "ax" in found_by("delay", replace(recording, provenance={}))
+    assert not found_by("delay", recording)

@@ -2,16 +2,14 @@
 is.
 """
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
-from broadband_drive import Wave, broadband_drive, without
+from broadband_drive import Wave, broadband_drive, changed, found_by, warned, without
 from scipy import signal
 
 from real_drives import real_drive
-from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import delays_of, spectra_of
 from vehest.alignment.motion import motion_of
 from vehest.alignment.spectra import cross_spectra, lag_of
@@ -32,33 +30,24 @@ def between(recording, channel, against):
 
 
 def reported(recording):
-    return {
-        finding.channel: finding
-        for finding in checks_of_recording(recording)
-        if finding.check == "delay"
-    }
+    return found_by("delay", recording)
 
 
-@pytest.mark.parametrize(("rate", "seed"), [*((25.0, seed) for seed in range(5)), (100.0, 0)])
+@pytest.mark.parametrize(("rate", "seed"), [(25.0, 0), (25.0, 1), (25.0, 2), (100.0, 0)])
 def test_channels_on_one_clock_get_no_report(rate, seed):
-    assert [
-        finding
-        for finding in checks_of_recording(broadband_drive(rate_hz=rate, seed=seed))
-        if finding.level != "note"
-    ] == []
+    assert warned(broadband_drive(rate_hz=rate, seed=seed)) == []
 
 
 LATE = (("yaw_rate",), ("ay",), ("ax",), ("vy_ref", "sideslip_ref"), ("vx",))
 
 
-@pytest.mark.parametrize(
-    ("late", "rate"), [*product(LATE, (25.0, 100.0)), (("yaw_rate",), 1000.0 / 3.0)]
-)
+@pytest.mark.parametrize(("late", "rate"), [*product(LATE, (25.0,)), (("yaw_rate",), 100.0)])
 def test_the_late_channel_is_named_and_no_other(late, rate):
-    by_channel = reported(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04)))
+    drive = broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04))
+    by_channel = reported(drive)
     assert set(by_channel) == {late[0]}
     assert "\n" not in by_channel[late[0]].message
-    for delay in delays(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04))):
+    for delay in delays(drive):
         truth = 0.04 * ((delay.channel in late) - (delay.against in late))
         assert delay.delay.value == pytest.approx(truth, abs=6e-3), delay
 
@@ -90,12 +79,9 @@ def test_a_lever_arm_is_no_delay_and_one_in_channels_of_the_wrong_sign_and_unit_
     delay_estimate = between(drive, "yaw_rate", "ay").delay
     assert delay_estimate.low < 0.0 < delay_estimate.high
     late = broadband_drive(late={"ay": 0.06})
-    spoilt = replace(
-        late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]}
-    )
-    findings = checks_of_recording(spoilt)
+    spoilt = changed(late, ay=-late["ay"], vy_ref=3.6 * late["vy_ref"])
     assert {
-        (finding.check, finding.channel) for finding in findings if finding.level == "warning"
+        (finding.check, finding.channel) for finding in warned(spoilt) if finding.level == "warning"
     } == {
         ("sign", "ay"),
         ("unit", "vy_ref"),
@@ -136,18 +122,15 @@ def test_intervals_hold_the_truth_as_often_as_they_promise():
 def test_slipping_wheels_are_not_reported_and_late_ones_once():
     """Slip in proportion to the acceleration: r·ω = v + 0.1 s · dv/dt."""
     drive = broadband_drive()
-    slipping = drive["vx_ref"] + 0.1 * np.gradient(drive["vx_ref"]) * drive.rate_hz
-    assert (
-        between(
-            replace(drive, channels={**drive.channels, "vx": slipping}), "vx", "vx_ref"
-        ).delay.low
-        < -0.015
+    slipping = changed(
+        drive, vx=drive["vx_ref"] + 0.1 * np.gradient(drive["vx_ref"]) * drive.rate_hz
     )
-    assert not reported(replace(drive, channels={**drive.channels, "vx": slipping}))
+    assert between(slipping, "vx", "vx_ref").delay.low < -0.015
+    assert not reported(slipping)
     drive = broadband_drive(noise=0.0)
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
     wheels = {f"wheel_speed_{wheel}": late for wheel in ("fl", "fr", "rl", "rr")}
-    (warning,) = reported(replace(drive, channels={**drive.channels, **wheels})).values()
+    (warning,) = reported(changed(drive, **wheels)).values()
     assert "like the other wheels, by 59 ms" in warning.message
 
 
@@ -168,15 +151,8 @@ def test_the_ferraris_accelerometers_are_a_sample_or_two_late_which_is_not_repor
         assert max(delay.low, 0.0002) < min(delay.high, 0.0226)
 
 
-@pytest.mark.parametrize("late", [0.04, 0.1])
-@pytest.mark.parametrize("channel", ["yaw_rate", "ay", "ax", "vy_ref"])
-def test_a_delay_planted_into_the_ferrari_is_found_where_it_is(ferrari, channel, late):
+@pytest.mark.parametrize("late", LATE[:-1])
+def test_a_delay_planted_into_the_ferrari_is_found_where_it_is(ferrari, late):
     drive = ferrari.cut(150.0, 450.0)
-    shifted = np.interp(drive.time - late, drive.time, drive[channel])
-    names = {"vy_ref", "sideslip_ref"} if channel == "vy_ref" else {channel}
-    changed = {**drive.channels, channel: shifted}
-    if channel == "vy_ref":
-        changed["sideslip_ref"] = np.interp(drive.time - late, drive.time, drive["sideslip_ref"])
-    late_channels = set(reported(replace(drive, channels=changed)))
-    assert late_channels <= names
-    assert channel in late_channels
+    shifted = {name: np.interp(drive.time - 0.04, drive.time, drive[name]) for name in late}
+    assert late[0] in set(reported(changed(drive, **shifted))) <= set(late)

@@ -30,8 +30,12 @@ from vehest.sources.surveys import survey
 from vehest.sources.surveys.tables import unit_in_name
 
 
-def proposals_of(tmp_path, table, **options):
-    return inspect("my_car", [write(tmp_path / "lap.csv", table, **options)]).proposals
+def examine(tmp_path, table, **options):
+    return inspect("my_car", [write(tmp_path / "lap.csv", table, **options)])
+
+
+def proposals_of(tmp_path, table):
+    return examine(tmp_path, table).proposals
 
 
 def proposed(tmp_path, table):
@@ -39,7 +43,7 @@ def proposed(tmp_path, table):
 
 
 def drafted(tmp_path, table, **options):
-    return draft(inspect("my_car", [write(tmp_path / "lap.csv", table, **options)]))
+    return draft(examine(tmp_path, table, **options))
 
 
 def read_back(log_draft):
@@ -47,13 +51,41 @@ def read_back(log_draft):
 
 
 def asked(tmp_path, table):
-    return [
-        question.key
-        for question in questions_of(inspect("my_car", [write(tmp_path / "lap.csv", table)]))
-    ]
+    return [question.key for question in questions_of(examine(tmp_path, table))]
+
+
+def left_out(tmp_path, table):
+    """Channels with their columns, and keys of open questions, where every question stays open."""
+    examined, questions = ask(examine(tmp_path, table), interactive=False)
+    by_channel = {name: proposal.column for name, proposal in examined.proposals.by_channel.items()}
+    return by_channel, {question.key: question for question in questions}
 
 
 CORNERS = ("fl", "fr", "rl", "rr")
+
+
+def wheels_of(d, header="Wheel{}", factor=1.0):
+    """Columns of the four wheels."""
+    return {header.format(corner.upper()): factor * d[f"wheel_{corner}"] for corner in CORNERS}
+
+
+def places_of(d, turning=1.0):
+    """Velocities and degrees of a drive that starts towards the east."""
+    heading = turning * np.cumsum(d["r"]) / 50.0
+    east = d["vx"] * np.cos(heading)
+    north = d["vx"] * np.sin(heading)
+    metres = 111_000.0 * np.cos(np.radians(48.0))
+    places = {
+        "Latitude": 48.0 + np.cumsum(north) / 50.0 / 111_000.0,
+        "Longitude": 16.0 + np.cumsum(east) / 50.0 / metres,
+    }
+    return east, north, places
+
+
+def inspect_course(tmp_path, table):
+    """With all digits of its degrees."""
+    table.to_csv(tmp_path / "course.csv", index=False)
+    return inspect("my_car", [tmp_path / "course.csv"]).proposals
 
 
 def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path):
@@ -78,11 +110,11 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
     )
 
 
-@pytest.mark.parametrize("unit", ["m/s", "km/h", "mph"])
-@pytest.mark.parametrize(("of_rate", "of_ay"), [("rad/s", "g"), ("deg/s", "m/s²")])
-def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(
-    tmp_path, unit, of_rate, of_ay
-):
+@pytest.mark.parametrize(
+    ("unit", "of_rate", "of_ay"),
+    [("m/s", "rad/s", "g"), ("km/h", "deg/s", "m/s²"), ("mph", "rad/s", "m/s²")],
+)
+def test_units_are_distinguished_under_names_that_say_nothing(tmp_path, unit, of_rate, of_ay):
     d = drive()
     size = {
         "m/s": 1.0,
@@ -114,37 +146,24 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     mirrored = usual(d)
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(tmp_path, mirrored) == ["left_right"]
-    proposals = proposals_of(
-        tmp_path,
-        mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in CORNERS}),
-    )
+    proposals = proposals_of(tmp_path, mirrored.assign(**wheels_of(d)))
     assert "right wheels are faster" in proposals.left_right
     assert {proposals.by_channel[name].sign for name in LATERAL} == {-1}
-    heading = np.cumsum(d["r"]) / 50.0  # counter-clockwise from east
-    east = np.cumsum(d["vx"] * np.cos(heading)) / 50.0
-    north = np.cumsum(d["vx"] * np.sin(heading)) / 50.0
-    mirrored["Latitude"] = 48.0 + north / 111_000.0
-    mirrored["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
-    mirrored.to_csv(tmp_path / "course.csv", index=False)
-    proposals = inspect("my_car", [tmp_path / "course.csv"]).proposals
-    assert (
-        "course over latitude and longitude" in proposals.left_right,
-        proposals.by_channel["yaw_rate"].sign,
-    ) == (True, -1)
+    proposals = inspect_course(tmp_path, mirrored.assign(**places_of(d)[2]))
+    assert "course over latitude and longitude" in proposals.left_right
+    assert proposals.by_channel["yaw_rate"].sign == -1
 
 
 def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
     d = drive()
-    wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
-    examined = inspect(
-        "my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Speed").assign(**wheels))]
-    )
+    wheels = wheels_of(d, "n_{}", 30.0 / np.pi)
+    examined = examine(tmp_path, usual(d).drop(columns="Speed").assign(**wheels))
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
     assert {"vx", "vy_ref"} <= draft(examined).contents[0].channels
     table = usual(d).drop(columns=["Time [s]", "Speed"]).assign(**wheels)
     table.loc[1000:1100, list(wheels)] = np.nan
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = examine(tmp_path, table)
     assert examined.proposals.wheel_radius is not None
     log_draft = draft(examined)
     assert (log_draft.examined.proposals.wheel_radius, log_draft.dataset["transforms"]) == (
@@ -175,10 +194,7 @@ WHEEL_SCALES = {  # unit -> value at a wheel speed of 1 rad/s
 )
 def test_wheel_speeds_are_read_in_any_unit_of_a_speed(tmp_path, unit, header):
     d = drive(60.0)
-    wheels = {
-        header.format(f"Wheel{corner.upper()}", unit): WHEEL_SCALES[unit] * d[f"wheel_{corner}"]
-        for corner in CORNERS
-    }
+    wheels = wheels_of(d, header.format("Wheel{}", unit), WHEEL_SCALES[unit])
     proposals = proposals_of(tmp_path, usual(d).assign(**wheels))
     names = [f"wheel_speed_{corner}" for corner in CORNERS]
     is_ambiguous = unit == "mph" and "[" not in header  # from rad/s of a wheel of 0.447 m
@@ -213,7 +229,7 @@ def test_a_wheel_in_another_unit_is_named_with_the_remedy(tmp_path, name, scale,
 
 def test_wheel_speeds_in_counts_of_no_known_unit_are_left_out_with_a_question(tmp_path):
     d = drive(60.0)
-    wheels = {f"Wheel{corner.upper()}": 20.0 * d[f"wheel_{corner}"] for corner in CORNERS}
+    wheels = wheels_of(d, factor=20.0)
     proposal = proposed(tmp_path, usual(d).assign(**wheels))["wheel_speed_fl"]
     assert "does not agree with the speed" in proposal.question
     assert proposal.is_weak
@@ -835,7 +851,7 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     table["acc_vehicle_x"] = np.diff(table["mocap_speed"], prepend=0.0) / 0.05
     table["imu_ax"] = d["ax"] + 0.4 * np.random.default_rng(5).standard_normal(len(table))
     table.loc[700, "mocap_speed"] = 4000.0
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = examine(tmp_path, table)
     assert examined.proposals.by_channel["ax"].column == "imu_ax"
     assert (
         "'acc_vehicle_x' is left out: it is the difference of 'mocap_speed' from row to row, not "
@@ -856,7 +872,7 @@ def test_a_torque_is_no_acceleration_and_a_derived_yaw_rate_is_the_references(
             "Tq": 130.0 * d["ax"],
         }
     )
-    proposals = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    proposals = examine(tmp_path, table).proposals
     assert (proposals.by_channel["vx"].unit, "ax" in proposals.by_channel) == ("km/h", False)
     assert any("'speed' is " in note and "% too low" in note for note in proposals.notes)
     proposals = proposed(
@@ -879,7 +895,7 @@ def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_th
     )
     table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
     table = table.assign(WheelSpeedFL=d["wheel_fl"], WheelSpeedFR=d["wheel_fr"])
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = examine(tmp_path, table)
     by_channel = examined.proposals.by_channel
     assert [by_channel[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [
         -1,
@@ -927,7 +943,7 @@ def test_course_and_heading_without_another_reference_and_samples_that_rows_repe
         .drop(columns="Beta")
         .assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
     )
-    notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    notes = examine(tmp_path, table).proposals.notes
     assert (
         "the difference 'Heading' - 'Course' may be the missing reference of the sideslip angle; "
         "if so, save it as a column" in notes
@@ -961,12 +977,7 @@ def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path,
     table = usual(d).assign(Speed=3.6 * excess * d["vx"])
     by_channel = proposed(
         tmp_path,
-        table.assign(
-            **{
-                f"WheelSpeed{corner.upper()}": 3.6 * RADIUS * d[f"wheel_{corner}"]
-                for corner in CORNERS
-            }
-        ),
+        table.assign(**wheels_of(d, "WheelSpeed{}", 3.6 * RADIUS)),
     )
     assert (
         "circumferential speed in km/h, compared with the speed"
@@ -1085,7 +1096,7 @@ def test_a_unit_that_two_relations_contradict_is_corrected_with_both_named(
     tmp_path, factors, units
 ):
     d = drive()
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", with_units(d, **factors))])
+    examined = examine(tmp_path, with_units(d, **factors))
     made = draft(ask(examined, interactive=False)[0])
     found = made.examined.proposals.by_channel
     assert {name: found[name].unit for name in units} == units
@@ -1102,11 +1113,6 @@ def test_a_wrong_gain_that_nothing_else_explains_leaves_out_all_that_may_be_wron
     ]
     with pytest.raises(ConfigurationError, match="no channel is supported by two pieces"):
         left_out(tmp_path, table)
-
-
-def test_a_speed_12_percent_too_high_is_noted(tmp_path):
-    notes = proposals_of(tmp_path, with_units(drive(), vx=1.12)).notes
-    assert any("12 % too high compared with ay/yaw_rate" in note for note in notes)
 
 
 def test_tilt_is_asked_where_accelerations_may_be_reversed_as_those_of_a_telephone(tmp_path):
@@ -1127,9 +1133,7 @@ def test_an_unnamed_angle_that_no_wheel_turns_by_is_no_steering_command(tmp_path
 
 def test_wheels_named_wsp_are_wheels(tmp_path):
     d = drive()
-    table = with_units(d)
-    for corner in CORNERS:
-        table[f"WSP_{corner.upper()} [km/h]"] = 3.6 * RADIUS * d[f"wheel_{corner}"]
+    table = with_units(d).assign(**wheels_of(d, "WSP_{} [km/h]", 3.6 * RADIUS))
     assert {f"wheel_speed_{corner}" for corner in CORNERS} <= set(proposed(tmp_path, table))
 
 
@@ -1172,10 +1176,7 @@ def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
 def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path):
     d = drive()
     counts = np.round(1500.0 + 8000.0 * d["steer"])
-    examined = inspect(
-        "my_car",
-        [write(tmp_path / "lap.csv", usual(d).drop(columns="Steer").assign(steer_us=counts))],
-    )
+    examined = examine(tmp_path, usual(d).drop(columns="Steer").assign(steer_us=counts))
     answered, left = ask(examined, interactive=False)
     assert {question.key: question.proposed for question in left}["steer_us"] == "-"
     assert "steer" not in draft(answered).channels
@@ -1282,7 +1283,7 @@ def test_names_in_shift_jis_are_read_and_windows_1252_is_not_taken_for_it(
     tmp_path, encoding, speed, rate
 ):
     table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding=encoding)])
+    examined = examine(tmp_path, table, encoding=encoding)
     assert [examined.proposals.by_channel[name].column for name in ("vx", "yaw_rate")] == [
         speed,
         rate,
@@ -1395,11 +1396,7 @@ def test_roll_and_pitch_have_the_signs_of_the_axes_that_ay_and_yaw_rate_reveal(
     and ax.
     """
     d = drive(240.0)
-    heading = np.cumsum(d["r"]) / 50.0
-    table = usual(d).drop(columns=["Steer", "Beta"])
-    table["Latitude"] = 48.0 + np.cumsum(d["vx"] * np.sin(heading)) / 50.0 / 111_000.0
-    metres = 111_000.0 * np.cos(np.radians(48.0))
-    table["Longitude"] = 16.0 + np.cumsum(d["vx"] * np.cos(heading)) / 50.0 / metres
+    table = usual(d).drop(columns=["Steer", "Beta"]).assign(**places_of(d)[2])
     table["LatAcc"] *= of_ay
     table["Gyro"] *= of_yaw_rate
     table[TILTED["roll"]] = -0.01 * d["ay"]
@@ -1487,26 +1484,13 @@ def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp
     stand = np.zeros(1500)
     vx, rate = (np.concatenate([stand, d[name], stand]) for name in ("vx", "r"))
     noise = np.random.default_rng(1).standard_normal((2, 9000))
-    heading = np.cumsum(rate) / 50.0
     table = pd.DataFrame({"t": np.arange(9000) / 50.0, "Speed [m/s]": vx, "Gyro [rad/s]": -rate})
     table["LatAcc [m/s2]"] = -vx * rate + 0.05 * noise[0]
-    metres = 111_000.0 * np.cos(np.radians(48.0))
-    table["Latitude"] = 48.0 + np.cumsum(vx * np.sin(heading)) / 50.0 / 111_000.0
-    table["Longitude"] = 11.0 + np.cumsum(vx * np.cos(heading)) / 50.0 / metres
+    table = table.assign(**places_of({"vx": vx, "r": rate})[2])
     table[["Latitude", "Longitude"]] += 1e-7 * noise.T
-    table.to_csv(tmp_path / "course.csv", index=False)
-    proposals = inspect("my_car", [tmp_path / "course.csv"]).proposals
+    proposals = inspect_course(tmp_path, table)
     assert "course over latitude and longitude" in proposals.left_right
     assert (proposals.by_channel["yaw_rate"].sign, proposals.by_channel["ay"].sign) == (-1, -1)
-
-
-def left_out(tmp_path, table):
-    """Channels with their columns, and keys of open questions, where every question stays open."""
-    examined, questions = ask(
-        inspect("my_car", [write(tmp_path / "lap.csv", table)]), interactive=False
-    )
-    by_channel = {name: proposal.column for name, proposal in examined.proposals.by_channel.items()}
-    return by_channel, {question.key: question for question in questions}
 
 
 def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path):
@@ -1544,23 +1528,28 @@ def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answ
     assert column_of == {"vx": "b", "yaw_rate": "c", "ay": "d", "ax": "e"}
 
 
-def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
-    d = drive()
+def with_y_up(d, sign=1.0):
+    """Motion along and about axes of which y points upwards; x points to the left, times a sign."""
     noise = 0.02 * np.random.default_rng(2).standard_normal((3, len(d["t"])))
-    table = pd.DataFrame(
+    return pd.DataFrame(
         {
             "t": d["t"],
-            "AccelerationX": d["ay"],
+            "AccelerationX": sign * d["ay"],
             "AccelerationY": noise[0],
             "AccelerationZ": d["ax"],
-            "VelocityX": d["vy"],
+            "VelocityX": sign * d["vy"],
             "VelocityY": noise[1],
             "VelocityZ": d["vx"],
             "AngularVelocityX": noise[2],
-            "AngularVelocityY": d["r"],
+            "AngularVelocityY": sign * d["r"],
             "AngularVelocityZ": noise[1] + noise[2],
         }
     )
+
+
+def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
+    d = drive()
+    table = with_y_up(d)
     column_of = {name: proposal.column for name, proposal in proposed(tmp_path, table).items()}
     assert column_of == {
         "vx": "VelocityZ",
@@ -1576,24 +1565,21 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
 
 def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     d = drive()
-    heading = 3.0 * np.cumsum(d["r"]) / 50.0
-    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    east, north, _ = places_of(d, turning=3.0)
     table = pd.DataFrame({"t": d["t"], "Velocity east [m/s]": east, "vel_n [m/s]": north})
     table["Velocity forward [m/s]"] = d["vx"]
     table = table.assign(**{"Gyro [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
     by_channel = proposed(tmp_path, table)
     assert (by_channel["vx"].column, by_channel["vx"].question) == ("Velocity forward [m/s]", "")
     assert {"vx_ref", "vy_ref"}.isdisjoint(by_channel)
-    heading = np.cumsum(d["r"]) / 50.0  # always nearly along x
-    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    east, north, _ = places_of(d)  # always nearly along x
     table = pd.DataFrame({"t": d["t"], "twist.linear.x": east, "twist.linear.y": north})
     table = table.assign(x=np.cumsum(east) / 50.0, y=np.cumsum(north) / 50.0)
     table = table.assign(**{"gyro_z [rad/s]": d["r"], "LatAcc [m/s2]": d["ay"]})
     channels, open_questions = left_out(tmp_path, table)
     assert channels == {"yaw_rate": "gyro_z [rad/s]", "ay": "LatAcc [m/s2]"}
     assert "an axis of the world" in open_questions["twist.linear.x"].text
-    heading = 3.0 * np.cumsum(d["r"]) / 50.0
-    east, north = d["vx"] * np.cos(heading), d["vx"] * np.sin(heading)
+    east, north, _ = places_of(d, turning=3.0)
     table = pd.DataFrame({"t": d["t"], "vx": east, "vy": north, "wz": d["r"], "acc_lat": d["ay"]})
     table = table.assign(pos_x=np.cumsum(east) / 50.0, pos_y=np.cumsum(north) / 50.0)
     channels, open_questions = left_out(tmp_path, table)
@@ -1604,24 +1590,13 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
 def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):
     """An error of heading named dpsi, like a yaw rate, and a curvature named like nothing."""
     d = drive()
-    noise = 0.02 * np.random.default_rng(3).standard_normal((3, len(d["t"])))
-    table = pd.DataFrame(
-        {
-            "t": d["t"],
-            "dpsi": d["r"] / 9.0 + 0.2 * d["sideslip"],
-            "q": d["r"] / d["vx"],
-            "AccelerationX [m/s2]": -d["ay"],
-            "AccelerationY [m/s2]": noise[0],
-            "AccelerationZ [m/s2]": d["ax"],
-            "VelocityX [m/s]": -d["vy"],
-            "VelocityY [m/s]": noise[1],
-            "VelocityZ [m/s]": d["vx"],
-            "AngularVelocityX [deg/s]": 50.0 * noise[2],
-            "AngularVelocityY [deg/s]": -np.degrees(d["r"]),
-            "AngularVelocityZ [deg/s]": 50.0 * noise[1],
-        }
-    )
-    by_channel = proposed(tmp_path, table)
+    table = with_y_up(d, sign=-1.0)
+    rates = [name for name in table if name.startswith("Angular")]
+    table[rates] = np.degrees(table[rates])
+    units = {"Acceleration": "m/s2", "Velocity": "m/s", "AngularVelocity": "deg/s"}
+    table.columns = [f"{name} [{units[name[:-1]]}]" if name != "t" else name for name in table]
+    path = {"dpsi": d["r"] / 9.0 + 0.2 * d["sideslip"], "q": d["r"] / d["vx"]}
+    by_channel = proposed(tmp_path, table.assign(**path))
     columns = {
         name: by_channel[name].column.split(" ")[0] for name in ("vx", "yaw_rate", "ay", "ax")
     }
@@ -1728,10 +1703,8 @@ def test_the_rate_of_a_log_without_times_is_right_though_the_car_slides(tmp_path
 
 def test_a_latitude_is_no_speed(tmp_path):
     d = drive()
-    heading = np.cumsum(d["r"]) / 50.0
-    table = usual(d).drop(columns=["Speed", "Steer", "Beta"])
-    table["lat"] = 48.0 + np.cumsum(d["vx"] * np.sin(heading)) / 50.0 / 111_000.0
-    table["lon"] = 16.0 + np.cumsum(d["vx"] * np.cos(heading)) / 50.0 / 74_000.0
+    table = usual(d).drop(columns=["Speed", "Steer", "Beta"]).assign(**places_of(d)[2])
+    table = table.rename(columns={"Latitude": "lat", "Longitude": "lon"})
     proposals = proposals_of(tmp_path, table)
     assert not {"lat", "lon"} & {proposal.column for proposal in proposals.channels}
     assert not [note for note in proposals.notes if "'lat'" in note]

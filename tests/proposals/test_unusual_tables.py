@@ -29,6 +29,12 @@ def read_back(file):
     return log_draft, open_source(log_draft.dataset).read(file.stem)
 
 
+def text_file(tmp_path, *lines):
+    file = tmp_path / "lap.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    return file
+
+
 def assert_yaw_rate_is(recording, table):
     np.testing.assert_allclose(recording["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
 
@@ -51,8 +57,7 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     product = d["vx"] * d["r"] / G  # computed, and not measured
     columns = (d["t"], d["vx"], product, d["vx"] + 0.01, d["ay"] / G, np.degrees(d["r"]))
     rows = [",".join(f"{value:.5f}" for value in row) for row in zip(*columns, strict=True)]
-    file = tmp_path / "lap.csv"
-    file.write_text("\n".join([*head, *rows]), encoding="utf-8")
+    file = text_file(tmp_path, *head, *rows)
     log_draft, recording = read_back(file)
     channels = {name: entry["column"] for name, entry in log_draft.dataset["channels"].items()}
     assert {channels.pop("vx"), channels.pop("vx_ref")} == {"speed #2", "speed #4"}
@@ -68,8 +73,7 @@ def test_delimiters_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names, o
     table = usual(drive())
     lines = lines_of(table)
     lines = [lines[0] + of_names, *(row + of_rows for row in lines[1:])]
-    file = tmp_path / "lap.csv"
-    file.write_text("\n".join(lines), encoding="utf-8")
+    file = text_file(tmp_path, *lines)
     assert_yaw_rate_is(read_back(file)[1], table)
 
 
@@ -78,8 +82,7 @@ def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
     table = usual(drive()).round(5)
     lines = [line.split(",") for line in lines_of(table)]
     lines[701][2] = cell
-    file = tmp_path / "lap.csv"
-    file.write_text("\n".join(map(",".join, lines)), encoding="utf-8")
+    file = text_file(tmp_path, *map(",".join, lines))
     log_draft, recording = read_back(file)
     assert log_draft.dataset.get("missing", [cell]) == [cell]
     table.loc[700, "Gyro"] = 0.5 * (table.loc[699, "Gyro"] + table.loc[701, "Gyro"])
@@ -91,8 +94,7 @@ def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
 def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
     table = usual(drive())
     lines = lines_of(table)
-    file = tmp_path / "lap.csv"
-    file.write_text("\n".join([*lines[:500], lines[0], *lines[500:]]), encoding="utf-8")
+    file = text_file(tmp_path, *lines[:500], lines[0], *lines[500:])
     log_draft, recording = read_back(file)
     assert log_draft.dataset["drop_rows"] == {"lap": [500]}
     assert_yaw_rate_is(recording, table)
@@ -102,10 +104,8 @@ def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
 def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
     table = usual(drive())
     lines = lines_of(table)
-    file = tmp_path / "lap.csv"
     below = [line + ",9" * (6 - line.count(",")) if "," in line else line for line in below]
-    text = [*lines[:500], "# marker: lap 2", *lines[500:], *below, ""]
-    file.write_text("\n".join(text), encoding="utf-8")
+    file = text_file(tmp_path, *lines[:500], "# marker: lap 2", *lines[500:], *below, "")
     log_draft, recording = read_back(file)
     assert "not read: line '# marker: lap 2'" in log_draft.notes
     assert log_draft.dataset.get("drop_rows", {}) == (
@@ -117,9 +117,8 @@ def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
 
 def test_a_row_of_numbers_that_is_cut_off_within_the_table_is_an_error(tmp_path):
     lines = lines_of(usual(drive()))
-    file = tmp_path / "lap.csv"
     for row in ("bad,1.0,2.0", lines[500][:-30]):
-        file.write_text("\n".join([*lines[:500], row, *lines[500:]]), encoding="utf-8")
+        file = text_file(tmp_path, *lines[:500], row, *lines[500:])
         with pytest.raises(DataError, match="Expected 7 columns"):
             inspect("my_car", [file])
 
@@ -160,21 +159,13 @@ def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, secon
     assert (clock.asked, read_back(file)[1].rate_hz) == (False, 50.0)
 
 
-def test_a_row_of_units_in_brackets_has_the_unit_of_time(tmp_path):
-    lines = lines_of(usual(drive()).rename(columns={"Time [s]": "Time"}))
-    file = tmp_path / "lap.csv"
-    units = "[s],[km/h],[°/s],[g],[g],[°],[°]"
-    file.write_text("\n".join([lines[0], units, *lines[1:]]), encoding="utf-8")
-    clock = inspect("my_car", [file]).log.clock
-    assert (clock.unit, clock.asked) == ("s", False)
-
-
-def test_units_in_a_row_of_comment_have_the_unit_of_time(tmp_path):
-    lines = lines_of(usual(drive()).rename(columns={"Time [s]": "Time"}))
-    file = tmp_path / "lap.csv"
-    units = "# s,km/h,deg/s,g,g,deg,deg"
-    file.write_text("\n".join([f"# {lines[0]}", units, *lines[1:]]), encoding="utf-8")
-    clock = inspect("my_car", [file]).log.clock
+@pytest.mark.parametrize(
+    ("mark", "units"),
+    [("", "[s],[km/h],[°/s],[g],[g],[°],[°]"), ("# ", "s,km/h,deg/s,g,g,deg,deg")],
+)
+def test_a_row_of_units_in_brackets_or_in_a_comment_has_the_unit_of_time(tmp_path, mark, units):
+    names, *rows = lines_of(usual(drive()).rename(columns={"Time [s]": "Time"}))
+    clock = survey_table(text_file(tmp_path, mark + names, mark + units, *rows)).clock
     assert (clock.unit, clock.asked) == ("s", False)
 
 
@@ -186,13 +177,6 @@ def test_fixes_of_a_receiver_of_1_hz_are_bridged_though_they_jitter(tmp_path):
     log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
     assert "drop_rows" not in log_draft.dataset
     assert recording.duration > 58.0
-
-
-def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path):
-    table = usual(drive()).rename(columns={"Time [s]": "time [ticks]"})
-    table["time [ticks]"] *= 100.0
-    clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
-    assert (clock.unit, clock.asked) == ("ms", True)
 
 
 DURATIONS = {
@@ -301,10 +285,8 @@ UNSUITED = {
 @pytest.mark.parametrize("name", UNSUITED)
 def test_a_file_without_a_column_a_signal_is_named_with_the_way_out(tmp_path, name):
     text, message_part = UNSUITED[name]
-    file = tmp_path / "lap.csv"
-    file.write_text(text, encoding="utf-8")
     with pytest.raises(DataError) as refused:
-        inspect("my_car", [file])
+        inspect("my_car", [text_file(tmp_path, text)])
     assert message_part in str(refused.value)
 
 
@@ -319,9 +301,7 @@ def test_decimal_commas_in_quotes_between_commas_are_read(tmp_path):
     table = usual(drive())
     lines = [[f'"{cell}"' for cell in line.split(",")] for line in lines_of(table)]
     text = "\n".join(",".join(cells).replace(".", ",") for cells in lines)
-    (tmp_path / "lap.csv").write_text(text, encoding="utf-8")
-    _, recording = read_back(tmp_path / "lap.csv")
-    assert_yaw_rate_is(recording, table)
+    assert_yaw_rate_is(read_back(text_file(tmp_path, text))[1], table)
 
 
 def test_a_column_of_names_beside_columns_of_signals_is_no_long_format(tmp_path):
@@ -415,8 +395,7 @@ def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, mes
         at = list(table.columns).index("Gyro")
         cells[at] = cell(100.0 + row[at]) if "thousand" in message_part else cell(row[at])
         lines.append(",".join(cells))
-    file = tmp_path / "lap.csv"
-    file.write_text("\n".join(lines), encoding="utf-8")
+    file = text_file(tmp_path, *lines)
     (reason,) = (reason for reason in survey_table(file).skipped if "'Gyro'" in reason)
     assert reason.startswith(f"column 'Gyro' holds numbers with {message_part}")
 
@@ -438,8 +417,7 @@ def test_decimals_of_parquet_are_numbers(tmp_path):
     gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
     file = tmp_path / "lap.parquet"
     pq.write_table(stored.set_column(at, "Gyro", gyro), file)
-    _, recording = read_back(file)
-    np.testing.assert_allclose(recording["yaw_rate"], np.radians(table["Gyro"]), atol=1e-6)
+    assert_yaw_rate_is(read_back(file)[1], table)
 
 
 def test_minutes_and_seconds_are_times():
@@ -459,13 +437,14 @@ def test_minutes_and_seconds_are_times():
 )
 def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
     d = drive()
+    channels = {"vx": ("Speed", d["vx"]), "yaw_rate": ("Yaw Rate", d["r"])}
+    channels["ay"] = ("Lat Acc", d["ay"])
     table = {"time [s]": d["t"]}
-    for name, key, unit, factor in zip("vra", ("vx", "r", "ay"), units, factors, strict=True):
-        label = {"v": "Speed", "r": "Yaw Rate", "a": "Lat Acc"}[name]
-        table[f"{label} [{unit}]"] = d[key] / factor
+    for (label, samples), unit, factor in zip(channels.values(), units, factors, strict=True):
+        table[f"{label} [{unit}]"] = samples / factor
     _, recording = read_back(write(tmp_path / "lap.csv", pd.DataFrame(table)))
-    for channel, key in (("vx", "vx"), ("yaw_rate", "r"), ("ay", "ay")):
-        np.testing.assert_allclose(recording[channel], d[key], atol=1e-3)
+    for channel, (_, samples) in channels.items():
+        np.testing.assert_allclose(recording[channel], samples, atol=1e-3)
 
 
 def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path):
@@ -479,26 +458,22 @@ def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("name", "factor", "step", "unit"),
+    ("name", "factor", "step", "unit", "is_asked"),
     [
-        ("timestamp_100us", 1e4, 0.04, "0.1*ms"),
-        ("time (10ms)", 100.0, 0.04, "cs"),
-        ("time [s]", 1.0, 0.5, "s"),  # a slow logger
+        ("timestamp_100us", 1e4, 0.04, "0.1*ms", False),
+        ("time (10ms)", 100.0, 0.04, "cs", False),
+        ("time [s]", 1.0, 0.5, "s", False),  # a slow logger
+        ("t", 1.0, 0.5, "s", True),  # not in ms
+        ("time [ticks]", 100.0, 0.02, "ms", True),
     ],
 )
-def test_steps_of_a_counter_and_slow_clocks_are_read_as_the_header_states(
-    tmp_path, name, factor, step, unit
+def test_the_unit_of_time_is_as_the_header_states_or_asked_where_it_states_none(
+    tmp_path, name, factor, step, unit, is_asked
 ):
     table = usual(drive(60.0)).iloc[:: round(50 * step)]
     table = table.rename(columns={"Time [s]": name}).assign(**{name: factor * table["Time [s]"]})
     clock = survey_table(write(tmp_path / "lap.csv", table)).clock
-    assert (clock.unit, clock.asked) == (unit, False)
-
-
-def test_a_clock_of_two_rows_a_second_without_a_unit_is_asked_and_not_read_as_ms(tmp_path):
-    table = usual(drive(60.0)).iloc[::25].rename(columns={"Time [s]": "t"})
-    clock = survey_table(write(tmp_path / "lap.csv", table)).clock
-    assert (clock.unit, clock.asked) == ("s", True)
+    assert (clock.unit, clock.asked) == (unit, is_asked)
 
 
 def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):

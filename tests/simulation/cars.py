@@ -3,6 +3,7 @@
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from vehest.simulation.plant.multi_body import MultiBodyPlant
@@ -28,3 +29,13 @@ def shipped(name):
 def plant_of(name):
     """Multi-body plant of a vehicle of conf/vehicle."""
     return MultiBodyPlant(shipped(name))
+
+
+def rolling(plant, speed):
+    """State at the origin, straight ahead at a speed."""
+    return plant.initial_state(0.0, 0.0, 0.0, speed)
+
+
+def inputs_of(steering=0.0, acceleration=0.0, moment=0.0, along=0.0, across=0.0):
+    """Inputs of a plant."""
+    return np.array([steering, acceleration, moment, along, across])

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cars import plant_of
+from cars import inputs_of, plant_of, rolling
 from scipy.integrate import solve_ivp
 from scipy.signal import welch
 from test_simulation_sensors import motion_of, only
@@ -39,10 +39,10 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     """
     plant = _lagging()
     plain = _lagging((0.0, 0.0))
-    states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
+    states = [rolling(plant, 25.0)]
     for k in range(1500):  # of a swerve
         steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
-        states.append(plant.advance(states[-1], np.array([steering, 0.0, 0.0, 0.0, 0.0]), 1))
+        states.append(plant.advance(states[-1], inputs_of(steering), 1))
     inputs = np.zeros((len(states), 5))
     _, forces = plain.evaluate(states, inputs)
     steer = np.array([state.steer for state in states])
@@ -76,11 +76,11 @@ def test_short_relaxation_lengths_converge_to_none_and_negative_ones_are_refused
             plant = MultiBodyPlant(
                 replace(plant_of("ferrari_250_lm").vehicle, relaxation=(length, length)), step
             )
-            state = plant.initial_state(0.0, 0.0, 0.0, 25.0)
+            state = rolling(plant, 25.0)
             per_ms = round(1e-3 / step)
             for k in range(800):
                 steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
-                state = plant.advance(state, np.array([steering, 0.0, 0.0, 0.0, 0.0]), per_ms)
+                state = plant.advance(state, inputs_of(steering), per_ms)
             ends.append(state.vy)
         return abs(ends[0] / ends[1] - 1.0)
 
@@ -97,7 +97,7 @@ def test_a_payload_moves_the_static_loads_as_levers_say_and_stays_on_the_axles()
     full = MultiBodyPlant(loaded(empty.vehicle, 80.0, forward=-0.6, up=0.1))
     loads = []
     for plant in (empty, full):
-        state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+        state = rolling(plant, 0.0)
         loads.append(plant.evaluate([state], np.zeros((1, 5)))[1][0, 2])
     more = loads[1] - loads[0]
     a = empty.parameters.a

@@ -51,6 +51,11 @@ def vehicle(name):
     return PUBLISHED[name] if name in PUBLISHED else shipped(name)
 
 
+def driven(car):
+    """What a driver has of a car."""
+    return car_of(MultiBodyPlant(vehicle(car)))
+
+
 @cache
 def moderate(car, case):
     return drive(
@@ -62,7 +67,7 @@ def moderate(car, case):
 
 def among_cones(car, case):
     """A moderate trip, its manoeuvre, and the car's width [m]."""
-    width = car_of(MultiBodyPlant(vehicle(car))).width
+    width = driven(car).width
     return moderate(car, case), manoeuvre_from_config(MODERATE[case]), width
 
 
@@ -97,7 +102,7 @@ def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(
         MANOEUVRES
     )
-    car = car_of(MultiBodyPlant(vehicle("bmw_545i")))
+    car = driven("bmw_545i")
     surface = surface_from_config("dry")
     sides = {
         manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"]
@@ -125,7 +130,7 @@ def test_moderate_severity_is_completed_by_every_car(car, case):
     assert math.degrees(flags.largest_sideslip) < 6.0
     assert motion.vx[0] > 5.0  # rolls from the first sample on
     # The circuit's banked corner takes a little more than a level road's grip.
-    grip = car_of(MultiBodyPlant(vehicle(car))).grip
+    grip = driven(car).grip
     assert 0.25 * grip < flags.largest_ay < 1.1 * grip
     assert_finite(motion)
 
@@ -191,9 +196,7 @@ def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
     ay = side * motion.ay[turned]
     slope = np.polyfit(times(trip)[turned], ay, 1)[0]
     assert slope == pytest.approx(0.4, rel=0.1)
-    assert ay[-50:].mean() == pytest.approx(
-        0.8 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06
-    )
+    assert ay[-50:].mean() == pytest.approx(0.8 * driven(car).grip, rel=0.06)
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -205,9 +208,7 @@ def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand
     assert motion.ax[braking].mean() == pytest.approx(-3.0, abs=0.5)
     assert (side * motion.yaw_rate[braking] > 0.05).all()
     at_brakes = np.searchsorted(times(trip), trip.drawn["brakes_at"])
-    assert side * motion.ay[at_brakes] == pytest.approx(
-        0.5 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.06
-    )
+    assert side * motion.ay[at_brakes] == pytest.approx(0.5 * driven(car).grip, rel=0.06)
     assert np.ptp(motion.steer[at_brakes + 5 :]) < 1e-9  # the steering is held
     last_moving = np.flatnonzero(np.hypot(motion.vx, motion.vy) > 0.01)[-1]
     assert (len(motion) - 1 - last_moving) / 100.0 == pytest.approx(1.0, abs=0.05)
@@ -235,9 +236,7 @@ def test_j_turn_reaches_the_configured_steady_turn(car):
     drawn = trip.drawn
     last = slice(-100, None)
     assert np.ptp(motion.yaw_rate[last]) < 0.01 * abs(motion.yaw_rate[-1]) + 2e-3  # steady
-    assert side_of(trip) * motion.ay[last].mean() == pytest.approx(
-        0.6 * car_of(MultiBodyPlant(vehicle(car))).grip, rel=0.05
-    )
+    assert side_of(trip) * motion.ay[last].mean() == pytest.approx(0.6 * driven(car).grip, rel=0.05)
     assert motion.steer[-1] == pytest.approx(drawn["steer"], abs=1e-4)
     before = times(trip) < drawn["begin"] - 0.05
     assert np.abs(motion.steer[before]).max() < 1e-6
@@ -254,7 +253,7 @@ def test_spiral_tightens_slowly_to_both_sides_in_turn():
         times(trip) < drawn["begin"] + drawn["ramp_time"]
     )
     assert (np.diff(side * motion.yaw_rate[ramp]) > 0.0).all()
-    grip = car_of(MultiBodyPlant(vehicle("bmw_545i"))).grip
+    grip = driven("bmw_545i").grip
     assert (side * motion.ay).max() == pytest.approx(0.8 * grip, rel=0.1)
     assert (side * motion.ay).min() == pytest.approx(-0.8 * grip, rel=0.1)
     assert np.argmax(side * motion.ay) < np.argmin(side * motion.ay)

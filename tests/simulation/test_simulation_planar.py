@@ -177,7 +177,6 @@ def test_wheel_loads_carry_the_weight_and_a_fixed_step_agrees_with_solve_ivp():
     )
     axles = CAR.cg_to_front_axle * load[:2].sum() - CAR.cg_to_rear_axle * load[2:].sum()
     assert -axles == pytest.approx(CAR.mass * CAR.cg_height * 2.0)
-    plant = PlanarPlant(CAR)
     inputs = Inputs(steer=0.45, current=45.0)
     start = plant.initial_state(2.0)
     reference = solve_ivp(
@@ -229,16 +228,12 @@ def test_car_at_rest_stays_there_and_slippery_floors_lower_accelerations():
     np.testing.assert_array_equal(state[:STEER], 0.0)
     assert coasted(CAR, 2.0, current=0.5 * CAR.coulomb_torque / CAR.torque_constant)[VX] < 0.06
     assert coasted(CAR, 2.0, current=30.0)[VX] > 2.0
-    floors = {
-        name: drive_freely(
-            PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]
-        ).motion
+    dry, wet = (
+        drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]).motion
         for name in ("dry", "wet")
-    }
-    reached = {
-        name: np.quantile(np.hypot(motion.ax, motion.ay), 0.95) for name, motion in floors.items()
-    }
-    assert reached["wet"] / reached["dry"] == pytest.approx(0.7, rel=0.05)
+    )
+    dry, wet = (np.quantile(np.hypot(motion.ax, motion.ay), 0.95) for motion in (dry, wet))
+    assert wet / dry == pytest.approx(0.7, rel=0.05)
 
 
 def test_states_stay_finite_under_random_inputs():
@@ -319,12 +314,8 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
 
 
 def test_every_value_says_where_it_comes_from_or_that_it_is_assumed():
-    lines = (
-        (CONF / "vehicle" / "f1tenth.yaml")
-        .read_text(encoding="utf-8")
-        .partition("parameters:\n")[2]
-        .splitlines()
-    )
+    text = (CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8")
+    lines = text.partition("parameters:\n")[2].splitlines()
     assert len(lines) == len(PARAMETERS)
     assert all(re.search(r"#.*(assumed|\] \[\d\]|see \w+)", line) for line in lines)
 

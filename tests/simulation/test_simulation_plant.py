@@ -11,7 +11,7 @@ from types import FunctionType
 
 import numpy as np
 import pytest
-from cars import ALL, shipped
+from cars import ALL, inputs_of, rolling, shipped
 from numba.core.dispatcher import Dispatcher
 from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
@@ -179,10 +179,6 @@ def disturbed(plant, generator, speed=25.0):
     return values + 0.02 * generator.standard_normal(29) * np.maximum(np.abs(values), 0.1)
 
 
-def inputs_of(steering=0.0, acceleration=0.0, moment=0.0, along=0.0, across=0.0):
-    return np.array([steering, acceleration, moment, along, across])
-
-
 def drive(plant, state, command, seconds, rate_hz=100.0, friction=1.0):
     """What follows from inputs command(time, state), held between samples."""
     states = []
@@ -211,7 +207,7 @@ def spins(time, state):
 @pytest.fixture(scope="module")
 def spin():
     plant = MultiBodyPlant(CORVETTE)
-    return drive(plant, plant.initial_state(0.0, 0.0, 0.0, 40.0), spins, 12.0)
+    return drive(plant, rolling(plant, 40.0), spins, 12.0)
 
 
 def test_published_derivatives_are_reproduced():
@@ -236,7 +232,7 @@ def test_equations_are_the_librarys_bit_by_bit(vehicle):
     generator = np.random.default_rng(0)
     parameters = TwoTyres(vehicle)
     assert (
-        plant.initial_state(0.0, 0.0, 0.0, 0.0).values[[16, 21]].tolist()
+        rolling(plant, 0.0).values[[16, 21]].tolist()
         == np.array(init_mb([0.0] * 7, parameters))[[16, 21]].tolist()
     )
     for _ in range(200):
@@ -267,19 +263,19 @@ def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle):
 def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_below():
     plant = MultiBodyPlant(LOWERED)
     for speed in (1.02 * SMALLEST_WHEEL_VELOCITY, 2.0 * SMALLEST_WHEEL_VELOCITY):
-        state = plant.initial_state(0.0, 0.0, 0.0, speed).values
+        state = rolling(plant, speed).values
         state[FIRST_WHEEL] *= 0.98
         expected = vehicle_dynamics_mb(state.tolist(), [0.0, 0.0], library_parameters(LOWERED))
         assert derivatives_of(state.tolist(), [0.0, 0.0], LOWERED) == expected
     at_limit = []
     for speed in (0.999999 * SMALLEST_WHEEL_VELOCITY, 1.000001 * SMALLEST_WHEEL_VELOCITY):
-        state = plant.initial_state(0.0, 0.0, 0.0, speed).values
+        state = rolling(plant, speed).values
         state[[FIRST_WHEEL, VY, YAW_RATE]] += 0.01, 0.02, 0.02
         at_limit.append(derivatives_of(state.tolist(), [0.0, 0.0], LOWERED))
     np.testing.assert_allclose(
         at_limit[0], at_limit[1], rtol=1e-3, atol=1e-3
     )  # no step at the limit
-    creeping = plant.initial_state(0.0, 0.0, 0.0, 1e-6).values
+    creeping = rolling(plant, 1e-6).values
     assert np.isfinite(derivatives_of(creeping.tolist(), [0.0, 0.0], LOWERED)).all()
 
 
@@ -287,7 +283,7 @@ def test_fixed_step_agrees_with_solve_ivp():
     plant = MultiBodyPlant(LOWERED)
     inputs = inputs_of(0.04, -2.0)
     parameters = library_parameters(LOWERED)
-    start = plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    start = rolling(plant, 30.0)
 
     def right_hand_side(_, state):
         return vehicle_dynamics_mb(state.tolist(), inputs[:2].tolist(), parameters)
@@ -308,7 +304,7 @@ def turn_left(speed, steer, seconds, vehicle=LOWERED):
             np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * (speed - state.vx) + 0.8
         )
 
-    return drive(plant, plant.initial_state(0.0, 0.0, 0.0, speed), hold, seconds)[0]
+    return drive(plant, rolling(plant, speed), hold, seconds)[0]
 
 
 def test_left_turn_and_braking_have_the_signs_of_iso_8855():
@@ -324,7 +320,7 @@ def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     plant = MultiBodyPlant(LOWERED)
     motion, _ = drive(
         plant,
-        plant.initial_state(0.0, 0.0, 0.0, 30.0),
+        rolling(plant, 30.0),
         lambda time, state: inputs_of(acceleration=-5.0),
         1.0,
     )
@@ -347,9 +343,7 @@ def velocities_and_rates(motion):
 
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
-    motion, states = drive(
-        plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0
-    )
+    motion, states = drive(plant, rolling(plant, 14.0), lane_change, 5.5, rate_hz=1000.0)
     assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
     assert motion.vx[-1] == 0.0
     for velocity, rate in velocities_and_rates(motion):
@@ -378,7 +372,7 @@ def test_tyre_forces_account_for_all_accelerations(moment):
     def command(time, state):
         return inputs_of(20.0 * (0.05 * math.sin(3.0 * time) - state.steer), -1.0, moment, *slope)
 
-    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), command, 2.0, rate_hz)
+    motion, states = drive(plant, rolling(plant, 30.0), command, 2.0, rate_hz)
     values = np.array([state.values for state in states])
     change = ((values[2:] - values[:-2]) / (2.0 / rate_hz))[
         100:
@@ -406,7 +400,7 @@ def test_tyre_forces_account_for_all_accelerations(moment):
 def test_yaw_moment_turns_left_and_is_limited_by_the_brakes_of_a_side():
     plant = MultiBodyPlant(FERRARI)
     p = plant.parameters
-    state = plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    state = rolling(plant, 30.0)
     inputs = np.array([inputs_of(moment=moment) for moment in (0.0, 900.0, 1e6)])
     without, with_moment, too_much = plant.motion([state] * 3, inputs, 100.0).ax
     arm = 0.25 * (p.T_f + p.T_r)
@@ -427,7 +421,7 @@ def test_bank_pulls_all_masses_equally_and_half_friction_halves_grip():
     assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
     motion, states = drive(
         plant,
-        plant.initial_state(0.0, 0.0, 0.0, 20.0),
+        rolling(plant, 20.0),
         lambda t, s: inputs_of(across=across),
         1.0,
         friction=1e-3,
@@ -456,7 +450,7 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     plant = MultiBodyPlant(FERRARI)
     along = road_gravity(bank=0.0, grade=0.1)[0]
     assert along > 0.0  # downhill
-    state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    state = rolling(plant, 0.0)
     stopped = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
     assert stopped.is_standing
     rolls = plant.advance(state, inputs_of(along=along), 1000)
@@ -469,7 +463,7 @@ def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     plant = MultiBodyPlant(TRUCK)
     motion, states = drive(
         plant,
-        plant.initial_state(0.0, 0.0, 0.0, 12.5),
+        rolling(plant, 12.5),
         lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5),
         12.0,
     )
@@ -491,9 +485,7 @@ def test_regimes_join_without_jumps_that_matter():
     def stop_and_go(time, state):
         return inputs_of(10.0 * (0.15 * math.sin(time) - state.steer), -2.5 if time < 3.0 else 2.0)
 
-    motion, states = drive(
-        plant, plant.initial_state(0.0, 0.0, 0.0, 5.0), stop_and_go, 6.0, rate_hz=1000.0
-    )
+    motion, states = drive(plant, rolling(plant, 5.0), stop_and_go, 6.0, rate_hz=1000.0)
     regimes = np.array([state.regime for state in states])
     joins = np.flatnonzero(np.diff(regimes)) + 1
     assert regimes[joins].tolist() == [Regime.SLOW, Regime.ROLLING]
@@ -545,7 +537,7 @@ def test_rollovers_and_non_finite_states_are_errors():
         turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
     assert raised.value.exit_code == 3
     plant = MultiBodyPlant(LOWERED)
-    state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    state = rolling(plant, 20.0)
     state.values[VY] = np.nan
     with pytest.raises(SimulationError):
         plant.advance(state, inputs_of(), 1)
@@ -556,7 +548,7 @@ def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
     p = plant.parameters
     motion, _ = drive(
         plant,
-        plant.initial_state(0.0, 0.0, 0.0, 20.0),
+        rolling(plant, 20.0),
         lambda t, s: inputs_of(0.3 if t < 0.3 else 0.0, 7.0),
         3.0,
     )
@@ -575,7 +567,7 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
     for speed in (0.0, 0.05, 0.9, 1.0, 1.1, 1.3, 2.0, 5.0, 15.0, 40.0, 70.0):
         for acceleration in (-20.0, 0.0, 5.0):
             for steering, friction in ((0.0, 1.0), (0.3, 0.3)):
-                state = plant.initial_state(0.0, 0.0, 0.0, speed)
+                state = rolling(plant, speed)
                 state = plant.advance(
                     state, inputs_of(steering, acceleration, 500.0), 600, friction
                 )
@@ -604,7 +596,7 @@ def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
 
 def test_no_kind_of_array_is_compiled_for_twice():
     plant = MultiBodyPlant(FERRARI)
-    state = MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
+    state = rolling(MultiBodyPlant(FERRARI), 20.0)
     read_only = np.broadcast_to(inputs_of(), (3, 5))
     columns = np.zeros((3, 10), order="F")[:, ::2]
     for inputs in (read_only, columns, columns.tolist()):

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from refusals import refusal
 from scipy import signal, stats
+from scipy.spatial.transform import Rotation
 
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
@@ -315,7 +316,7 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
 
     def at(s):
         yaw = -0.4 / 1.1 * math.cos(1.1 * s)
-        return _turn_z(yaw) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s))
+        return _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s), yaw)
 
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
     np.testing.assert_allclose(rates[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
@@ -326,7 +327,7 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
     turned = measure(
         motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0
     )
-    axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
+    axes = _rotation(0.1, -0.05, 0.2)
     for names, third in (
         (("roll_rate", "pitch_rate", "yaw_rate"), None),
         (("ax", "ay"), specific_force(motion, Tilt())[2]),
@@ -357,12 +358,12 @@ def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
     bare = measure(motion, only(tilt=levels.tilt), 0)
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
     place = lambda s: (  # noqa: E731
-        _turn_z(yaw(s)) @ _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s)) @ lever
+        _rotation(0.05 * math.sin(1.3 * s), 0.02 * math.cos(0.7 * s), yaw(s)) @ lever
     )
     for k in (100, 321, 1500):
         t = k / 100.0
         h = 1e-3
-        axes = _turn_z(yaw(t)) @ _rotation(motion.roll[k], motion.pitch[k])
+        axes = _rotation(motion.roll[k], motion.pitch[k], yaw(t))
         expected = axes.T @ (place(t + h) - 2.0 * place(t) + place(t - h)) / h**2
         np.testing.assert_allclose(
             [channels["ax"][k] - bare["ax"][k], channels["ay"][k] - bare["ay"][k]],
@@ -584,8 +585,7 @@ def test_noise_density_is_measured_despite_resonance_and_jolts():
     assert noise_density(shaken, 100.0) == pytest.approx(0.02, rel=0.05)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_reading_a_simulated_race_car_gives_its_levels_back(seed):
+def test_reading_a_simulated_race_car_gives_its_levels_back():
     # 25 minutes are 250 correlation times of ay's drift: 5 % of its deviation. Its time, where the
     # correlation falls to 1/e, is less well known, and the reference's own slow errors blur all
     # that is slow.
@@ -595,7 +595,7 @@ def test_reading_a_simulated_race_car_gives_its_levels_back(seed):
         ax=replace(race.ax, drift=0.1, drift_time=2.0),
         ay=replace(race.ay, drift=0.2, drift_time=6.0),
     )
-    levels_read = read_off(measure(swerving(1500.0), levels, seed), 100.0)
+    levels_read = read_off(measure(swerving(1500.0), levels, 0), 100.0)
     for sensor in ("ax", "ay"):
         for kind, rel in (("noise", 0.05), ("delay", 0.2), ("drift", 0.2), ("drift_time", 0.4)):
             assert levels_read[f"{sensor}.{kind}"] == pytest.approx(
@@ -634,33 +634,9 @@ def test_race_levels_are_those_of_the_ferrari_recording(data_root):
         assert level == pytest.approx(value, rel=0.03), name  # the levels are rounded
 
 
-def _turn_z(angle):
-    return np.array(
-        [
-            [math.cos(angle), -math.sin(angle), 0.0],
-            [math.sin(angle), math.cos(angle), 0.0],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def _rotation(roll, pitch):
-    """Ry(pitch) Rx(roll): the axes of what is pitched, then rolled, as columns."""
-    about_y = np.array(
-        [
-            [math.cos(pitch), 0.0, math.sin(pitch)],
-            [0.0, 1.0, 0.0],
-            [-math.sin(pitch), 0.0, math.cos(pitch)],
-        ]
-    )
-    about_x = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, math.cos(roll), -math.sin(roll)],
-            [0.0, math.sin(roll), math.cos(roll)],
-        ]
-    )
-    return about_y @ about_x
+def _rotation(roll, pitch, yaw=0.0):
+    """Rz(yaw) Ry(pitch) Rx(roll): the axes of what is turned, pitched, then rolled, as columns."""
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
 
 
 def _alone(level):

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cars import ALL, FOLDER, OURS, plant_of
+from cars import ALL, FOLDER, OURS, inputs_of, plant_of, rolling
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
@@ -34,19 +34,13 @@ def ramp_of(name):
 
 def steady_turn(plant, speed, steer, seconds=8.0):
     """The last moment of a turn at constant speed and steering angle, as a motion of one sample."""
-    state = plant.initial_state(0.0, 0.0, 0.0, speed)
+    state = rolling(plant, speed)
     integral = 0.0
     for _ in range(round(100 * seconds)):
         error = speed - state.vx
         integral += 0.01 * error
-        inputs = np.array(
-            [
-                np.clip(10.0 * (steer - state.steer), -0.02, 0.02),
-                3.0 * error + 2.0 * integral,
-                0.0,
-                0.0,
-                0.0,
-            ]
+        inputs = inputs_of(
+            np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * error + 2.0 * integral
         )
         state = plant.advance(state, inputs, 10)
     return plant.motion([state], inputs[None], 100.0)
@@ -64,7 +58,7 @@ def cornering_stiffnesses(plant):
 def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_tracks(name, speed):
     plant = plant_of(name)
     p = plant.parameters
-    (front, rear) = cornering_stiffnesses(plant_of(name))
+    (front, rear) = cornering_stiffnesses(plant)
     length = p.a + p.b
     ay = 0.7
     understeer = p.m / length * (p.b / front - p.a / rear)
@@ -149,7 +143,7 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
 def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
     plant = plant_of(name)
     p = plant.parameters
-    at_rest = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    at_rest = rolling(plant, 0.0)
     assert p.m_s + p.m_uf + p.m_ur == pytest.approx(p.m, rel=1e-4)
     disturbed = at_rest.values.copy()
     disturbed[[HEAVE, PITCH, ROLL, ROLL_RATE]] += 0.02, 0.01, 0.02, 0.1
@@ -223,9 +217,7 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
 def test_overrides_reach_the_plant_and_cars_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
-        after = plant.advance(
-            plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0]), 2000
-        )
+        after = plant.advance(rolling(plant, 30.0), inputs_of(acceleration=-3.0), 2000)
         assert abs(after.y) < 1e-12
         assert abs(after.yaw) < 1e-12
     slippery = Vehicle(
@@ -275,7 +267,7 @@ def sine_with_dwell(plant, amplitude, control, friction):
     """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that
     the control asked for.
     """
-    state = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6)
+    state = rolling(plant, 80.0 / 3.6)
     doing = StabilityState()
     largest = 0.0
     moments = []
@@ -295,7 +287,7 @@ def sine_with_dwell(plant, amplitude, control, friction):
         moments.append(doing.moment)
         state = plant.advance(
             state,
-            np.array([30.0 * (target - state.steer), 0.0, doing.moment, 0.0, 0.0]),
+            inputs_of(30.0 * (target - state.steer), moment=doing.moment),
             10,
             friction,
         )
@@ -318,9 +310,9 @@ def test_sideslip_stays_lower_with_control_than_without(name, friction):
 @pytest.mark.parametrize("name", OURS)
 def test_largest_moment_is_within_the_braking_limit_of_both_sides(name):
     plant = plant_of(name)
-    rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    state = rolling(plant, 20.0)
     forces = plant.motion(
-        [rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0
+        [state] * 2, np.array([inputs_of(moment=moment) for moment in (1e9, -1e9)]), 100.0
     ).tyre_fx
     arm = 0.25 * (plant.parameters.T_f + plant.parameters.T_r)
     max_moment = (
@@ -338,42 +330,22 @@ def test_control_leaves_calm_driving_alone(name):
     assert not moments.any()
 
 
+def controlled(reference, active=False, step=0.01, steer=0.0, vx=20.0, yaw_rate=0.0, **options):
+    """State of the control a step after one with this reference."""
+    state = StabilityState(reference=reference, active=active)
+    return CONTROL.step(state, step, steer=steer, vx=vx, yaw_rate=yaw_rate, **options)
+
+
 def test_moment_turns_the_car_towards_the_reference_with_hysteresis_and_a_limit():
-    turns_too_much = CONTROL.step(
-        StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.5
-    )
-    turns_too_little = CONTROL.step(
-        StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.0
-    )
-    assert turns_too_much.moment < 0.0 < turns_too_little.moment
-    mirrored = CONTROL.step(
-        StabilityState(reference=-0.2), 0.01, steer=-0.025, vx=20.0, yaw_rate=-0.5
-    )
-    assert mirrored.moment == -turns_too_much.moment
-    between = StabilityState(reference=0.05, active=False)
-    assert not CONTROL.step(between, 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
-    assert CONTROL.step(
-        StabilityState(reference=0.05, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0
-    ).active
-    assert not CONTROL.step(
-        StabilityState(reference=0.02, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0
-    ).active
-    assert (
-        CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0).moment
-        == -3000.0
-    )
-    assert (
-        CONTROL.step(
-            StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0, friction=0.5
-        ).moment
-        == -1500.0
-    )
-    assert (
-        CONTROL.step(
-            StabilityState(reference=0.0, active=True), 0.01, steer=0.3, vx=3.0, yaw_rate=0.0
-        ).moment
-        == 0.0
-    )
+    turns_too_much = controlled(0.2, steer=0.025, yaw_rate=0.5).moment
+    assert turns_too_much < 0.0 < controlled(0.2, steer=0.025).moment
+    assert controlled(-0.2, steer=-0.025, yaw_rate=-0.5).moment == -turns_too_much
+    assert not controlled(0.05, step=1e-6).active
+    assert controlled(0.05, active=True, step=1e-6).active
+    assert not controlled(0.02, active=True, step=1e-6).active
+    assert controlled(0.0, yaw_rate=2.0).moment == -3000.0
+    assert controlled(0.0, yaw_rate=2.0, friction=0.5).moment == -1500.0
+    assert controlled(0.0, active=True, steer=0.3, vx=3.0).moment == 0.0
 
 
 def test_reference_is_the_linear_single_track_within_friction():

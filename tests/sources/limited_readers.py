@@ -24,7 +24,7 @@ def hangs(file):
 
 
 def takes_memory(file):
-    return {"vx": np.ones(250_000_000)}, {}
+    return {"vx": np.ones(100_000_000)}, {}
 
 
 def crashes(file):

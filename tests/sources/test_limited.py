@@ -52,7 +52,7 @@ def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
     file, monkeypatch, function, kind, message_part
 ):
     monkeypatch.setattr("vehest.sources.limited.SECONDS", 1.0)
-    with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
+    with use_limits(Limits(memory=600_000_000)), pytest.raises(VehestError) as error:
         read_limited(f"limited_readers:{function}", file)
     assert type(error.value) is kind
     message = str(error.value)
@@ -71,7 +71,7 @@ def test_of_what_was_unpacked_the_packed_size_counts_towards_memory(file, tmp_pa
     with open(unpacked, "wb") as stream:
         stream.truncate(300_000_000)  # ten times as much would be enough for the reader
     reader = "limited_readers:takes_memory"
-    with use_limits(Limits(memory=1_000_000_000)):
-        assert len(read_limited(reader, unpacked).arrays["vx"]) == 250_000_000
-        with pytest.raises(DataError, match="takes more than 1000 MB of memory"):
+    with use_limits(Limits(memory=600_000_000)):
+        assert len(read_limited(reader, unpacked).arrays["vx"]) == 100_000_000
+        with pytest.raises(DataError, match="takes more than 600 MB of memory"):
             read_limited(reader, unpacked, packed=file)

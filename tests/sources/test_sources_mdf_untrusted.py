@@ -155,15 +155,6 @@ def test_a_table_of_texts_is_read_where_no_sample_meets_a_text(tmp_path):
     )
 
 
-def test_a_text_that_says_not_available_is_a_missing_sample(tmp_path):
-    linear = asammdf.blocks.conversion_utils.from_dict({"a": 2.0, "b": 1.0})
-    table = {"val_0": 250.0, "text_0": b"error", "default_addr": linear}
-    raw = (np.arange(2001) % 200).astype("u1")
-    raw[70] = 250
-    vx = read_mdf(written(tmp_path / "a.mf4", raw, table))["vx"]
-    assert vx[70] == pytest.approx(0.5 * (vx[69] + vx[71]))
-
-
 @pytest.mark.parametrize("version", ["4.10", "3.30"])
 def test_a_conversion_that_leads_elsewhere_is_not_left_out(tmp_path, version):
     file = written(tmp_path / "a.mf4", conversion={"a": 2.0, "b": 1.0}, version=version)

@@ -21,6 +21,14 @@ def read(folder, **more):
     return next(open_source(dataset(folder, **more)).recordings())
 
 
+def write_rows(folder, change):
+    """Write a log whose rows are others."""
+    write_log(folder / "lap.vbo")
+    head, mark, rows = (folder / "lap.vbo").read_bytes().partition(b"[data]\r\n")
+    lines = change(rows.splitlines(keepends=True))
+    (folder / "lap.vbo").write_bytes(b"".join([head, mark, *lines]))
+
+
 def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path):
     write_log(tmp_path / "lap.vbo")
     recording = read(tmp_path)
@@ -68,19 +76,14 @@ def test_time_goes_on_past_midnight_and_a_last_row_that_is_cut_off_or_late_is_le
 def test_a_row_that_repeats_the_time_before_is_left_out_and_counted(tmp_path):
     write_log(tmp_path / "lap.vbo")
     expected = read(tmp_path)
-    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
-    lines = rows.splitlines(keepends=True)
-    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[399:]]))
+    write_rows(tmp_path, lambda lines: [*lines[:400], *lines[399:]])
     recording = read(tmp_path)
     assert recording.provenance["rows_dropped_with_repeated_times"] == 1
     assert np.array_equal(recording["ay"], expected["ay"])
 
 
 def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(tmp_path):
-    write_log(tmp_path / "lap.vbo")
-    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
-    lines = rows.splitlines(keepends=True)
-    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[650:]]))
+    write_rows(tmp_path, lambda lines: [*lines[:400], *lines[650:]])
     assert "1 gap, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
     first, second = open_source(dataset(tmp_path, max_gap=1.0)).recordings()
     assert (first.id, second.id, second.provenance["run"], second.start_time) == (
@@ -103,13 +106,14 @@ def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(t
 
 
 def test_missing_samples_end_a_recording_where_max_gap_says_so(tmp_path):
-    write_log(tmp_path / "lap.vbo")
-    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
-    lines = rows.splitlines(keepends=True)
-    for k in [*range(200, 203), *range(400, 500)]:
-        cells = rows.splitlines()[k].split(b" ")
-        lines[k] = b" ".join([*cells[:2], *[b"nan"] * (len(cells) - 3), b"\r\n"])
-    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines]))
+
+    def without_samples(lines):
+        for k in [*range(200, 203), *range(400, 500)]:
+            cells = lines[k].split(b" ")
+            lines[k] = b" ".join([*cells[:2], *[b"nan"] * (len(cells) - 3), b"\r\n"])
+        return lines
+
+    write_rows(tmp_path, without_samples)
     first, second = open_source(dataset(tmp_path, max_gap=0.5)).recordings()
     assert (len(first), len(second)) == (400, 500)
     at = np.delete(np.arange(1000), np.s_[400:500])
