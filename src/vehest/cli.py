@@ -45,13 +45,11 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Train, run and compare published estimators of a car's lateral velocity and sideslip "
-    "angle.\n\n"
-    "Options of a command are set by overrides after it: `vehest train estimator=ksnn "
-    "estimator.n_local=3 seed=7`.",
+    help="Train, run and compare published estimators of a car's lateral velocity and "
+    "sideslip angle.\n\nOptions of a command are set by overrides after it: `vehest train "
+    "estimator=ksnn estimator.n_local=3 seed=7`.",
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable "
-    "data, 4 something is missing, "
-    "5 some jobs failed, 130 or 143 stopped by a signal.",
+    "data, 4 something is missing, 5 some jobs failed, 130 or 143 stopped by a signal.",
 )
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
@@ -125,10 +123,9 @@ Address = Annotated[
     str | None,
     typer.Option(
         "--address",
-        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is "
-        "part of. "
-        "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: "
-        "local, to try it here.",
+        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine "
+        "is part of. By default RAY_ADDRESS, else a Ray of its own on this machine. With "
+        "--launcher slurm: local, to try it here.",
         show_default=False,
         rich_help_panel=CLUSTER,
     ),
@@ -138,8 +135,7 @@ Slurm = Annotated[
     typer.Option(
         "--slurm",
         help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, "
-        "constraint, minutes (60), memory_gb (2). "
-        "Repeatable.",
+        "constraint, minutes (60), memory_gb (2). Repeatable.",
         show_default=False,
         rich_help_panel=CLUSTER,
     ),
@@ -786,9 +782,8 @@ def compare(
             "--column",
             metavar="QUANTITY=COLUMN",
             help="Column of time, vy or sideslip in a table of another tool, such as "
-            "sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
-            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; "
-            "repeatable.",
+            "sideslip=Beta_CarMaker or sideslip=-Beta:deg: a minus where it counts the other "
+            "way than ISO 8855, :UNIT where the name has none; repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -906,8 +901,7 @@ def report(
         typer.Option(
             "--check",
             help="Draw nothing; list published results in ./results, of all or the named studies, "
-            "that differ from today's code, "
-            "configuration and data.",
+            "that differ from today's code, configuration and data.",
         ),
     ] = False,
     dry_run: DryRun = False,

@@ -193,8 +193,7 @@ class Protocol:
         if self.initial_state:
             words += (
                 " Estimates start at the reference state (forward and lateral velocity, yaw rate) "
-                "of the first sample of each "
-                f"{self.piece}, as far as the method has these states."
+                f"of the first sample of each {self.piece}, as far as the method has these states."
             )
         return words
 
@@ -310,8 +309,7 @@ def sequences(
     if not pieces:
         raise DataError(
             f"none of {', '.join(span.describe() for span in spans)} lasts as long as a sequence "
-            f"of {protocol.sequence_seconds:g} s; "
-            f"set evaluation.sequence_seconds lower"
+            f"of {protocol.sequence_seconds:g} s; set evaluation.sequence_seconds lower"
         )
     return pieces
 
@@ -335,8 +333,7 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
         if channel not in reference or np.isnan(reference[channel][first]):
             raise DataError(
                 f"recording '{reference.id}' has no '{channel}' at {reference.time[first]:.12g} s "
-                "to start estimates from; "
-                f"set evaluation.initial_state=false"
+                "to start estimates from; set evaluation.initial_state=false"
             )
         state[name] = float(reference[channel][first])
     return state

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 PATENT_NOTE = (
     "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product "
-    "may need their licence; "
-    "the licence of this software grants none."
+    "may need their licence; the licence of this software grants none."
 )
 """What every report with a KS-NN ends with."""
 

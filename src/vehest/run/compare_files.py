@@ -138,8 +138,7 @@ def compare_files(
     of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
         f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car "
-        "is slower at "
-        f"{100 * comparison['share_below_min_speed']:.1f} % of the samples"
+        f"is slower at {100 * comparison['share_below_min_speed']:.1f} % of the samples"
     )
     return comparison | {"findings": findings}, [
         TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
@@ -323,8 +322,7 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
         )
         raise DataError(
             f"{ranges}: less than {MIN_COMMON_SECONDS:g} s in common; are the clocks the same? "
-            "(--shift "
-            "SECONDS or auto moves tables of other tools)"
+            "(--shift SECONDS or auto moves tables of other tools)"
         )
     if reference.rate_hz < MIN_RATE_HZ:
         raise DataError(

@@ -180,8 +180,7 @@ class Evaluation:
                 if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
                         f"test set '{name}' shares samples with the ranges that {model.label} was "
-                        "trained or chosen on "
-                        f"({learnt.describe()}); test it on something else"
+                        f"trained or chosen on ({learnt.describe()}); test it on something else"
                     )
         inputs = {"model": model.digest} | (
             {} if calibration is None else {"calibration": calibration.digest}

@@ -242,8 +242,7 @@ def summary_of_leaderboard(
         if share > 0:
             notes.append(
                 f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the "
-                "samples, where the car is slower than "
-                f"{rows['min_sideslip_speed'].iloc[0]}"
+                f"samples, where the car is slower than {rows['min_sideslip_speed'].iloc[0]}"
             )
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(

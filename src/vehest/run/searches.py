@@ -162,8 +162,7 @@ def remarks_on(
                 if is_searched and settings_to_compare(config) != settings_to_compare(best):
                     remarks[
                         f"part '{name}' does not use what the search '{chosen.search}' chose by "
-                        f"{chosen.metric} "
-                        f"on validation: {chosen.options}"
+                        f"{chosen.metric} on validation: {chosen.options}"
                     ] = None
     return list(remarks)
 
