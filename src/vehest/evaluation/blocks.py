@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.text_files import number_in, read_rows
-from vehest.evaluation.metrics import Scored
+from vehest.evaluation.metrics import Scored, half_turned
 from vehest.evaluation.significance import root_intervals, unexplained_interval
 
 SEGMENT_SECONDS = 1.0
@@ -65,7 +65,7 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
     columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
     for position, part in enumerate(parts):
         starts = np.arange(0, len(part.time), steps)
-        turn = np.remainder(part.sideslip - part.sideslip_ref + math.pi, 2.0 * math.pi) - math.pi
+        turn = half_turned(part.sideslip - part.sideslip_ref)
         error = part.vy - part.vy_ref
         summed = {
             "samples": np.ones_like(error),
