@@ -136,7 +136,7 @@ class Document:
 
 
 def write_documents(
-    documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()
+    documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table]
 ) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by
     side.
@@ -198,7 +198,6 @@ def write_document(
     ValueError
         A table of ``on_page`` has the name of another.
     """
-    numbers = _numbers(document)
     images: dict[str, bytes] = {}
     for table, frame in document.data.items():
         _write_table(folder, table, frame)
@@ -210,9 +209,7 @@ def write_document(
             (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
             images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    (folder / f"{name}.md").write_bytes(
-        _markdown(document, numbers).encode("utf-8", "backslashreplace")
-    )
+    (folder / f"{name}.md").write_bytes(_markdown(document).encode("utf-8", "backslashreplace"))
     if page:
         page_document = replace(document, blocks=[*document.blocks, *on_page])
         (folder / f"{name}.html").write_bytes(page_of(page_document, images))
@@ -231,7 +228,7 @@ def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> by
     drawn = images or {
         block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
     }
-    return _page(document, _numbers(document), drawn).encode("utf-8", "backslashreplace")
+    return _page(document, drawn).encode("utf-8", "backslashreplace")
 
 
 def as_text(name: str) -> str:
@@ -320,11 +317,8 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
     """
     from PIL import Image
 
-    buffer = io.BytesIO()
     small = io.BytesIO()
-    with paper_style():
-        figure.savefig(buffer, format="png", dpi=dpi)
-    with Image.open(buffer) as image:
+    with Image.open(io.BytesIO(_saved(figure, "png", dpi=dpi))) as image:
         quantized = image.convert("RGB").quantize(
             PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
@@ -334,10 +328,7 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
 
 def pdf_of(figure: MatplotlibFigure) -> bytes:
     """A figure as PDF."""
-    buffer = io.BytesIO()
-    with paper_style():
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Creator": None})
-    return buffer.getvalue()
+    return _saved(figure, "pdf", metadata={"CreationDate": None, "Creator": None})
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:
@@ -350,10 +341,16 @@ def svg_of(figure: MatplotlibFigure) -> bytes:
             lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0]
         )
 
+    svg = _saved(figure, "svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
+    return _PATH.sub(in_hundredths, svg.decode("utf-8")).encode("utf-8")
+
+
+def _saved(figure: MatplotlibFigure, form: str, **options: Any) -> bytes:
+    """A figure as matplotlib writes it in a format."""
     buffer = io.BytesIO()
     with paper_style():
-        figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
-    return _PATH.sub(in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
+        figure.savefig(buffer, format=form, **options)
+    return buffer.getvalue()
 
 
 def _for_both_schemes(svg: bytes) -> bytes:
@@ -387,8 +384,9 @@ def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     )
 
 
-def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
+def _markdown(document: Document) -> str:
     """The report as Markdown, tables in pipes, figures as links to PNG and SVG."""
+    numbers = _numbers(document)
     parts = [f"# {as_text(document.title)}"]
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -448,13 +446,14 @@ def _spoken(caption: str) -> str:
     return re.split(r"(?<=\.)\s", plain, maxsplit=1)[0]
 
 
-def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
+def _page(document: Document, images: Mapping[str, bytes]) -> str:
     """The HTML page from its template, with style, script, figures and data inside."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markdown_it import MarkdownIt
     from markupsafe import Markup
 
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+    numbers = _numbers(document)
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
