@@ -89,9 +89,7 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
     if rows:
         lines += [
             "",
-            TerminalTable(
-                "", ("residual RMS", "before", "after", "after, without tilt", "unit"), rows
-            ),
+            TerminalTable(("residual RMS", "before", "after", "after, without tilt", "unit"), rows),
         ]
     proposal = f"to apply the corrections: '{override_of(alignment)}'"
     lines += [
@@ -226,7 +224,7 @@ def _parameters(alignment: Alignment) -> TerminalTable:
         value, sigma, low, high = (f"{factor * number:.{decimals}f}" for number in numbers)
         rows.append([parameter.name, value, sigma, f"{low} … {high}", unit])
     return TerminalTable(
-        "", ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows
+        ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows
     )
 
 

@@ -65,7 +65,7 @@ def plan_ingest(config: Config) -> StagePlan:
         Raw files are missing or the data set's configuration makes no sense.
     """
     dataset: Mapping[str, Any] = config["dataset"]
-    if missing := missing_keys(dict(dataset)):
+    if missing := missing_keys(dataset):
         raise ConfigurationError(
             f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set"
         )

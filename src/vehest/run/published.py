@@ -174,7 +174,7 @@ def in_words(verdict: Mapping[str, Any]) -> str:
 
 
 def check_published(
-    names: Sequence[str], overrides: Sequence[str] = (), messages: Messages | None = None
+    names: Sequence[str], overrides: Sequence[str], messages: Messages
 ) -> list[dict[str, Any]]:
     """Compare the recorded keys of published studies with those of today's code, configuration and
     raw files; ``messages`` name a study that takes long.
@@ -189,8 +189,8 @@ def check_published(
         Pipelines or published studies; none for all that are published.
     overrides : sequence of str
         Of where raw files come from and results go alone.
-    messages : Messages or None
-        By default nothing is printed.
+    messages : Messages
+        Prints the study that takes long.
 
     Raises
     ------
@@ -216,7 +216,6 @@ def check_published(
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    messages = messages or Messages(quiet=True)
     verdicts = []
     for study, declared_pipeline in pipelines.items():
         with messages.running("check", study):
@@ -224,9 +223,7 @@ def check_published(
     return verdicts
 
 
-def check_listed(
-    overrides: Sequence[str] = (), messages: Messages | None = None
-) -> list[dict[str, Any]]:
+def check_listed(overrides: Sequence[str], messages: Messages) -> list[dict[str, Any]]:
     """Compare all published studies as `check_published`, and those that are not up to date with
     the list of those that may be stale.
 
@@ -238,7 +235,7 @@ def check_listed(
     ----------
     overrides : sequence of str
         As of `check_published`.
-    messages : Messages or None
+    messages : Messages
         As of `check_published`.
     """
     reasons = _stale_list()

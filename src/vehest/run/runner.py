@@ -136,7 +136,7 @@ class Stages:
 
         def look(name: str) -> None:
             dataset = self.dataset_config(name, config)["dataset"]
-            if not missing_keys(dict(dataset)):  # which its ingest reports
+            if not missing_keys(dataset):  # which its ingest reports
                 open_source(dataset).inputs()
 
         for name in dataset_names(config["split"]):
