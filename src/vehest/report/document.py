@@ -572,15 +572,18 @@ def bars_of(
         ``value``, places ``at``, ``low`` and ``high`` [%], and ``cut``, of each; None for a missing
         one.
     """
-    finite = [value for value in values if math.isfinite(value)]
-    ends = [
-        high if math.isfinite(high) else value
-        for value, high in zip(values, highs, strict=True)
-        if math.isfinite(value)
-    ]
-    if not finite or max(ends) <= 0:
+    lows, highs = (
+        [end if math.isfinite(end) else value for value, end in zip(values, ends, strict=True)]
+        for ends in (lows, highs)
+    )
+    finite = sorted(value for value in values if math.isfinite(value))
+    longest = max(
+        (high for value, high in zip(values, highs, strict=True) if math.isfinite(value)),
+        default=0.0,
+    )
+    if longest <= 0:
         return [None] * len(values)
-    axis = min(max(ends), MAX_AXIS_RATIO * sorted(finite)[len(finite) // 2] or max(ends))
+    axis = min(longest, MAX_AXIS_RATIO * finite[len(finite) // 2] or longest)
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)
@@ -589,9 +592,9 @@ def bars_of(
         {
             "value": value,
             "at": place(value),
-            "low": place(low if math.isfinite(low) else value),
-            "high": place(high if math.isfinite(high) else value),
-            "cut": max(value, high if math.isfinite(high) else value) > axis * (1 + 1e-9),
+            "low": place(low),
+            "high": place(high),
+            "cut": max(value, high) > axis * (1 + 1e-9),
         }
         if math.isfinite(value)
         else None

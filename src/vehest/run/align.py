@@ -126,8 +126,9 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "cutoff_hz": alignment.settings.cutoff_at(drive.rate_hz),
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
-            {"channel": residual.channel, "unit": residual.unit}
-            | {
+            {
+                "channel": residual.channel,
+                "unit": residual.unit,
                 "rms_before": residual.rms["before"],
                 "rms_after": residual.rms["after"],
                 "rms_without_tilt": residual.rms["rest"],
