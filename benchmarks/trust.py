@@ -54,13 +54,13 @@ def compared(case: str, baseline: float, ours: float) -> dict[str, Any]:
 
 def bootstrap_row() -> dict[str, Any]:
     """Twenty candidates of three seeds against the best of them, 150 blocks drawn 10,000 times: all pairs together, and one by one."""
-    from vehest.evaluation.significance import difference_of_blocks, differences_of_blocks
+    from vehest.evaluation.significance import differences_of_blocks
 
     generator = np.random.default_rng(0)
     sizes = generator.uniform(20.0, 40.0, 150)
     sums = [sizes * generator.gamma(2.0, 1.0, (3, 150)) for _ in range(20)]
     pairs = [(sums[0], other) for other in sums[1:]]
-    apart = least(lambda: [difference_of_blocks(*pair, sizes) for pair in pairs])
+    apart = least(lambda: [differences_of_blocks([pair], sizes) for pair in pairs])
     return compared(
         "block bootstrap of 20 candidates, 10,000 draws",
         apart,

@@ -15,15 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.configuration.files import GROUPS, choices, is_file_name, pipeline_names
+from vehest.configuration.files import GROUPS, choices, files_and_overrides, pipeline_names
 from vehest.data.errors import ConfigurationError, VehestError, counted, printable
 from vehest.run.launchers.base import LAUNCHERS, RunOptions
-from vehest.run.named_files import (
-    file_words,
-    require_dataset_or_file,
-    require_paths,
-    require_pipeline,
-)
+from vehest.run.named_files import require_dataset_or_file, require_paths, require_pipeline
 from vehest.run.printing import (
     OutputClosed,
     TerminalTable,
@@ -45,13 +40,11 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Train, run and compare published estimators of a car's lateral velocity and sideslip "
-    "angle.\n\n"
-    "Options of a command are set by overrides after it: `vehest train estimator=ksnn "
-    "estimator.n_local=3 seed=7`.",
+    help="Train, run and compare published estimators of a car's lateral velocity and "
+    "sideslip angle.\n\nOptions of a command are set by overrides after it: `vehest train "
+    "estimator=ksnn estimator.n_local=3 seed=7`.",
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable "
-    "data, 4 something is missing, "
-    "5 some jobs failed, 130 or 143 stopped by a signal.",
+    "data, 4 something is missing, 5 some jobs failed, 130 or 143 stopped by a signal.",
 )
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
@@ -125,10 +118,9 @@ Address = Annotated[
     str | None,
     typer.Option(
         "--address",
-        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is "
-        "part of. "
-        "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: "
-        "local, to try it here.",
+        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine "
+        "is part of. By default RAY_ADDRESS, else a Ray of its own on this machine. With "
+        "--launcher slurm: local, to try it here.",
         show_default=False,
         rich_help_panel=CLUSTER,
     ),
@@ -138,8 +130,7 @@ Slurm = Annotated[
     typer.Option(
         "--slurm",
         help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, "
-        "constraint, minutes (60), memory_gb (2). "
-        "Repeatable.",
+        "constraint, minutes (60), memory_gb (2). Repeatable.",
         show_default=False,
         rich_help_panel=CLUSTER,
     ),
@@ -271,9 +262,7 @@ def ingest(
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
-    with open_runner(
-        config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})
-    ) as runner:
+    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), ("ingest",)) as runner:
         if download:
             download_files(config, runner.messages, dry_run=dry_run)
         artefact = runner.ingest(config)
@@ -312,9 +301,7 @@ def simulate(
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
-    with open_runner(
-        config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})
-    ) as runner:
+    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), ("ingest",)) as runner:
         artefact = runner.ingest(config)
     outcome = outcome_of(artefact)
     if not as_json:
@@ -339,9 +326,7 @@ def downsample(
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
     rate = positive_rate(config["rate_hz"], "rate_hz")
-    with open_runner(
-        config, RunOptions(force, dry_run, quiet), frozenset({"downsample"})
-    ) as runner:
+    with open_runner(config, RunOptions(force, dry_run, quiet), ("downsample",)) as runner:
         artefact = runner.downsample(runner.ingest(config), rate, config["downsample"])
     emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
 
@@ -471,8 +456,8 @@ def estimate(
     `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    logs = file_words(words[:2])[-1:]  # the recording, or what stands in its place without a model
-    require_paths([*logs, car])
+    logs, _ = files_and_overrides(words[:2])  # the recording comes last, after a model, if any
+    require_paths([*logs[-1:], car])
     from vehest.run.estimate import estimate_file
     from vehest.run.estimate_summary import summary_lines
 
@@ -524,10 +509,11 @@ def plot_drive(
     in colours of β; with a reference also estimate over reference. The course is integrated from
     u, v and the yaw rate, and drifts over minutes.
     """
-    require_paths(file_words([recording, *(words or [])]))
+    all_words = [recording, *(words or [])]
+    require_paths(files_and_overrides(all_words)[0])
     from vehest.run.plot import plot_files
 
-    emit(as_json, plot_files([recording, *(words or [])], out, start, stop))
+    emit(as_json, plot_files(all_words, out, start, stop))
 
 
 @app.command()
@@ -550,7 +536,7 @@ def identify(
     Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest
     estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
-    require_paths(file_words(words))
+    require_paths(files_and_overrides(words)[0])
     from vehest.run.identify import identify_files, in_words
 
     record = identify_files(words, out)
@@ -786,9 +772,8 @@ def compare(
             "--column",
             metavar="QUANTITY=COLUMN",
             help="Column of time, vy or sideslip in a table of another tool, such as "
-            "sideslip=Beta_CarMaker or sideslip=-Beta:deg: "
-            "a minus where it counts the other way than ISO 8855, :UNIT where the name has none; "
-            "repeatable.",
+            "sideslip=Beta_CarMaker or sideslip=-Beta:deg: a minus where it counts the other "
+            "way than ISO 8855, :UNIT where the name has none; repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -812,7 +797,7 @@ def compare(
     drive; an estimate is called best only if it is significantly below all others. A model that was
     trained on the recording is listed and left out of the verdict.
     """
-    require_paths([recording, *file_words(words or [])])
+    require_paths([recording, *files_and_overrides(words or [])[0]])
     from vehest.run.compare_files import compare_files
 
     emit(as_json, *compare_files(recording, words or [], models or [], columns or [], shift))
@@ -906,8 +891,7 @@ def report(
         typer.Option(
             "--check",
             help="Draw nothing; list published results in ./results, of all or the named studies, "
-            "that differ from today's code, "
-            "configuration and data.",
+            "that differ from today's code, configuration and data.",
         ),
     ] = False,
     dry_run: DryRun = False,
@@ -929,8 +913,7 @@ def report(
             from vehest.run.published import check_listed, check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
-        names = [word for word in words if is_file_name(word)]
-        overrides_of_check = [word for word in words if not is_file_name(word)]
+        names, overrides_of_check = files_and_overrides(words)
         verdicts = (
             check_published(names, overrides_of_check, messages)
             if names
@@ -1043,9 +1026,7 @@ def prune(
         ]
         for entry in unused
     ]
-    tables = (
-        [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if unused else []
-    )
+    tables = [TerminalTable(("cannot be reused", "size", "age", "since"), rows)] if unused else []
     emit(
         False,
         None,
@@ -1106,7 +1087,7 @@ def data_channels(as_json: AsJson = False) -> None:
     from vehest.data.channels import CHANNELS
 
     table = TerminalTable(
-        "", ("channel", "unit", "meaning"), [[c.name, c.unit, c.meaning] for c in CHANNELS.values()]
+        ("channel", "unit", "meaning"), [[c.name, c.unit, c.meaning] for c in CHANNELS.values()]
     )
     emit(
         as_json,

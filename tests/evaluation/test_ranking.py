@@ -23,7 +23,7 @@ from vehest.evaluation.blocks import (
 )
 from vehest.evaluation.metrics import Scored, accuracy
 from vehest.evaluation.ranking import rank
-from vehest.evaluation.significance import holm, root_interval, unexplained_interval
+from vehest.evaluation.significance import holm, root_intervals, unexplained_interval
 from vehest.trust.bands import effective_blocks
 
 RATE = 20.0
@@ -153,8 +153,8 @@ def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
     for _ in range(200):
         segments = segments_of([scored(coloured(generator, 6000, memory))], RATE)
         labels = block_labels(segments, segments.squared_error_vy[None])
-        interval = root_interval(
-            block_sums(segments.squared_error_vy[None], labels),
+        (interval,) = root_intervals(
+            [block_sums(segments.squared_error_vy[None], labels)],
             block_sums(segments.samples, labels),
             n_resamples=400,
         )

@@ -133,7 +133,7 @@ def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_befo
     emit(
         False,
         None,
-        [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])],
+        [TerminalTable(["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])],
     )
     out = capsys.readouterr().out
     assert _shows_only_text(out)

@@ -39,6 +39,8 @@ MANIFEST = "manifest.json"
 TIMINGS = "timings.csv"  # durations, which differ each time and are no part of the content
 FORMAT = 1
 Status = Literal["complete", "interrupted"]
+Write = Callable[[Path], Status | None]
+"""Fills an empty folder, which then becomes an artefact; ``interrupted`` if it was stopped."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,7 @@ def read_artefact(folder: Path, *, hash_files: bool = True) -> Artefact:
                 f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage "
                 f"'{manifest.stage}' again"
             )
-        if hash_files and _digest_of(folder / name, (folder / name).stat()) != output.sha256:
+        if hash_files and _digest_of(folder / name) != output.sha256:
             raise DataError(
                 f"'{folder / name}' was changed after it was made (its digest is not that in "
                 f"{MANIFEST}); remove '{folder}', and the stage '{manifest.stage}' makes it again"
@@ -238,8 +240,9 @@ def read_manifest(folder: Path) -> Manifest:
     return validated(Manifest, content, f"'{path}'")
 
 
-def _digest_of(path: Path, stat: os.stat_result) -> str:
+def _digest_of(path: Path) -> str:
     """SHA-256 of a file, computed once in a process as long as its length and time stamp stay."""
+    stat = path.stat()
     state = (stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     if _DIGESTS.get(path, (None, ""))[0] != state:
         _DIGESTS[path] = (state, sha256_of(path))
@@ -256,7 +259,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in files if file.is_file() and not file.is_symlink())
 
 
-def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
+def make(plan: StagePlan, write: Write) -> Artefact:
     """Run a stage and return its artefact.
 
     Parameters
@@ -300,7 +303,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
 
 def ensured(
     plan: StagePlan,
-    write: Callable[[Path], Status | None],
+    write: Write,
     force: bool,
     should_stop: Callable[[], bool],
     on_wait: Callable[[Waiting], None],

@@ -9,7 +9,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -534,23 +534,18 @@ def positive_rate(value: Any, name: str) -> float:
     return float(value)
 
 
-def missing_keys(config: Any, prefix: str = "") -> list[str]:
-    """Dotted keys that still hold ``???``.
+def dotted(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys of nested mappings with their values; ``prefix`` comes before each key."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
-    Parameters
-    ----------
-    config : Any
-        Plain nested values.
-    prefix : str
-        Dotted name of ``config``, ending in a dot; empty at the top.
-    """
-    if isinstance(config, dict):
-        return [
-            missing_key
-            for key, value in config.items()
-            for missing_key in missing_keys(value, f"{prefix}{key}.")
-        ]
-    return [prefix.rstrip(".")] if config == "???" else []
+
+def missing_keys(config: Mapping[str, Any]) -> list[str]:
+    """Dotted keys that still hold ``???``."""
+    return [key for key, value in dotted(config) if value == "???"]
 
 
 def _shortened(text: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "tracking")
@@ -35,6 +36,12 @@ def choices(group: str) -> list[str]:
 def is_file_name(word: str) -> bool:
     """Whether a word is no override; an existing file may have an ``=`` in its name."""
     return ("=" not in word and not word.startswith("~")) or Path(word).is_file()
+
+
+def files_and_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The words of a command line that are files, and those that are overrides."""
+    files = [word for word in words if is_file_name(word)]
+    return files, [word for word in words if word not in files]
 
 
 def find_pipeline(name: str) -> Path | None:

@@ -14,7 +14,7 @@ import scipy
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import MIN_BLOCKS, block_labels, block_sums, segments_of
-from vehest.evaluation.metrics import BoolArray, Scored
+from vehest.evaluation.metrics import BoolArray, Scored, half_turned
 from vehest.evaluation.regimes import AY_BANDS, Mask, is_long_enough, is_represented
 from vehest.trust.bands import (
     CHANNEL_LEVEL,
@@ -37,6 +37,11 @@ class Banded(NamedTuple):
     half: FloatArray  # half widths in the same unit, (N, L), of `LEVELS`
     is_scored: BoolArray  # which of all samples these are, (K,), N of them True
 
+    @property
+    def half_width_90(self) -> FloatArray:
+        """Half widths of the bands at 90 %, (N,)."""
+        return self.half[:, LEVELS.index(CHANNEL_LEVEL)]
+
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     """Errors and bands of ``vy`` [m/s], at all samples, and ``sideslip`` [deg], at those at which
@@ -57,32 +62,22 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
         ``vy`` and ``sideslip`` -> errors, (N,), half widths, (N, levels), and which samples of all
         parts these are.
     """
-    sideslip_error = np.concatenate(
-        [
-            np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-            for part in parts
-        ]
-    )
+    whole = Scored.joined(parts)
     errors = {
-        "vy": np.concatenate([part.vy - part.vy_ref for part in parts]),
-        "sideslip": np.degrees(sideslip_error),
+        "vy": whole.vy - whole.vy_ref,
+        "sideslip": np.degrees(half_turned(whole.sideslip - whole.sideslip_ref)),
     }
     scale = {"vy": 1.0, "sideslip": np.degrees(1.0)}
-    level_ratios = {
-        "vy": bands.vy.beside(CHANNEL_LEVEL),
-        "sideslip": bands.sideslip.beside(CHANNEL_LEVEL),
+    is_scored = {
+        "vy": np.ones_like(whole.is_sideslip_scored),
+        "sideslip": whole.is_sideslip_scored,
     }
-    half = {
-        name: scale[name]
-        * np.concatenate([part.bands[name] for part in parts])[:, None]
-        * level_ratios[name]
-        for name in SUFFIXES
-    }
-    is_sideslip_scored = np.concatenate([part.is_sideslip_scored for part in parts])
-    is_scored = {"vy": np.ones_like(is_sideslip_scored), "sideslip": is_sideslip_scored}
-    return {
-        name: Banded(errors[name][mask], half[name][mask], mask) for name, mask in is_scored.items()
-    }
+    banded_errors = {}
+    for name, mask in is_scored.items():
+        half_width_90 = np.concatenate([part.bands[name] for part in parts])[:, None]
+        half = scale[name] * half_width_90 * getattr(bands, name).beside(CHANNEL_LEVEL)
+        banded_errors[name] = Banded(errors[name][mask], half[mask], mask)
+    return banded_errors
 
 
 def band_figures(
@@ -116,7 +111,7 @@ def band_figures(
         if not len(errors):
             continue
         labels = np.unique(manoeuvres[is_scored], return_inverse=True)[1]
-        half_width_90 = half[:, LEVELS.index(CHANNEL_LEVEL)]
+        half_width_90 = banded_errors[name].half_width_90
         inside = np.abs(errors)[:, None] <= half
         by_block = block_sums(
             inside[:, LEVELS.index(CHANNEL_LEVEL)].astype(np.float64), labels
@@ -187,8 +182,7 @@ def figures_by_regime(
             if not is_long_enough([chosen], rate_hz):
                 continue
             errors = banded_errors[name].errors[chosen]
-            half = banded_errors[name].half[chosen]
-            half_width_90 = half[:, LEVELS.index(CHANNEL_LEVEL)]
+            half_width_90 = banded_errors[name].half_width_90[chosen]
             values = (
                 np.mean(np.abs(errors) <= half_width_90),
                 2.0 * half_width_90.mean(),

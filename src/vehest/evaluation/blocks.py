@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.text_files import number_in, read_rows
-from vehest.evaluation.metrics import Scored
-from vehest.evaluation.significance import root_interval, unexplained_interval
+from vehest.evaluation.metrics import Scored, half_turned
+from vehest.evaluation.significance import root_intervals, unexplained_interval
 
 SEGMENT_SECONDS = 1.0
 MIN_PIECES_AS_BLOCKS = 8  # ranges or sequences, from which on each is a block
@@ -65,7 +65,7 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
     columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
     for position, part in enumerate(parts):
         starts = np.arange(0, len(part.time), steps)
-        turn = np.remainder(part.sideslip - part.sideslip_ref + math.pi, 2.0 * math.pi) - math.pi
+        turn = half_turned(part.sideslip - part.sideslip_ref)
         error = part.vy - part.vy_ref
         summed = {
             "samples": np.ones_like(error),
@@ -271,10 +271,8 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
     if len(moving):
         labels = block_labels(moving, _sideslip_loss(moving)[None])
         if labels.max() + 1 >= MIN_BLOCKS:
-            sideslip = root_interval(
-                block_sums(moving.squared_error_sideslip, labels)[None],
-                block_sums(moving.sideslip_samples, labels),
-            )
+            sums = block_sums(moving.squared_error_sideslip[None], labels)
+            (sideslip,) = root_intervals([sums], block_sums(moving.sideslip_samples, labels))
             intervals["rmse_sideslip"] = (sideslip.low, sideslip.high)
             if np.array_equal(segments.sideslip_samples, segments.samples):
                 intervals["mse_sideslip"] = (sideslip.low**2, sideslip.high**2)
@@ -286,7 +284,7 @@ def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
         name: block_sums(getattr(segments, name), labels)
         for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref")
     }
-    vy = root_interval(summed["squared_error_vy"][None], sizes)
+    (vy,) = root_intervals([summed["squared_error_vy"][None]], sizes)
     intervals["rmse_vy"] = (vy.low, vy.high)
     if summed["squared_vy_ref"].sum() > 0:
         fvu = unexplained_interval(

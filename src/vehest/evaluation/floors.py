@@ -52,6 +52,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
@@ -230,7 +231,6 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
     """
     third = []
     explained = []
-    n_samples = 0
     shared_inputs = {
         name for name in ("ay", "yaw_rate") if all(name in drive.inputs for drive in drives)
     }
@@ -247,8 +247,7 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
             if parts
             else np.empty((len(third[-1]), 0))
         )
-        n_samples += len(third[-1])
-    if n_samples < MIN_SAMPLES:
+    if sum(map(len, third)) < MIN_SAMPLES:
         return None
     residuals = np.concatenate(third)
     regressors = np.concatenate(explained)
@@ -660,7 +659,7 @@ def _is_sideslip_scored(drives: Sequence[Drive]) -> BoolArray:
 def _rms(series: Sequence[FloatArray]) -> float:
     """Root mean square; NaN of nothing."""
     joined = np.concatenate(series)
-    return float(np.sqrt(np.mean(np.square(joined)))) if len(joined) else math.nan
+    return rms(joined) if len(joined) else math.nan
 
 
 def _sideslip_deviation(

@@ -56,7 +56,8 @@ def lever_arm_figures(
             return {}
     if not yaw_rates:
         return {}
-    error = np.concatenate([part.vy - part.vy_ref for part in parts])
+    whole = Scored.joined(parts)
+    error = whole.vy - whole.vy_ref
     turns = np.concatenate(yaw_rates)
     power = float(turns @ turns)
     x = float(np.clip(error @ turns / power, -MAX_LEVER_ARM, MAX_LEVER_ARM)) if power > 0.0 else 0.0

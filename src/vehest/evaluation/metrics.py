@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
 from vehest.data.derived import VelocityFromSideslip
 from vehest.data.errors import DataError
@@ -193,8 +194,7 @@ class Protocol:
         if self.initial_state:
             words += (
                 " Estimates start at the reference state (forward and lateral velocity, yaw rate) "
-                "of the first sample of each "
-                f"{self.piece}, as far as the method has these states."
+                f"of the first sample of each {self.piece}, as far as the method has these states."
             )
         return words
 
@@ -258,15 +258,19 @@ class Scored:
         """Lateral velocity and sideslip at some of the samples; without other states, covariances,
         innovations and bands.
         """
-        return Scored(
-            self.time[chosen],
-            self.vy[chosen],
-            self.vy_ref[chosen],
-            self.sideslip[chosen],
-            self.sideslip_ref[chosen],
-            self.ay[chosen],
-            self.is_sideslip_scored[chosen],
-        )
+        return Scored(*(getattr(self, name)[chosen] for name in SAMPLED))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Scored]) -> Scored:
+        """Lateral velocity and sideslip at the samples of all parts, as `at` has them."""
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in SAMPLED
+        }
+        return cls(**arrays)
+
+
+SAMPLED = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay", "is_sideslip_scored")
+"""Arrays that every `Scored` has, its first fields."""
 
 
 def sequences(
@@ -310,8 +314,7 @@ def sequences(
     if not pieces:
         raise DataError(
             f"none of {', '.join(span.describe() for span in spans)} lasts as long as a sequence "
-            f"of {protocol.sequence_seconds:g} s; "
-            f"set evaluation.sequence_seconds lower"
+            f"of {protocol.sequence_seconds:g} s; set evaluation.sequence_seconds lower"
         )
     return pieces
 
@@ -335,8 +338,7 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
         if channel not in reference or np.isnan(reference[channel][first]):
             raise DataError(
                 f"recording '{reference.id}' has no '{channel}' at {reference.time[first]:.12g} s "
-                "to start estimates from; "
-                f"set evaluation.initial_state=false"
+                "to start estimates from; set evaluation.initial_state=false"
             )
         state[name] = float(reference[channel][first])
     return state
@@ -606,29 +608,29 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and
         of innovations are there only if all parts have what they need.
     """
-    vy = np.concatenate([part.vy for part in parts])
-    vy_ref = np.concatenate([part.vy_ref for part in parts])
-    error = np.degrees(np.concatenate([part.sideslip_error for part in parts]))
-    nonlinear = np.abs(np.concatenate([part.ay for part in parts])) >= NONLINEAR_AY
-    is_scored = np.concatenate([part.is_sideslip_scored for part in parts])
-    scored = error[is_scored] if is_scored.any() else np.full(1, np.nan)
-    variance = float(np.var(vy_ref))
-    fvu = float(np.var(vy_ref - vy)) / variance if variance > 0 else float("nan")
+    whole = Scored.joined(parts)
+    error = np.degrees(whole.sideslip_error)
+    nonlinear = error[np.abs(whole.ay) >= NONLINEAR_AY]
+    scored = (
+        error[whole.is_sideslip_scored] if whole.is_sideslip_scored.any() else np.full(1, np.nan)
+    )
+    variance = float(np.var(whole.vy_ref))
+    fvu = float(np.var(whole.vy_ref - whole.vy)) / variance if variance > 0 else math.nan
     return {
-        "rmse_vy": float(np.sqrt(np.mean(np.square(vy - vy_ref)))),
+        "rmse_vy": rms(whole.vy - whole.vy_ref),
         "fvu": fvu,
         "r2": 1.0 - fvu,
-        "rmse_sideslip": float(np.sqrt(np.mean(np.square(scored)))),
+        "rmse_sideslip": rms(scored),
         "mse_sideslip": float(np.mean(np.square(error))),
-        "mse_sideslip_nonlinear": float(np.mean(np.square(error[nonlinear])))
-        if nonlinear.any()
-        else float("nan"),
+        "mse_sideslip_nonlinear": float(np.mean(np.square(nonlinear)))
+        if len(nonlinear)
+        else math.nan,
         "max_error_sideslip": float(np.abs(scored).max()),
-        "max_error_sideslip_nonlinear": float(np.abs(error[nonlinear]).max())
-        if nonlinear.any()
-        else float("nan"),
+        "max_error_sideslip_nonlinear": float(np.abs(nonlinear).max())
+        if len(nonlinear)
+        else math.nan,
         "p99_sideslip": float(np.quantile(np.abs(scored), 0.99)),
-        "share_below_min_speed": float(1.0 - is_scored.mean()),
+        "share_below_min_speed": float(1.0 - whole.is_sideslip_scored.mean()),
         **_state_accuracy(parts),
         **_consistency(parts),
     }
@@ -674,18 +676,15 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """
     common = set.intersection(*(set(part.errors) for part in parts))
     figures = {
-        f"rmse_{name}": float(
-            np.sqrt(np.mean(np.square(np.concatenate([part.errors[name] for part in parts]))))
-        )
+        f"rmse_{name}": rms(np.concatenate([part.errors[name] for part in parts]))
         for name in REFERENCES
         if name in common and name != "vy"
     }
     if common >= set(WEIGHTS):
+        squared = np.concatenate([weighted_errors(part, np.square) for part in parts])
         absolute = np.concatenate([weighted_errors(part, np.abs) for part in parts])
-        figures["mse_weighted"] = float(
-            np.mean(np.concatenate([weighted_errors(part, np.square) for part in parts]))
-        )
         figures |= {
+            "mse_weighted": float(squared.mean()),
             "mae_weighted": float(absolute.mean()),
             "ae99_weighted": float(np.quantile(absolute, 0.99)),
         }
@@ -791,4 +790,9 @@ def _turned(angle: FloatArray) -> FloatArray:
     """The same angle within a half turn [rad]: a car that slides backwards is not a full turn
     off.
     """
-    return np.where(np.abs(angle) > np.pi, np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi, angle)
+    return np.where(np.abs(angle) > np.pi, half_turned(angle), angle)
+
+
+def half_turned(angle: FloatArray) -> FloatArray:
+    """The same angle from -π up to π [rad]."""
+    return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -225,7 +225,7 @@ def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
     """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is
     tested.
     """
-    differences = [difference.root for difference in differences_of_blocks(pairs, sizes)]
+    differences = differences_of_blocks(pairs, sizes)
     adjusted = holm([difference.p_value for difference in differences])
     comparisons = []
     for difference, p_value in zip(differences, adjusted, strict=True):

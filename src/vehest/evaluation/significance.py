@@ -41,34 +41,18 @@ class Interval:
         return self.value - half, self.value + half
 
 
-@dataclass(frozen=True)
-class Difference:
-    """How the losses of two estimators differ."""
-
-    mean: Interval  # of their mean losses over all seeds and samples
-    median: Interval  # of the medians over seeds of their mean losses over samples
-    root: Interval  # of the roots of their mean losses (RMSE); NaN where a loss is negative
-
-
-def difference_of_blocks(
-    first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000
-) -> Difference:
-    """`differences_of_blocks` of one pair."""
-    return differences_of_blocks([(first, second)], sizes, n_resamples=n_resamples)[0]
-
-
 def differences_of_blocks(
     pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000
-) -> list[Difference]:
-    """Compare pairs of estimators on the same samples; all pairs see the same draws.
+) -> list[Interval]:
+    """Compare pairs of estimators on the same samples by the roots of their mean losses over all
+    seeds and samples, an RMSE where losses are squared errors; all pairs see the same draws.
 
     Each resample draws blocks with replacement, the same for both estimators, since what is
     difficult for one is for the other; and seeds of each estimator, independently, since they are
     different trainings. Of n blocks or seeds n - 1 are drawn, which makes the variance of a mean
-    unbiased (Rao & Wu 1988); for a median of three seeds or more all n. The resamples give the
-    standard error, Student's t the interval, with degrees of freedom from blocks and seeds by Welch
-    and Satterthwaite: with 7 sequences and 3 seeds percentiles of the resamples would be too
-    narrow.
+    unbiased (Rao & Wu 1988). The resamples give the standard error, Student's t the interval, with
+    degrees of freedom from blocks and seeds by Welch and Satterthwaite: with 7 sequences and 3
+    seeds percentiles of the resamples would be too narrow.
 
     An estimator with one seed counts as if all its trainings had that outcome. Where errors are a
     seed's own in each sequence, and common neither to an estimator's seeds nor to its sequences,
@@ -77,7 +61,7 @@ def differences_of_blocks(
     Parameters
     ----------
     pairs : Sequence[Pair]
-        Sum of the losses of each seed over each block, shape (S, B) and (S', B).
+        Sum of the losses of each seed over each block, shape (S, B) and (S', B), none negative.
     sizes : FloatArray
         Samples in each block, shape (B,).
 
@@ -94,23 +78,10 @@ def differences_of_blocks(
         raise DataError(f"there are {len(sizes)} blocks to resample, at least two are needed")
     differences = []
     for pair, drawn in zip(pairs, _resampled(pairs, sizes, n_resamples), strict=True):
-        means = [sums.sum(axis=1) / sizes.sum() for sums in pair]
-        dof = _degrees_of_freedom(pair, sizes, means)
-        with np.errstate(invalid="ignore"):
-            root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
-        differences.append(
-            Difference(
-                mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
-                median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
-                root=_interval(root, drawn[2], dof),
-            )
-        )
+        first, second = ((sums.sum(axis=1) / sizes.sum()).mean() for sums in pair)
+        value = float(np.sqrt(first) - np.sqrt(second))
+        differences.append(_interval(value, drawn, _degrees_of_freedom(pair, sizes)))
     return differences
-
-
-def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000) -> Interval:
-    """`root_intervals` of one estimator."""
-    return root_intervals([sums], sizes, n_resamples=n_resamples)[0]
 
 
 def root_intervals(
@@ -135,10 +106,8 @@ def root_intervals(
     for sums, drawn in zip(candidates, _resampled(pairs, sizes, n_resamples), strict=True):
         value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
         if value > 0:
-            dof = _degrees_of_freedom(
-                [sums, no_losses], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]
-            )
-            intervals.append(_logarithmic(value, drawn[2], dof))
+            dof = _degrees_of_freedom((sums, no_losses), sizes)
+            intervals.append(_logarithmic(value, drawn, dof))
         else:
             intervals.append(Interval(value, value, value, 1.0))
     return intervals
@@ -153,8 +122,8 @@ def unexplained_interval(
     *,
     n_resamples: int = 4000,
 ) -> Interval:
-    """The fraction of variance unexplained with its interval, as `root_interval`; all arguments are
-    sums over blocks, (B,).
+    """The fraction of variance unexplained with its interval, as `root_intervals`; all arguments
+    are sums over blocks, (B,).
 
     Parameters
     ----------
@@ -409,54 +378,41 @@ def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray
 
 
 def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> FloatArray:
-    """Differences of means, of medians over seeds, and of roots of means of each resample, (pairs,
-    3, n_resamples).
+    """Differences of the roots of mean losses of each resample, (pairs, n_resamples).
 
     Pairs of as many seeds share their draws, which are those of each pair alone.
     """
     at_once = max(DRAWN_AT_ONCE // len(sizes), 1)
-    drawn = np.empty((len(pairs), 3, n_resamples))
+    drawn = np.empty((len(pairs), n_resamples))
     for numbers in dict.fromkeys((len(first), len(second)) for first, second in pairs):
         generator = np.random.default_rng(0)
         for begin in range(0, n_resamples, at_once):
             part = slice(begin, min(begin + at_once, n_resamples))
             counts = _counts(len(sizes), part.stop - begin, generator)
             seeds = [generator.integers(number, size=(len(counts), number)) for number in numbers]
-            statistics: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+            roots: dict[tuple[int, int], FloatArray] = {}
             for position, pair in enumerate(pairs):
                 if (len(pair[0]), len(pair[1])) != numbers:
                     continue
                 for side, sums in enumerate(pair):
-                    if (id(sums), side) not in statistics:
+                    if (id(sums), side) not in roots:
                         losses = np.take_along_axis(
                             counts @ sums.T / (counts @ sizes)[:, None], seeds[side], axis=1
                         )
                         fewer = losses[:, : max(len(sums) - 1, 1)]
-                        statistics[id(sums), side] = (
-                            fewer.mean(axis=1),
-                            np.median(losses if len(sums) > 2 else fewer, axis=1),
-                        )
-                (first, first_median), (second, second_median) = (
-                    statistics[id(sums), side] for side, sums in enumerate(pair)
-                )
-                with np.errstate(invalid="ignore"):
-                    drawn[position, :, part] = (
-                        first - second,
-                        first_median - second_median,
-                        np.sqrt(first) - np.sqrt(second),
-                    )
+                        roots[id(sums), side] = np.sqrt(fewer.mean(axis=1))
+                drawn[position, part] = roots[id(pair[0]), 0] - roots[id(pair[1]), 1]
     return drawn
 
 
-def _degrees_of_freedom(
-    sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]
-) -> float:
+def _degrees_of_freedom(pair: Pair, sizes: FloatArray) -> float:
     """Welch-Satterthwaite over the variance between blocks and that between seeds of either
     estimator.
     """
+    means = [sums.sum(axis=1) / sizes.sum() for sums in pair]
     n_blocks = len(sizes)
     difference = means[0].mean() - means[1].mean()
-    residuals = (sums[0].mean(axis=0) - sums[1].mean(axis=0) - difference * sizes) / sizes.mean()
+    residuals = (pair[0].mean(axis=0) - pair[1].mean(axis=0) - difference * sizes) / sizes.mean()
     parts = [(float(residuals.var(ddof=1)) / n_blocks, n_blocks - 1)]
     parts += [
         (float(seed_means.var(ddof=1)) / len(seed_means), len(seed_means) - 1)

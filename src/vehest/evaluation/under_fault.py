@@ -11,13 +11,14 @@ Each has the errors of the same estimator on the same samples without the fault 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
-from vehest.evaluation.metrics import Scored
+from vehest.evaluation.metrics import Scored, half_turned
 
 SETTLED_SECONDS = 3.0
 FAULTED = "faulted"
@@ -102,7 +103,7 @@ def flags_under_fault(
     undetected = []
     for part, (band, health), window in zip(parts, flagged, windows, strict=True):
         during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
-        error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+        error = half_turned(part.sideslip - part.sideslip_ref)
         error[~part.is_sideslip_scored] = np.nan
         has_band = during & np.isfinite(band) & part.is_sideslip_scored
         inside.append((np.abs(error) <= band)[has_band])
@@ -136,22 +137,14 @@ def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict
 
     Sideslip is NaN where none of these samples counts for it; its error is turned into ±180°.
     """
-
-    def over_all(error_of: Callable[[Scored], FloatArray]) -> FloatArray:
-        return np.concatenate(
-            [error_of(part)[mask] for part, mask in zip(parts, masks, strict=True)]
-        )
-
-    vy = over_all(lambda part: part.vy - part.vy_ref)
-    sideslip = np.degrees(over_all(lambda part: part.sideslip - part.sideslip_ref))
-    is_scored = np.concatenate(
-        [part.is_sideslip_scored[mask] for part, mask in zip(parts, masks, strict=True)]
-    )
+    inside = Scored.joined([part.at(mask) for part, mask in zip(parts, masks, strict=True)])
+    sideslip = np.degrees(inside.sideslip - inside.sideslip_ref)
+    is_scored = inside.is_sideslip_scored
     sideslip = sideslip[is_scored] if is_scored.any() else np.full(1, np.nan)
     turned = np.abs(np.remainder(sideslip + 180.0, 360.0) - 180.0)
     return {
-        "rmse_sideslip": float(np.sqrt(np.mean(np.square(turned)))),
-        "rmse_vy": float(np.sqrt(np.mean(np.square(vy)))),
+        "rmse_sideslip": rms(turned),
+        "rmse_vy": rms(inside.vy - inside.vy_ref),
         "max_error_sideslip": float(turned.max()),
     }
 

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 PATENT_NOTE = (
     "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product "
-    "may need their licence; "
-    "the licence of this software grants none."
+    "may need their licence; the licence of this software grants none."
 )
 """What every report with a KS-NN ends with."""
 
@@ -137,7 +136,7 @@ class Document:
 
 
 def write_documents(
-    documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()
+    documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table]
 ) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by
     side.
@@ -199,7 +198,6 @@ def write_document(
     ValueError
         A table of ``on_page`` has the name of another.
     """
-    numbers = _numbers(document)
     images: dict[str, bytes] = {}
     for table, frame in document.data.items():
         _write_table(folder, table, frame)
@@ -211,9 +209,7 @@ def write_document(
             (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
             images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    (folder / f"{name}.md").write_bytes(
-        _markdown(document, numbers).encode("utf-8", "backslashreplace")
-    )
+    (folder / f"{name}.md").write_bytes(_markdown(document).encode("utf-8", "backslashreplace"))
     if page:
         page_document = replace(document, blocks=[*document.blocks, *on_page])
         (folder / f"{name}.html").write_bytes(page_of(page_document, images))
@@ -232,7 +228,7 @@ def page_of(document: Document, images: Mapping[str, bytes] | None = None) -> by
     drawn = images or {
         block.name: svg_of(block.static) for block in document.blocks if isinstance(block, Figure)
     }
-    return _page(document, _numbers(document), drawn).encode("utf-8", "backslashreplace")
+    return _page(document, drawn).encode("utf-8", "backslashreplace")
 
 
 def as_text(name: str) -> str:
@@ -321,11 +317,8 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
     """
     from PIL import Image
 
-    buffer = io.BytesIO()
     small = io.BytesIO()
-    with paper_style():
-        figure.savefig(buffer, format="png", dpi=dpi)
-    with Image.open(buffer) as image:
+    with Image.open(io.BytesIO(_saved(figure, "png", dpi=dpi))) as image:
         quantized = image.convert("RGB").quantize(
             PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
@@ -335,10 +328,7 @@ def png_of(figure: MatplotlibFigure, dpi: int = PNG_DPI) -> bytes:
 
 def pdf_of(figure: MatplotlibFigure) -> bytes:
     """A figure as PDF."""
-    buffer = io.BytesIO()
-    with paper_style():
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "Creator": None})
-    return buffer.getvalue()
+    return _saved(figure, "pdf", metadata={"CreationDate": None, "Creator": None})
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:
@@ -351,10 +341,16 @@ def svg_of(figure: MatplotlibFigure) -> bytes:
             lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0]
         )
 
+    svg = _saved(figure, "svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
+    return _PATH.sub(in_hundredths, svg.decode("utf-8")).encode("utf-8")
+
+
+def _saved(figure: MatplotlibFigure, form: str, **options: Any) -> bytes:
+    """A figure as matplotlib writes it in a format."""
     buffer = io.BytesIO()
     with paper_style():
-        figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
-    return _PATH.sub(in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
+        figure.savefig(buffer, format=form, **options)
+    return buffer.getvalue()
 
 
 def _for_both_schemes(svg: bytes) -> bytes:
@@ -388,8 +384,9 @@ def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     )
 
 
-def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
+def _markdown(document: Document) -> str:
     """The report as Markdown, tables in pipes, figures as links to PNG and SVG."""
+    numbers = _numbers(document)
     parts = [f"# {as_text(document.title)}"]
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -449,13 +446,14 @@ def _spoken(caption: str) -> str:
     return re.split(r"(?<=\.)\s", plain, maxsplit=1)[0]
 
 
-def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
+def _page(document: Document, images: Mapping[str, bytes]) -> str:
     """The HTML page from its template, with style, script, figures and data inside."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markdown_it import MarkdownIt
     from markupsafe import Markup
 
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+    numbers = _numbers(document)
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -574,15 +572,18 @@ def bars_of(
         ``value``, places ``at``, ``low`` and ``high`` [%], and ``cut``, of each; None for a missing
         one.
     """
-    finite = [value for value in values if math.isfinite(value)]
-    ends = [
-        high if math.isfinite(high) else value
-        for value, high in zip(values, highs, strict=True)
-        if math.isfinite(value)
-    ]
-    if not finite or max(ends) <= 0:
+    lows, highs = (
+        [end if math.isfinite(end) else value for value, end in zip(values, ends, strict=True)]
+        for ends in (lows, highs)
+    )
+    finite = sorted(value for value in values if math.isfinite(value))
+    longest = max(
+        (high for value, high in zip(values, highs, strict=True) if math.isfinite(value)),
+        default=0.0,
+    )
+    if longest <= 0:
         return [None] * len(values)
-    axis = min(max(ends), MAX_AXIS_RATIO * sorted(finite)[len(finite) // 2] or max(ends))
+    axis = min(longest, MAX_AXIS_RATIO * finite[len(finite) // 2] or longest)
 
     def place(value: float) -> float:
         return round(100 * min(max(value / axis, 0.0), 1.0), 1)
@@ -591,9 +592,9 @@ def bars_of(
         {
             "value": value,
             "at": place(value),
-            "low": place(low if math.isfinite(low) else value),
-            "high": place(high if math.isfinite(high) else value),
-            "cut": max(value, high if math.isfinite(high) else value) > axis * (1 + 1e-9),
+            "low": place(low),
+            "high": place(high),
+            "cut": max(value, high) > axis * (1 + 1e-9),
         }
         if math.isfinite(value)
         else None

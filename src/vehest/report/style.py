@@ -153,7 +153,7 @@ def paper_style() -> Iterator[None]:
 
 
 @contextmanager
-def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
+def new_figure(width: float, height: float) -> Iterator[MatplotlibFigure]:
     """An empty figure of a width and height [in] without global state, drawn inside the ``with``
     block in `paper_style`.
 

@@ -89,9 +89,7 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
     if rows:
         lines += [
             "",
-            TerminalTable(
-                "", ("residual RMS", "before", "after", "after, without tilt", "unit"), rows
-            ),
+            TerminalTable(("residual RMS", "before", "after", "after, without tilt", "unit"), rows),
         ]
     proposal = f"to apply the corrections: '{override_of(alignment)}'"
     lines += [
@@ -128,8 +126,9 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "cutoff_hz": alignment.settings.cutoff_at(drive.rate_hz),
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
-            {"channel": residual.channel, "unit": residual.unit}
-            | {
+            {
+                "channel": residual.channel,
+                "unit": residual.unit,
                 "rms_before": residual.rms["before"],
                 "rms_after": residual.rms["after"],
                 "rms_without_tilt": residual.rms["rest"],
@@ -226,7 +225,7 @@ def _parameters(alignment: Alignment) -> TerminalTable:
         value, sigma, low, high = (f"{factor * number:.{decimals}f}" for number in numbers)
         rows.append([parameter.name, value, sigma, f"{low} … {high}", unit])
     return TerminalTable(
-        "", ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows
+        ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows
     )
 
 

@@ -9,13 +9,13 @@ A calibration knows no evaluation's protocol, and no test range.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vehest.artefacts.artefact import Artefact, StagePlan
+from vehest.artefacts.artefact import Artefact, StagePlan, Write
 from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
@@ -36,7 +36,7 @@ def plan_calibrate(
     data: Mapping[str, Artefact],
     output: Path,
     cars: Mapping[str, CarValues],
-) -> tuple[StagePlan, Callable[[Path], None]] | None:
+) -> tuple[StagePlan, Write] | None:
     """The calibration of a model, as `vehest.artefacts.artefact.make` takes it.
 
     Parameters

@@ -18,7 +18,7 @@ import numpy as np
 
 from vehest.alignment.checks import refuse_errors
 from vehest.configuration.estimate_options import estimate_options
-from vehest.configuration.files import is_file_name
+from vehest.configuration.files import files_and_overrides
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, counted, listed, printable, suggestion
 from vehest.data.estimate import Estimate
@@ -91,8 +91,9 @@ def compare_files(
     """
     named_columns = parse_columns(columns)
     seconds = parse_shift(shift)
-    files = [Path(word) for word in words if is_file_name(word)]
-    options = estimate_options([word for word in words if not is_file_name(word)])
+    file_words, overrides = files_and_overrides(words)
+    files = [Path(word) for word in file_words]
+    options = estimate_options(overrides)
     settings = options.settings
     notes: list[str] = []
     trained_here: list[str] = []
@@ -138,11 +139,10 @@ def compare_files(
     of_wheelbase = "wheelbase not known" if wheelbase is None else f"wheelbase {wheelbase:g} m"
     scored += (
         f", sideslip from {comparison['min_sideslip_speed']:.3g} m/s on ({of_wheelbase}): the car "
-        "is slower at "
-        f"{100 * comparison['share_below_min_speed']:.1f} % of the samples"
+        f"is slower at {100 * comparison['share_below_min_speed']:.1f} % of the samples"
     )
     return comparison | {"findings": findings}, [
-        TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
+        TerminalTable(("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells),
         scored,
         comparison["verdict"],
     ]
@@ -323,8 +323,7 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
         )
         raise DataError(
             f"{ranges}: less than {MIN_COMMON_SECONDS:g} s in common; are the clocks the same? "
-            "(--shift "
-            "SECONDS or auto moves tables of other tools)"
+            "(--shift SECONDS or auto moves tables of other tools)"
         )
     if reference.rate_hz < MIN_RATE_HZ:
         raise DataError(

@@ -319,8 +319,7 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
     }
     lengths = [
         f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} "
-        "s "
-        f"({key}={max(1, round(number * lowest / rate))} keeps that)"
+        f"s ({key}={max(1, round(number * lowest / rate))} keeps that)"
         for key, number in samples.items()
         if isinstance(number, int) and number > 0
     ]

@@ -45,8 +45,7 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
     if unknown:
         return (
             f"reference sensor of data set {' and '.join(unknown)}, whose place in the car is not "
-            "known "
-            "(reference_point in conf/dataset)"
+            "known (reference_point in conf/dataset)"
         )
     return "centre of gravity"
 

@@ -76,8 +76,7 @@ def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
             meant = suggestion(quantity, CHANNELS_OF_QUANTITIES) or ";"
             raise ConfigurationError(
                 f"--column {printable(word)}: '{printable(quantity)}' is no quantity of an "
-                f"estimate{meant} "
-                f"there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column "
+                f"estimate{meant} there are {listed(list(CHANNELS_OF_QUANTITIES))}, as in --column "
                 "sideslip=Beta:deg"
             )
         if not text.strip("-"):
@@ -277,16 +276,14 @@ def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
         accepted = ", ".join(TIME_UNITS) if quantity == "time" else "m/s, km/h, rad, deg and others"
         raise DataError(
             f"'{file}': column '{printable(name)}' has the unknown unit '{printable(text)}' (known "
-            f"are {accepted}); "
-            "convert it, or rename the column"
+            f"are {accepted}); convert it, or rename the column"
         )
     try:
         factor_to_si(unit, DEFAULT_UNITS[quantity])
     except DataError:
         raise DataError(
             f"'{file}': column '{printable(name)}' is in '{printable(text)}', which is no unit of "
-            f"{quantity.removesuffix('_ref')}; "
-            "name its unit, as in --column sideslip=NAME:deg"
+            f"{quantity.removesuffix('_ref')}; name its unit, as in --column sideslip=NAME:deg"
         ) from None
     return unit
 

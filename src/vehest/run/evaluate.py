@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan
+from vehest.artefacts.artefact import TIMINGS, Artefact, StagePlan, Write
 from vehest.artefacts.keys import changed_options
 from vehest.data.car import UNKNOWN_CAR, CarValues
 from vehest.data.errors import ConfigurationError, DataError
@@ -152,9 +152,7 @@ class Evaluation:
     faults: tuple[FaultSettings, ...] = ()
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
 
-    def of(
-        self, model: Artefact, calibration: Artefact | None
-    ) -> tuple[StagePlan, Callable[[Path], None]]:
+    def of(self, model: Artefact, calibration: Artefact | None) -> tuple[StagePlan, Write]:
         """The evaluation of a model, as `artefacts.make` takes it.
 
         Parameters
@@ -180,8 +178,7 @@ class Evaluation:
                 if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
                         f"test set '{name}' shares samples with the ranges that {model.label} was "
-                        "trained or chosen on "
-                        f"({learnt.describe()}); test it on something else"
+                        f"trained or chosen on ({learnt.describe()}); test it on something else"
                     )
         inputs = {"model": model.digest} | (
             {} if calibration is None else {"calibration": calibration.digest}

@@ -116,8 +116,7 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
     ):
         raise ConfigurationError(
             "faults must be a list of faults, each with its kind, for example [{kind: bias, "
-            "channel: ay, severity: mild}]; "
-            f"kinds: {', '.join(kinds)}"
+            f"channel: ay, severity: mild}}]; kinds: {', '.join(kinds)}"
         )
     named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
     bases = {
@@ -160,8 +159,7 @@ def union_of_faults(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSet
         if by_condition.setdefault(fault.condition, fault) != fault:
             raise ConfigurationError(
                 f"two faults are both called {fault.condition}: they differ in start or duration; "
-                "give them different seeds too, "
-                f"or evaluate them one after the other"
+                "give them different seeds too, or evaluate them one after the other"
             )
     return tuple(by_condition.values())
 

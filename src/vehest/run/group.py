@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find, make
+from vehest.artefacts.artefact import Artefact, StagePlan, Status, Write, ensured, find, make
 from vehest.artefacts.locks import Lock, Waiting, held
 from vehest.data.car import CarValues
 from vehest.data.splits import Split
@@ -91,7 +91,7 @@ class Group:
             One a job, in their order; a member that was stopped lacks what was not made.
         """
 
-        def artefact_of(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
+        def artefact_of(plan: StagePlan, write: Write) -> Artefact | None:
             if should_stop():
                 return None
             return self.existing(plan) or ensured(
@@ -159,7 +159,7 @@ def _member(
     group: Group,
     job: TrainJob,
     model: Artefact | None,
-    artefact_of: Callable[[StagePlan, Callable[[Path], None]], Artefact | None],
+    artefact_of: Callable[[StagePlan, Write], Artefact | None],
 ) -> Member:
     """A member whose model is calibrated, then evaluated, as far as ``artefact_of`` gives
     artefacts.

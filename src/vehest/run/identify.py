@@ -17,7 +17,7 @@ import yaml
 
 from vehest.api import read_recording
 from vehest.configuration.estimate_options import estimate_options
-from vehest.configuration.files import is_file_name
+from vehest.configuration.files import files_and_overrides
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
@@ -88,8 +88,7 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
     VehestError
         No recording is named, two have one id, one cannot be used, or ``out`` is no record.
     """
-    files = [Path(word) for word in words if is_file_name(word)]
-    overrides = [word for word in words if not is_file_name(word)]
+    files, overrides = files_and_overrides(words)
     if not files or out.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigurationError(
             f"'{out}' must end in .yaml"
@@ -106,7 +105,7 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         model.preparation = options.preparation
     drives: dict[str, dict[str, Normal]] = {}
     for file in files:
-        drive = read_recording(file, overrides)
+        drive = read_recording(Path(file), overrides)
         if drive.id in drives:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
         for finding in findings_of(drive, model, options.dataset.get("accept") or ()):
@@ -154,7 +153,7 @@ def in_words(record: CarRecord) -> TerminalTable:
         for name, number in numbers.items()
     ]
     heads = ("quantity", "value", "deviation", "unit", "seen", "identified on", "meaning")
-    return TerminalTable("", heads, rows)
+    return TerminalTable(heads, rows)
 
 
 def _excitation(deviation: float, at_start: float) -> str:

@@ -65,7 +65,7 @@ def plan_ingest(config: Config) -> StagePlan:
         Raw files are missing or the data set's configuration makes no sense.
     """
     dataset: Mapping[str, Any] = config["dataset"]
-    if missing := missing_keys(dict(dataset)):
+    if missing := missing_keys(dataset):
         raise ConfigurationError(
             f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set"
         )
@@ -226,10 +226,8 @@ def recording_file(recording_id: str) -> str:
     ):
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's "
-            "name in the store, "
-            f"of up to {MAX_ID_BYTES} bytes, without '/', '\\' and control characters, and no "
-            "hidden "
-            "one"
+            f"name in the store, of up to {MAX_ID_BYTES} bytes, without '/', '\\' and control "
+            "characters, and no hidden one"
         )
     return f"{recording_id}.parquet"
 
@@ -318,9 +316,8 @@ def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None
         downloadable = ", ".join(_datasets_with_download()) or "none"
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from "
-            "(download); "
-            "put them into its folder by hand, or declare download in its file; data sets that "
-            f"do: {downloadable}"
+            "(download); put them into its folder by hand, or declare download in its file; data "
+            f"sets that do: {downloadable}"
         )
     download = download_of(source)
     if dry_run:

@@ -76,7 +76,7 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
             }
         )
     keys = ("dataset", "kind", "source", "here", "title")
-    table = TerminalTable("", ("data set", *keys[1:]), [[row[key] for key in keys] for row in rows])
+    table = TerminalTable(("data set", *keys[1:]), [[row[key] for key in keys] for row in rows])
     cited = [
         line
         for row in rows
@@ -114,7 +114,7 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
             f"{about}, {recording['samples']} samples",
             *(f"  {line}" for line in recording["origin"]),
         ]
-        lines.append(TerminalTable("", ("channel", "unit", *SPREAD), rows))
+        lines.append(TerminalTable(("channel", "unit", *SPREAD), rows))
     return {"source": source, "recordings": recordings}, lines
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from vehest.configuration.files import choices, find_pipeline, is_file_name, pipeline_names
+from vehest.configuration.files import choices, find_pipeline, pipeline_names
 from vehest.data.errors import ConfigurationError, MissingError, closest, suggestion
 from vehest.data.files import missing_file
 
@@ -36,11 +36,6 @@ def require_paths(paths: Iterable[str | Path | None]) -> None:
                 os.stat(path)
             except (FileNotFoundError, NotADirectoryError):
                 raise missing_file(Path(path)) from None
-
-
-def file_words(words: Iterable[str]) -> list[str]:
-    """The words of a command line that are files and not overrides."""
-    return [word for word in words if is_file_name(word)]
 
 
 def require_dataset_or_file(source: str) -> None:

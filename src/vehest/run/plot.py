@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.configuration.estimate_options import EstimateOptions, estimate_options
-from vehest.configuration.files import is_file_name
+from vehest.configuration.files import files_and_overrides, is_file_name
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
 from vehest.data.limits import use_limits
@@ -102,16 +102,16 @@ def plot_files(
         A file cannot be used or written.
     """
     check_plot_name(out)
-    files = [Path(word) for word in words if is_file_name(word)]
+    files, overrides = files_and_overrides(words)
     if not files:
         raise ConfigurationError("name the file of a recording: vehest plot lap.csv")
     recording_file, *estimate_files = files
-    options = estimate_options([word for word in words if not is_file_name(word)])
-    recording = _with_references_if_any(recording_file, options)
+    options = estimate_options(overrides)
+    recording = _with_references_if_any(Path(recording_file), options)
     wheelbase = stated_wheelbase(recording.car, options.settings)
     recording = replace(recording, car=replace(recording.car, wheelbase=wheelbase))
     with use_limits(options.limits):
-        estimates = [read_estimate_table(file, recording) for file in estimate_files]
+        estimates = [read_estimate_table(Path(file), recording) for file in estimate_files]
     figure = drive_figure(recording, estimates, start, stop)
     content = WRITERS[out.suffix.lower()](figure)
     with written_aside(out) as aside:
@@ -120,7 +120,7 @@ def plot_files(
         "out": str(out),
         "recording": recording.id,
         "seconds": recording.duration,
-        "estimates": [str(file) for file in estimate_files],
+        "estimates": [str(Path(file)) for file in estimate_files],
         "has_reference": "vy_ref" in recording,
     }
 

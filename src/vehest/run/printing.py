@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vehest.data.errors import MissingError, is_printable, printable
-from vehest.data.errors import counted as counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,11 +36,11 @@ SCORE_HEADER = (
 
 @dataclass(frozen=True)
 class TerminalTable:
-    """A table in a terminal; an empty title is left out."""
+    """A table in a terminal, with or without a title."""
 
-    title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    title: str = ""
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ def as_json_text(outcome: Any) -> str:
 def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
     """The overview of a study in parts, or of recordings alone."""
     rows = [[_cell(value) for value in row] for row in overview.itertuples(index=False)]
-    table = TerminalTable("", [str(name) for name in overview.columns], rows)
+    table = TerminalTable([str(name) for name in overview.columns], rows)
     return _summary([table], [], {"overview": _records(overview)}, left_out)
 
 
@@ -237,13 +236,12 @@ def summary_of_leaderboard(
             )
             for row in rows.to_dict("records")
         ]
-        tables.append(TerminalTable(f"{title}: test set '{test_set}'{remark}", header, cells))
+        tables.append(TerminalTable(header, cells, f"{title}: test set '{test_set}'{remark}"))
         share = float(rows["share_below_min_speed"].iloc[0])
         if share > 0:
             notes.append(
                 f"test set '{test_set}': sideslip is not scored at {100 * share:.1f} % of the "
-                "samples, where the car is slower than "
-                f"{rows['min_sideslip_speed'].iloc[0]}"
+                f"samples, where the car is slower than {rows['min_sideslip_speed'].iloc[0]}"
             )
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(
@@ -294,7 +292,7 @@ def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
         "* lowest mean on the validation range; tests choose nothing" if figures["chosen"] else ""
     )
     return TerminalSummary(
-        (TerminalTable(title, *table_of(artefacts)),), note, "report.md", json.dumps(figures)
+        (TerminalTable(*table_of(artefacts), title),), note, "report.md", json.dumps(figures)
     )
 
 

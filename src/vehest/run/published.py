@@ -174,7 +174,7 @@ def in_words(verdict: Mapping[str, Any]) -> str:
 
 
 def check_published(
-    names: Sequence[str], overrides: Sequence[str] = (), messages: Messages | None = None
+    names: Sequence[str], overrides: Sequence[str], messages: Messages
 ) -> list[dict[str, Any]]:
     """Compare the recorded keys of published studies with those of today's code, configuration and
     raw files; ``messages`` name a study that takes long.
@@ -189,8 +189,8 @@ def check_published(
         Pipelines or published studies; none for all that are published.
     overrides : sequence of str
         Of where raw files come from and results go alone.
-    messages : Messages or None
-        By default nothing is printed.
+    messages : Messages
+        Prints the study that takes long.
 
     Raises
     ------
@@ -216,7 +216,6 @@ def check_published(
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    messages = messages or Messages(quiet=True)
     verdicts = []
     for study, declared_pipeline in pipelines.items():
         with messages.running("check", study):
@@ -224,21 +223,19 @@ def check_published(
     return verdicts
 
 
-def check_listed(
-    overrides: Sequence[str] = (), messages: Messages | None = None
-) -> list[dict[str, Any]]:
+def check_listed(overrides: Sequence[str], messages: Messages) -> list[dict[str, Any]]:
     """Compare all published studies as `check_published`, and those that are not up to date with
     the list of those that may be stale.
 
     Returns the same, each with ``failure``, empty for a study as it should be. A listed study with
-    keys of other stages than today's, or without keys, is stale without a look at its
-    configuration, which takes a minute for all.
+    keys of other stages than today's is stale without a look at its configuration, which takes a
+    minute for all.
 
     Parameters
     ----------
     overrides : sequence of str
         As of `check_published`.
-    messages : Messages or None
+    messages : Messages
         As of `check_published`.
     """
     reasons = _stale_list()
@@ -249,10 +246,6 @@ def check_listed(
         if published is None:
             note = f"nothing is published, which does not end its entry in '{RESULTS / STALE_LIST}'"
             verdicts.append(_outcome(study, "not known", note=note) | {"failure": note})
-        elif not published.keys:
-            verdicts.append(
-                _outcome(study, "not known", note="published before keys were recorded")
-            )
         elif changes := [
             (name, CODE)
             for name, entry in published.keys.items()
@@ -267,13 +260,13 @@ def check_listed(
         check_published(sorted(names), overrides, messages) if names or not settled else ()
     ):
         is_incomplete = verdict["n_not_trained"] > 0
-        if is_incomplete and verdict["study"] not in reasons:
+        is_current = verdict["state"] == "up to date"
+        is_listed = verdict["study"] in reasons
+        if is_incomplete and not is_listed:
             verdict["failure"] = f"it is incomplete, and not in '{RESULTS / STALE_LIST}'"
-        elif is_incomplete and verdict["state"] == "up to date":
-            pass  # the list says what will complete it
-        elif verdict["state"] == "up to date" and verdict["study"] in reasons:
+        elif is_current and is_listed and not is_incomplete:  # else the list says what completes it
             verdict["failure"] = f"it is up to date; remove it from '{RESULTS / STALE_LIST}'"
-        elif verdict["state"] != "up to date" and verdict["study"] not in reasons:
+        elif not is_current and not is_listed:
             verdict["failure"] = f"it is not in '{RESULTS / STALE_LIST}'"
         verdicts.append(verdict)
     for verdict in verdicts:

@@ -79,8 +79,8 @@ def draw_report(
     comparisons: Mapping[str, Comparison],
     datasets: Sequence[StoredDataset | AbsentDataset],
     runner: Runner,
-    trials: Sequence[Trial] = (),
-    search_remarks: Sequence[str] = (),
+    trials: Sequence[Trial],
+    search_remarks: Sequence[str],
 ) -> tuple[Artefact, TerminalSummary]:
     """Draw a study, unless its report is there, and sum it up for the terminal; parts without a
     comparison are named as absent.

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from vehest.artefacts.artefact import Artefact, StagePlan, Status, ensured, find
+from vehest.artefacts.artefact import Artefact, StagePlan, Write, ensured, find
 from vehest.artefacts.keys import hash_of
 from vehest.artefacts.locks import Waiting
 from vehest.configuration.composition import Config, compose_config, missing_keys, quoted
@@ -136,7 +136,7 @@ class Stages:
 
         def look(name: str) -> None:
             dataset = self.dataset_config(name, config)["dataset"]
-            if not missing_keys(dict(dataset)):  # which its ingest reports
+            if not missing_keys(dataset):  # which its ingest reports
                 open_source(dataset).inputs()
 
         for name in dataset_names(config["split"]):
@@ -257,7 +257,7 @@ class Stages:
             self.cars(config, split.datasets),
         )
 
-    def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
+    def ensure(self, plan: StagePlan, write: Write) -> Artefact:
         """Make the artefact of a plan by ``write``, which receives a folder, unless it is there.
 
         Returns

@@ -10,7 +10,7 @@ none of them is trained, wherever the study runs.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from vehest.estimators.registry import new_estimator
 from vehest.run.comparison import Comparison
 from vehest.run.evaluate import evaluation_options, read_metrics
 from vehest.run.evaluate_faults import faults_of
-from vehest.run.study import Job, Study
+from vehest.run.study import Study
 from vehest.run.train import TrainJob, training_options
 from vehest.run.versions import code_of
 from vehest.studies.artefacts import Trial, nominal_rows, write_frame
@@ -162,8 +162,7 @@ def remarks_on(
                 if is_searched and settings_to_compare(config) != settings_to_compare(best):
                     remarks[
                         f"part '{name}' does not use what the search '{chosen.search}' chose by "
-                        f"{chosen.metric} "
-                        f"on validation: {chosen.options}"
+                        f"{chosen.metric} on validation: {chosen.options}"
                     ] = None
     return list(remarks)
 
@@ -191,7 +190,7 @@ def _planned_trial(
     if name not in comparisons:
         return None
     comparison = comparisons[name]
-    job: Job = comparison.jobs[0]
+    job = comparison.jobs[0]
     if job.training is None:
         return None
     search = study.parts[name].search
@@ -230,9 +229,7 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
     return float(rows["value"].iloc[0])
 
 
-def settings_to_compare(
-    config: Config, tried: set[str] | frozenset[str] = frozenset()
-) -> dict[str, Any]:
+def settings_to_compare(config: Config, tried: Collection[str] = ()) -> dict[str, Any]:
     """What determines a training, without its seed and the dotted keys that are tried."""
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}

@@ -146,8 +146,8 @@ def run_study(
     cache: RunCache,
     messages: Messages,
     *,
-    sweep: bool = False,
-    only_report: bool = False,
+    sweep: bool,
+    only_report: bool,
 ) -> Ran:
     """Run every stage of a pipeline, or of a sweep; existing artefacts are reused. A study that
     overrides changed is not published.

@@ -168,7 +168,7 @@ def changes_of_tables(
     records: Mapping[str, TableRecord],
     keys: Mapping[str, Mapping[str, str]],
     folder: Path,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str],
 ) -> tuple[list[tuple[str, str]], str]:
     """What differs from when tables were made, as pairs with its cause, and a note on what was not
     compared.

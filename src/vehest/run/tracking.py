@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 
 from vehest.artefacts.artefact import MANIFEST, Artefact
 from vehest.artefacts.locks import Lock, held
+from vehest.configuration.composition import dotted
 from vehest.data.errors import MissingError, printable
 from vehest.data.files import regular_file, remove_leftovers, written_aside
 from vehest.run.calibrate import calibration_figures
@@ -113,7 +114,9 @@ class Tracker:
         )
         run_id = str(run.info.run_id)
         time = run.info.start_time  # metrics with the same time are kept once
-        parameters = [Param(key, value) for key, value in _flattened(artefact.config).items()]
+        parameters = [
+            Param(key, str(value)[:VALUE_LENGTH]) for key, value in dotted(artefact.config)
+        ]
         points = [
             Metric(key, value, time, 0)
             for key, value in METRICS[artefact.stage](artefact.folder).items()
@@ -236,15 +239,3 @@ def _require_sqlite_path(store: Path) -> None:
             "MLflow opens no store at a path with '?', '%' before two hexadecimal digits or bytes "
             "that are not UTF-8; give another output=FOLDER, or tracking=none"
         )
-
-
-def _flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Dotted key -> start of the value's text."""
-    flat: dict[str, str] = {}
-    for key, value in config.items():
-        flat |= (
-            _flattened(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else {f"{prefix}{key}": str(value)[:VALUE_LENGTH]}
-        )
-    return flat

@@ -8,10 +8,11 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from vehest.artefacts.artefact import MANIFEST, TIMINGS, Artefact, StagePlan, read_artefact
 from vehest.artefacts.keys import changed_options
@@ -32,8 +33,6 @@ HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
 DIVERGED = "diverged and ended with its best weights until then; lower its learning_rate"
 UNKEYED = frozenset({"checkpoint_seconds"})  # options of a training that move no number
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -290,15 +289,15 @@ def read_fit_metrics(folder: Path) -> dict[str, float]:
 
 def trained_rate(model: Artefact) -> float:
     """The rate that a model works at [Hz]."""
-    return _from_manifest(model, lambda config: float(config["estimator"]["rate_hz"]))
+    with _reading_manifest(model):
+        return float(model.config["estimator"]["rate_hz"])
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
     """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those
     of the named roles.
     """
-
-    def ranges(config: Mapping[str, Any]) -> list[Span]:
+    with _reading_manifest(model):
         return [
             Span(
                 str(entry["dataset"]),
@@ -307,16 +306,15 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
                 float(entry["stop"]),
             )
             for role in roles or ("train", "validation")
-            for entry in config[role]
+            for entry in model.config[role]
         ]
 
-    return _from_manifest(model, ranges)
 
-
-def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T:
+@contextmanager
+def _reading_manifest(model: Artefact) -> Iterator[None]:
     """Raises `DataError` where a manifest describes no training."""
     try:
-        return read(model.config)
+        yield
     except (LookupError, TypeError, ValueError, ConfigurationError) as error:
         raise DataError(
             f"'{model.folder / MANIFEST}': config describes no training ({first_line(error)})"

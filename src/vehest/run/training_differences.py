@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
+from vehest.configuration.composition import dotted
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.registry import new_estimator
 from vehest.run.train import TrainJob
@@ -86,21 +86,10 @@ def _differences_of_variant(trainings: Mapping[str, TrainJob]) -> dict[str, Diff
 
 
 def _options_of(training: TrainJob) -> dict[str, str]:
-    """Options with their groups, ``training.learning_rate``, and their values as text."""
-    options = dict(_flattened("training", training.training))
-    return options | dict(_flattened("estimator", training.estimator))
-
-
-def _flattened(name: str, value: Any) -> Iterable[tuple[str, str]]:
-    """Dotted names of nested options with their values as text; a model to start from by its
-    name.
+    """Options with their groups, ``training.learning_rate``, and their values as text; a model to
+    start from by its name.
     """
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            yield from _flattened(f"{name}.{key}", part)
-    elif value is None:
-        yield name, "none"
-    elif name == f"training.{START}":
-        yield name, Path(str(value)).name
-    else:
-        yield name, str(value)
+    options = dict(dotted({"training": training.training, "estimator": training.estimator}))
+    if start := options.get(f"training.{START}"):
+        options[f"training.{START}"] = Path(str(start)).name
+    return {name: "none" if value is None else str(value) for name, value in options.items()}

@@ -274,7 +274,7 @@ def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     }
     header = ("estimator", "usable", "rate", "missing", "remedy")
     lines: list[str | TerminalTable] = [
-        TerminalTable("", header, [_cells(row) for row in rows]),
+        TerminalTable(header, [_cells(row) for row in rows]),
         "",
     ]
     lines += [f"{channel}: {supply}" for channel, supply in supplies.items()]

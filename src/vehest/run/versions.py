@@ -62,12 +62,9 @@ def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
 
 
 def is_of_other_stages(code: str) -> bool:
-    """Whether a recorded version names another version of a stage than today's, or is a hash of
-    code, as versions were before.
+    """Whether a recorded version names another version of a stage than today's.
 
     Versions of classes are not compared.
     """
-    if code and "=" not in code:
-        return True
     versions = (pair.partition("=") for pair in code.split())
     return any(VERSIONS.get(name, version) != version for name, _, version in versions)

@@ -198,8 +198,7 @@ class PublishedWeights:
         if hash_of({name: sha256_of(folder / name) for name in names}) != record.digest:
             raise DataError(
                 f"'{self.path}' was changed after it was published: {record.label} does not have "
-                "its digest; "
-                f"restore the file by 'git checkout {self.path}', or add --retrain"
+                f"its digest; restore the file by 'git checkout {self.path}', or add --retrain"
             )
 
     def _read(self) -> None:
@@ -215,8 +214,7 @@ class PublishedWeights:
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
             raise DataError(
                 f"'{self.path}' is damaged ({first_line(error)}); restore it by 'git checkout "
-                f"{self.path}', "
-                "remove it, or add --retrain"
+                f"{self.path}', remove it, or add --retrain"
             ) from error
 
 

@@ -39,11 +39,12 @@ from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
 MAX_ATTEMPTS = 3  # that a group is tried, if its tasks end without a report
-ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-ENVIRONMENT |= {
-    "RAY_worker_niceness": "0",
-    "RAY_task_oom_retries": str(MAX_ATTEMPTS - 1),
-}  # by default 15, and without end
+ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",  # by default 15
+    "RAY_task_oom_retries": str(MAX_ATTEMPTS - 1),  # by default without end
+}
 """Of Ray, unless it is set otherwise."""
 QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
 STOP = "stop"  # file that asks all SLURM jobs to end
@@ -52,8 +53,9 @@ PARAMETERS = {
     "constraint": "slurm_constraint",
     "memory_gb": "mem_gb",
     "minutes": "timeout_min",
+    "partition": "slurm_partition",
+    "qos": "slurm_qos",
 }
-PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
 """Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
 
 

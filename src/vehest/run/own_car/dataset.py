@@ -22,14 +22,13 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
 from vehest.data.derived import speed_of_reference
-from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError, counted
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
 from vehest.data.transforms import MOST_BRIDGED
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import EVIDENCE_HZ, MAX_BRIDGED_SECONDS, TABLES, Examined, rate_of
-from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
 from vehest.sources.pose import POSE_CHANNELS

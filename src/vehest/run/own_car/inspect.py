@@ -23,11 +23,10 @@ from vehest.alignment.proposals.proposal import Proposals
 from vehest.configuration.composition import compose_config
 from vehest.configuration.files import choices
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, counted
 from vehest.data.limits import check_limit, limits_from_config, use_limits
 from vehest.data.recording import Kind
 from vehest.data.splits import check_name
-from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, typical_step
 from vehest.sources.surveys import Log, survey
