@@ -445,7 +445,7 @@ ROLES = {
     "Drehzahl": "other",
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
     "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
-    "VelDown": "other",
+    "VelDown": "other", "Pos Lat (deg)": "latitude", "GNSS_Lon": "longitude",
 }  # fmt: skip
 
 
