@@ -27,6 +27,7 @@ from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
+from vehest.sources.surveys.clocks import find_clock
 from vehest.sources.surveys.tables import unit_in_name
 
 
@@ -461,7 +462,7 @@ ROLES = {
     "Drehzahl": "other",
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
     "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
-    "VelDown": "other",
+    "VelDown": "other", "Pos Lat (deg)": "latitude", "GNSS_Lon": "longitude",
 }  # fmt: skip
 
 
@@ -1162,6 +1163,12 @@ def test_of_a_long_drive_the_busiest_minutes_are_compared_and_each_column_is_rea
     chosen = busiest_rows(rows, 6_000, 1_000)
     np.testing.assert_array_equal(chosen, rows[:, 20_000:26_000])
     assert sum(lengths) <= 2 * rows.size
+    assert busiest_rows(rows, 0, 1) is rows
+
+
+def test_a_slow_clock_without_a_unit_is_read_in_the_one_that_makes_a_rate():
+    clock, *_ = find_clock({"time": 1.7155e18 + 1e9 * np.arange(100.0)}, {})
+    assert (clock.unit, clock.asked) == ("ns", True)
 
 
 def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):

@@ -3,6 +3,7 @@ the way out.
 """
 
 import datetime
+import json
 
 import numpy as np
 import pandas as pd
@@ -275,6 +276,25 @@ UNSUITED = {
         + "".join(f"{k},0x1a0,0,0,0,8,ChssAAD/{k % 10}AA=\n" for k in range(99)),
         "raw frames of a CAN bus; decode them by the bus's DBC",
     ),
+    "an array of JSON": (
+        json.dumps([{"utime": k, "vel": [k, 0.0], "rotation_rate": [0.0, k]} for k in range(99)]),
+        "is JSON; save a table with a row for each time",
+    ),
+    "an indented object of JSON": (
+        json.dumps({"vehicle_speed": {"values": [[k, 2 * k] for k in range(99)]}}, indent=1),
+        "is JSON; save a table with a row for each time",
+    ),
+    "a trace of OpenXC": (
+        "".join(f'13327941{k}.31: {{"name":"speed","value":{k}.5}}\n' for k in range(10, 99)),
+        "is JSON; save a table with a row for each time",
+    ),
+    "messages of a receiver": (
+        "".join(
+            f"#INSPVAXA,COM1,0,73.5,FINE,1695,{k}.0,0;INS_SOLUTION_GOOD,48.1,11.5*e877c178\n"
+            for k in range(99)
+        ),
+        "messages of a satellite receiver",
+    ),
     "quoted rows": (
         "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
         "each row in one pair of quotes; remove them",
@@ -536,3 +556,14 @@ def test_a_measurement_of_raw_frames_is_refused_with_the_way_to_decode_them(tmp_
     file = write_mdf(tmp_path / "bus.mf4", {"CAN": [identifiers]})
     with pytest.raises(DataError, match=r"raw frames of a CAN bus.*extract_bus_logging"):
         survey(file)
+
+
+def test_a_magnitude_beside_a_column_of_its_sign_is_left_out(tmp_path):
+    table = usual(drive())
+    steering = 16.0 * np.degrees(drive()["r"])
+    signed = table.assign(LWI_Lenkradwinkel=np.abs(steering), LWI_VZ_Lenkradwinkel=steering < 0.0)
+    signed["LWI_VZ_Lenkradwinkel"] = signed["LWI_VZ_Lenkradwinkel"].astype(int)
+    proposals = inspect("my_car", [write(tmp_path / "lap.csv", signed)]).proposals
+    assert "LWI_Lenkradwinkel" not in {channel.column for channel in proposals.channels}
+    (note,) = [note for note in proposals.notes if "'LWI_VZ_Lenkradwinkel' holds its sign" in note]
+    assert note.startswith("'LWI_Lenkradwinkel' is left out: it is never negative")

@@ -240,6 +240,9 @@ def test_spellings_are_known_where_they_mean_one_thing():
         "m/(s^2)": "m/s²",
         "MPa": "MPa",
         "mPa": "another unit",
+        "Unit_KiloMeterPerHour": "km/h",
+        "Unit_DegreOfArcPerSecon": "deg/s",
+        "Unit_MeterPerSeconSquar": "m/s²",
     }
     unclear = dict.fromkeys(("KN", "Grad"))  # kilonewton or knots; degrees in German, gon elsewhere
     assert {text: plain_unit(text) for text in (spellings | unclear)} == spellings | unclear

@@ -12,19 +12,21 @@ from vehest.sources.columns import Column
 # brackets and case, sec as s; ambiguous ones are left out
 _SPELLINGS_OF = {
     "m/s": "m/s mps meter/s meters/s ms-1 ms^-1",
-    "km/h": "km/h kmh kph km/hr km/hour km/std kmph kmh-1 kmh^-1",
+    "km/h": "km/h kmh kph km/hr km/hour km/std kmph kmh-1 kmh^-1 unit_kilometerperhour",
     "mph": "mph mi/h mi/hr mile/h miles/h miles/hour",
     "knots": "kt kts knt knot knots knoten noeuds nœuds nodi",
     "ft/s": "ft/s fps feet/s foot/s fts-1 fts^-1",
-    "m/s²": "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2",
+    "m/s²": (
+        "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2 unit_meterperssquar"
+    ),
     "ft/s²": "ft/s² ft/s^2 ft/s2 ft/s/s fps2 fps² feet/s² feet/s^2 feet/s2 fts-2 fts^-2",
     "g": "g gs g's gn g0",
     "rad": "rad radian radians",
-    "deg": "deg ° º degree degrees gradi grados degré degrés 度",
+    "deg": "deg ° º degree degrees gradi grados degré degrés 度 unit_degreofarc",
     "rad/s": "rad/s radian/s radians/s rads-1 rads^-1",
     "deg/s": (
         "deg/s °/s º/s degree/s degrees/s degs-1 degs^-1 °s-1 dps gradi/s grados/s "
-        "degré/s degrés/s 度/s"
+        "degré/s degrés/s 度/s unit_degreofarcpers"
     ),
     "rpm": "rpm 1/min u/min r/min rev/min tr/min giri/min upm min-1 min^-1",
     "rev/s": "rev/s revs/s tr/s giri/s",
@@ -62,7 +64,7 @@ _CASES = {
     "mPa": "another unit",
 }
 _STEPPED = re.compile(r"(?:(0?[.,]0*1|1e-\d)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL)
-_SECOND = re.compile(r"sec(ond[saeoi]?)?|sek(unden?)?|秒")
+_SECOND = re.compile(r"sec(on(d[saeoi]?)?)?|sek(unden?)?|秒")
 
 
 def plain_unit(text: str) -> str | None:

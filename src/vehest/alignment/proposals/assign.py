@@ -26,6 +26,7 @@ from vehest.alignment.proposals.columns import (
     candidates,
     correlation,
     largest,
+    magnitudes_beside_signs,
     si_factor,
     slow_of,
     unchanging,
@@ -145,7 +146,8 @@ def propose(
         At most one proposal for a channel and for a column, with evidence and open questions.
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
-    usable = candidates(columns, clock_hz)
+    magnitudes = magnitudes_beside_signs(columns)
+    usable = candidates([column for column in columns if column[0] not in magnitudes], clock_hz)
     wheels, wheel_notes = find_wheels(usable)
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
@@ -178,6 +180,13 @@ def propose(
             f"constant, or of few values, and left out: {abbreviated(constant, MAX_LISTED)}; "
             "check these sensors"
         )
+    proposals = proposals.with_notes(
+        *(
+            f"'{name}' is left out: it is never negative and '{sign}' holds its sign; write the "
+            "signed value to one column"
+            for name, sign in magnitudes.items()
+        )
+    )
     assigned = {proposal.column for proposal in proposals.channels}
     assigned |= {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, *_ in columns if name not in assigned)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +27,7 @@ MIN_CLOCK_SAMPLES = 1000  # samples
 HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
 MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
+_SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")  # of a magnitude
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -138,6 +140,29 @@ def unchanging(columns: Sequence[tuple[str, str, FloatArray, str]]) -> list[str]
             seen = f"{levels[0]:.4g}" if len(levels) == 1 else f"{len(levels)} values"
             texts.append(f"'{name}' ({seen})")
     return texts
+
+
+def magnitudes_beside_signs(
+    columns: Sequence[tuple[str, str, FloatArray, str]],
+) -> dict[str, str]:
+    """Columns that are never negative because another one, named alike, holds their sign.
+
+    Parameters
+    ----------
+    columns : sequence of tuple
+        As `candidates` takes them.
+
+    Returns
+    -------
+    dict
+        Name of a magnitude -> name of the column of its sign, such as ``ESP_VZ_Gierrate``.
+    """
+    signs = {_SIGN.sub("", bare(name)): name for name, *_ in columns if _SIGN.search(bare(name))}
+    return {
+        name: signs[bare(name)]
+        for name, _, values, _ in columns
+        if bare(name) in signs and not np.any(values < 0.0)
+    }
 
 
 def is_unit_of(unit: str, channel: str) -> bool:

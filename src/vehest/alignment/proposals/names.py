@@ -52,8 +52,8 @@ _STRONG = {  # over the name without blanks
         r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
         r"headimu"
     ),
-    "latitude": r"latitude|gpslat$|^lat$|breitengrad",
-    "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
+    "latitude": r"latitude|(gps|gnss|pos)lat$|^lat$|breitengrad",
+    "longitude": r"longitude|(gps|gnss|pos)long?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": (

@@ -434,8 +434,10 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
 
 
 def busiest_rows(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
-    """The rows in which the columns change most, (C, at most ``max_rows``)."""
-    if columns.shape[1] <= max_rows:
+    """The rows in which the columns change most, (C, at most ``max_rows``); all where these are
+    less than a minute, as of a clock whose unit is misread.
+    """
+    if columns.shape[1] <= max_rows or max_rows < minute:
         return columns
     starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):

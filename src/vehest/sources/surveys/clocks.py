@@ -254,7 +254,7 @@ def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> St
     chosen = unit if unit in fitting or not fitting else fitting[0]
     if not unit and is_short and slow:
         chosen, fitting = slow[0], []
-    chosen = chosen or ("s" if named else "")
+    chosen = chosen or ((slow or ["s"])[0] if named else "")
     if not chosen or step * STATED_UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None
     rate = 1.0 / (step * STATED_UNITS[chosen])

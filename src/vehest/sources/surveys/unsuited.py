@@ -1,4 +1,6 @@
-"""Files of text that hold no table with a column a signal: long format, raw frames, quoted rows."""
+"""Files of text that hold no table with a column a signal: JSON, long format, raw frames, quoted
+rows.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +20,8 @@ _NAMES_SIGNAL = re.compile(
 )
 _NAMES_VALUE = re.compile(r"(\w*_)?(value|val|(mess)?wert|reading|data)", re.IGNORECASE)
 _LINE_PROTOCOL = re.compile(r"[^\s,]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d{10,19})?")
+_JSON = re.compile(r"(\d+(\.\d+)?: *)?(\{\s*(\"|$)|\[\s*(\{|\[|$)).*")
+_RECEIVER_MESSAGE = re.compile(r"[#$%][A-Z]\w{3,},.*\*[0-9A-Fa-f]{2,8}")
 _NAMES_FRAME = re.compile(
     r"((can|arb(itration)?|frame|msg|message)?[_ ]?id(entifier)?(_?hex)?)", re.IGNORECASE
 )
@@ -46,10 +50,21 @@ def require_columns_of_signals(
     Raises
     ------
     DataError
-        It holds raw frames of a bus, InfluxDB's line protocol, columns that are aligned by blanks,
-        rows in one pair of quotes, or a value a row (long format).
+        It holds JSON, messages of a satellite receiver, raw frames of a bus, InfluxDB's line
+        protocol, columns that are aligned by blanks, rows in one pair of quotes, or a value a row
+        (long format).
     """
     filled = [line.strip() for line in lines if line.strip()]
+    if filled and _JSON.fullmatch(filled[0]):
+        raise DataError(
+            f"'{file}' is JSON; save a table with a row for each time and a column of each "
+            "quantity, for example by pandas: json_normalize(…).to_csv('wide.csv')"
+        )
+    if filled and all(map(_RECEIVER_MESSAGE.fullmatch, filled[:20])):
+        raise DataError(
+            f"'{file}' holds messages of a satellite receiver (NMEA or NovAtel's ASCII); convert "
+            "them to a table with a column of each quantity, by the receiver's software"
+        )
     if filled and all(map(_CANDUMP.match, filled[:20])):
         raise DataError(
             f"'{file}' holds raw frames of a CAN bus as candump writes them; "
