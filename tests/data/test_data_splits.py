@@ -4,6 +4,7 @@ and splits of papers are theirs.
 
 import math
 import re
+from functools import cache
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
 
@@ -154,6 +155,13 @@ def test_misspelt_splits_are_refused_in_a_single_line(changes, message):
     assert message in refusal(BASE | changes)
 
 
+@cache
+def simulated_names(dataset):
+    """Names of the recordings of a simulated data set; none of any other."""
+    about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
+    return tuple(open_source(about).ids()) if about["source"] == "simulated" else ()
+
+
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_shipped_splits_are_valid(file):
     """Patterns name recordings that the data sets have: those of simulated ones are known, any
@@ -161,12 +169,10 @@ def test_shipped_splits_are_valid(file):
     """
 
     def cruising(dataset):
-        about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
-        names = (
-            open_source(about).ids()
-            if about["source"] == "simulated"
-            else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
-        )
+        names = simulated_names(dataset) or [
+            "some",
+            *re.findall(r"recording: ([^,}\s]+)", text),
+        ]
         speed = np.full(20_000, 20.0)
         lap = 2.0 * np.pi * np.arange(20_000) / 2000.0  # a lap of 100 s
         long = {
