@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache
 
 import numpy as np
@@ -125,7 +125,7 @@ def sliding(seed, slide=0.0):
     ramp[first : first + 100] = slide * np.sin(np.linspace(0.0, np.pi, 100)) ** 2
     ax = drive["ax"] - ramp * drive["yaw_rate"]
     ay = drive["ay"] + np.gradient(ramp, 1.0 / RATE)
-    return replace(drive, channels={**drive.channels, "ax": ax, "ay": ay})
+    return drive.with_channels({"ax": ax, "ay": ay})
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_senseless_values_leave_nothing_behind():
 
 def test_constant_training_channel_is_watched_and_a_training_glitch_sets_no_limit():
     drives = [
-        replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))})
+        drive.with_channels({"steer": np.zeros(len(drive))})
         for drive in map(measured_drive, range(4))
     ]
     model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
@@ -264,7 +264,7 @@ def test_constant_training_channel_is_watched_and_a_training_glitch_sets_no_limi
     drive = measured_drive(0)
     steer = np.array(drive["steer"])
     steer[1234] += 0.2
-    glitched = replace(drive, channels={**drive.channels, "steer": steer})
+    glitched = drive.with_channels({"steer": steer})
     model = learn_health([glitched, measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
     np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
