@@ -4,7 +4,6 @@ samples are.
 
 import math
 import warnings
-from dataclasses import replace
 from functools import cache
 from itertools import cycle, pairwise
 
@@ -380,7 +379,7 @@ def effects_of_wrong_samples(estimator, trust, drive, faults):
         run = GuardedRun(estimator, trust)
         disturbed = run(wrong, drive)["vy"] - guarded
         assert not (run.cleaned.flow[later] == RESTART).any(), (channel, seconds)
-        faulty = replace(drive, channels={**drive.channels, **wrong})
+        faulty = drive.with_channels(wrong)
         alone = estimator.estimate([faulty])[0]["vy"] - bare
         yield [np.sqrt(np.mean(effect[later] ** 2)) for effect in (disturbed, alone)]
 
