@@ -25,8 +25,6 @@ START = 22.0  # s, of each fault: after what a replay looks at beforehand
 CHANNELS = ("yaw_rate", "vx", "ay", "ax")  # of the pre-trained model
 FIRST_ROWS = {  # kind of fault -> reason, and rows (20 Hz) within which it shows
     "constant": (CLOCK_STOPPED, 6),
-    "runs_backwards": (CLOCK_STOPPED, 6),
-    "back_far": (CLOCK_JUMPED, 3),
     "ahead_1_h": (CLOCK_JUMPED, 3),
     "half_rate": (CLOCK_UNEVEN, 12),
 }
@@ -60,18 +58,10 @@ def test_stamps_of_frames_that_fail_make_the_estimate_invalid_with_a_reason(tmp_
     first = int(np.flatnonzero(flagged)[0])
     assert first <= before + 2 + within
     assert invalid[first : first + 15].all()
-    if kind in ("back_far", "ahead_1_h"):
+    if kind == "ahead_1_h":
         assert not flagged[first + 45 :].any(), (
             "a second of missing samples, a second of even stamps"
         )
         assert len(table) - first > 120
     else:
         assert invalid[first:].all()
-
-
-def test_right_stamps_with_jitter_are_not_suspected(tmp_path):
-    written = write_log(planar_drive(SECONDS, RATE, seed=3), tmp_path, jitter=0.001, lost=0.02)
-    words = {"dbc": written.dbc, "signals": signals_for(CHANNELS), "speed": "max"}
-    replay_log(written.log, out=tmp_path / "out.csv", **words)
-    reasons = pd.read_csv(tmp_path / "out.csv")["health_reason"].astype(str)
-    assert not reasons.str.startswith("the time stamps").any()

@@ -119,8 +119,7 @@ def test_kinematic_integration_solves_its_equation_and_fits_the_time_constant():
     truth.values = {"time_constant": 1.7}
     drive = planar_drive(60.0)
     vy = truth.estimate([drive.without_references()])[0]["vy"]
-    integrated = Recording("made", "car", 20.0, 0.0, {**drive.channels, "vy_ref": vy}, "simulated")
-    estimator, record = fitted("kinematic", integrated)
+    estimator, record = fitted("kinematic", drive.with_channels({"vy_ref": vy}))
     assert estimator.values["time_constant"] == pytest.approx(1.7, rel=1e-4)
     assert record.metrics["best_validation_loss"] < 1e-8
 
@@ -130,22 +129,6 @@ def test_zero_is_zero_and_a_map_that_is_not_fitted_or_not_determined_is_refused(
     assert not estimate["vy"].any()
     assert not estimate["sideslip"].any()
     assert "has not been fitted" in refusal(lambda: new("static_map").online(), ConfigurationError)
-    straight = Recording(
-        "straight",
-        "car",
-        20.0,
-        0.0,
-        {**drive.channels, "yaw_rate": np.zeros(len(drive))},
-        "simulated",
-    )
-    constant_speed = Recording(
-        "one speed",
-        "car",
-        20.0,
-        0.0,
-        {**drive.channels, "vx": np.full(len(drive), 20.0)},
-        "simulated",
-    )
-    for recording in (straight, constant_speed):
+    for channel, value in (("yaw_rate", 0.0), ("vx", 20.0)):
         with pytest.raises(DataError, match="do not determine a static map"):
-            fitted("static_map", recording)
+            fitted("static_map", drive.with_channels({channel: np.full(len(drive), value)}))

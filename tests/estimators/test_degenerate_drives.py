@@ -8,7 +8,6 @@ import pytest
 import every_estimator
 from every_estimator import CONFIGS, fitted
 from vehest.data.errors import DataError, VehestError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.luenberger import Luenberger
 from vehest.estimators.model_files import WEIGHTS, load_model, save_model
@@ -23,19 +22,11 @@ NO_CURVES = {"rational_ekf": {}}
 
 def _with(recording, channels):
     values = {
-        name: np.full(len(recording), channels[name]) if name in channels else samples
-        for name, samples in recording.channels.items()
+        name: np.full(len(recording), value)
+        for name, value in channels.items()
+        if name in recording.channels
     }
-    return Recording(
-        recording.id, recording.vehicle, recording.rate_hz, recording.start_time, values
-    )
-
-
-def _shortened(recording, steps):
-    values = {name: samples[:steps] for name, samples in recording.channels.items()}
-    return Recording(
-        recording.id, recording.vehicle, recording.rate_hz, recording.start_time, values
-    )
+    return recording.with_channels(values)
 
 
 DRIVES = {
@@ -47,8 +38,8 @@ DRIVES = {
     "constant_yaw_rate": lambda drive: _with(drive, {"yaw_rate": 0.1}),
     "constant_ay": lambda drive: _with(drive, {"ay": 1.0}),
     "constant_reference": lambda drive: _with(drive, {"vy_ref": 0.0, "sideslip_ref": 0.0}),
-    "two_samples": lambda drive: _shortened(drive, 2),
-    "forty_samples": lambda drive: _shortened(drive, 40),
+    "two_samples": lambda drive: drive.part(slice(0, 2)),
+    "forty_samples": lambda drive: drive.part(slice(0, 40)),
 }
 
 

@@ -102,8 +102,7 @@ def test_drives_of_any_length_are_independent_and_force_trust_has_hysteresis():
     assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
-@pytest.mark.parametrize("inputs", ["full", "imu"])
-def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
+def test_online_agrees_with_batch_through_gaps_and_standstill():
     drive = dugoff_drive(6.0, 7)
     gap = drive["ay"].copy()
     slow = drive["vx"].copy()
@@ -115,13 +114,13 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
         {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)},
         ("ay", "fy_fl"),
     )
-    estimator = estimator_with(inputs)
+    estimator = estimator_with()
     batch = estimator.estimate([drive.without_references()])[0]
     online = online_rows(estimator, drive)
     for name in ("vy", "yaw_rate"):
         np.testing.assert_allclose([row[name] for row in online], batch[name], rtol=0.0, atol=1e-9)
     assert np.isfinite(batch["sideslip"]).all()
-    assert batch["nis_dof"][160] == (3.0 if inputs == "full" else 1.0)
+    assert batch["nis_dof"][160] == 3.0
     rolling = np.flatnonzero(drive["vx"] < 3.0)
     assert (batch["nis_dof"][rolling] == 0.0).all()
     np.testing.assert_allclose(

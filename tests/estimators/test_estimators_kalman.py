@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from refusals import refusal
 
-from every_estimator import online_rows
 from single_track_drive import NOISE, linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import FitData
@@ -79,12 +78,6 @@ def test_samples_that_are_missing_are_skipped():
     assert (estimate.covariance[1100:1200, 0, 0] > 1.2 * complete.covariance[1100:1200, 0, 0]).all()
     error = np.degrees(estimate["sideslip"] - states[:, 0])[1100:1200]
     assert np.abs(error).max() < 2.0
-    stepper = estimator.online()
-    online = [
-        stepper.step({name: gappy[name][k] for name in estimator.channels})["vy"]
-        for k in range(1300)
-    ]
-    assert np.abs(np.array(online) - estimate["vy"][:1300]).max() < 1e-9
 
 
 def test_speed_and_steering_may_not_be_missing():
@@ -103,10 +96,8 @@ def test_speed_and_steering_may_not_be_missing():
 
 def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():
     drive = linear_drive(20.0, seed=6)[0]
-    slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
-    estimate = kalman(**CONFIGURED_NOISE).estimate(
-        [type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)]
-    )[0]
+    slow = drive.with_channels({"vx": np.linspace(20.0, -1.0, len(drive))})
+    estimate = kalman(**CONFIGURED_NOISE).estimate([slow])[0]
     assert np.isfinite(estimate["vy"]).all()
     assert np.isfinite(estimate.covariance).all()
     drive = linear_drive(2.0)[0]
@@ -133,16 +124,8 @@ def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed()
     ],
 )
 def test_unreadable_levels_are_a_clear_error(name, samples, message):
-    drive = linear_drive(30.0)[0]
-    wrong = type(drive)(
-        "linear",
-        "car",
-        100.0,
-        0.0,
-        {**drive.channels, name: samples},
-        "simulated",
-        frozenset({"ay"}),
-    )
+    drive = replace(linear_drive(30.0)[0], gappy=frozenset({"ay"}))
+    wrong = drive.with_channels({name: samples})
     with pytest.raises(DataError, match=message):
         kalman().fit(FitData([wrong], []), NoTraining())
 
@@ -155,9 +138,7 @@ def with_planted_offsets(seed, ay, steer):
         "ay": drive["ay"] + ay * generator.standard_normal(),
         "steer": drive["steer"] + steer * generator.standard_normal(),
     }
-    return replace(
-        drive.without_references(), channels={**drive.without_references().channels, **shifted}
-    ), states
+    return drive.without_references().with_channels(shifted), states
 
 
 def augmented(drive, ay, steer, seconds):
@@ -200,7 +181,7 @@ def augmented(drive, ay, steer, seconds):
 OFFSETS = {"ay": 0.6, "steer": 0.01, "seconds": 100.0}
 
 
-def test_offsets_are_the_states_of_an_augmented_filter_online_too():
+def test_offsets_are_the_states_of_an_augmented_filter():
     drive, _ = with_planted_offsets(3, 0.6, 0.01)
     means, covariances = augmented(drive, **OFFSETS)
     estimator = kalman(**CONFIGURED_NOISE, offsets=OFFSETS)
@@ -211,7 +192,3 @@ def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     assert estimator.estimate([drive])[0]["yaw_rate"] == pytest.approx(means[:, 1], abs=1e-8)
     estimator = kalman(**CONFIGURED_NOISE, offsets=OFFSETS, gate=5.0)
     assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
-    drive, _ = with_planted_offsets(1, 0.6, 0.01)
-    batch = estimator.estimate([drive])[0]
-    online = [row["vy"] for row in online_rows(estimator, drive)]
-    assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9

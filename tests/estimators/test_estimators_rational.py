@@ -33,9 +33,12 @@ def rational(tyres="rational_adaptive", **config):
     curves = {
         name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")
     }
-    return estimator_class("rational_ekf").from_config(
-        {"tyres": tyres, "noise": LEVEL, "curves": curves, **config}
-    )
+    return unfitted(**{"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
+
+
+def unfitted(**config):
+    """A filter whose curves or levels are not given."""
+    return estimator_class("rational_ekf").from_config(config)
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +130,8 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     samples = np.full((count, 4), np.nan)
     samples[:, 1] = 25.0
     samples[:, 3] = 0.02
-    ours = filtered_as_readable(estimator, samples)
     unscented = rational("rational", curves=curves, filter="unscented").filter_samples(samples)
-    for filtered in (ours, unscented):
+    for filtered in (filtered_as_readable(estimator, samples[:80]), unscented):
         begun_anew = np.isclose(filtered.deviation[1:, 0], 0.05) & (filtered.mean[1:, 2] == 0.0)
         assert begun_anew.any() == unstable
         assert np.abs(filtered.mean[:, 0]).max() < 1.5
@@ -141,8 +143,7 @@ def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres
     they were.
     """
     estimator = rational(tyres, largest_sideslip=np.radians(1.5))
-    short = drive.cut(0.0, 8.0)
-    samples = short.stack(estimator.channels)
+    samples = drive.cut(0.0, 4.0).stack(estimator.channels)
     ours = filtered_as_readable(estimator, samples)
     free = rational(tyres).filter_samples(samples).mean
     assert np.abs(free[:, 0]).max() > np.radians(1.5)
@@ -153,8 +154,7 @@ def test_sideslip_beyond_its_limit_restarts_motion_and_tyres_in_both_forms(tyres
 
 @pytest.mark.parametrize(
     "config",
-    [{"tyres": tyres} for tyres in KINDS]
-    + [{"filter": "unscented"}, {"filter": "unscented", "adapt_above": 2.0}],
+    [{"tyres": "rational_friction"}, {"filter": "unscented", "adapt_above": 2.0}],
 )
 def test_online_is_batch_through_gaps_and_a_stop_and_from_its_file(config, drive, tmp_path):
     gappy = with_gaps(drive, {"yaw_rate": slice(100, 120), "ay": slice(110, 150)}).cut(0.0, 12.0)
@@ -265,7 +265,7 @@ def test_standing_and_reversing_cars_roll_without_slip_and_adapt_no_tyres(kind, 
 def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected():
     train = rational_drive(60.0, seed=4)
     validation_drive = rational_drive(40.0, seed=5)
-    estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    estimator = unfitted(tyres="rational")
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
     assert "has no axle curves yet; fit or load it first" in refusal(
         lambda: estimator.online(), ConfigurationError
@@ -287,7 +287,7 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
             ** 2
         )
     )
-    second_filter = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    second_filter = unfitted(tyres="rational")
     second_filter.load_weights(estimator.weights())
     assert np.array_equal(
         second_filter.estimate([validation_drive])[0]["vy"],
@@ -305,7 +305,7 @@ def test_stiffness_intervals_cover_the_truth_with_offset_sensors(fault):
         "slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)},
         "force": {"ay": 1.05 * drive["ay"]},
     }[fault]
-    estimator = estimator_class("rational_ekf").from_config({})
+    estimator = unfitted()
     record = estimator.fit(FitData([changed(drive, wrong)], []), NoiseTuningSettings(method="data"))
     for name in ("c2_front", "c2_rear"):
         assert abs(record.metrics[name] - CURVES[name]) < record.metrics[f"{name}_interval"]
@@ -313,13 +313,10 @@ def test_stiffness_intervals_cover_the_truth_with_offset_sensors(fault):
 
 def test_unscented_levels_are_searched_through_the_extended_filter_within_limits():
     train = rational_drive(30.0, seed=9)
-    estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    estimator = unfitted(tyres="rational")
     assert estimator.fit(FitData([train], []), QUICK).metrics["levels_at_limits"] == 0
     train = rational_drive(30.0, seed=8)
-    fitted = [
-        estimator_class("rational_ekf").from_config({"filter": kind})
-        for kind in ("extended", "unscented")
-    ]
+    fitted = [unfitted(filter=kind) for kind in ("extended", "unscented")]
     for estimator in fitted:
         estimator.fit(FitData([train], []), NoiseTuningSettings(grid=1, max_evaluations=5))
     assert fitted[0].values == fitted[1].values
@@ -330,10 +327,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
     """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
     train = rational_drive(60.0, seed=4)
     worn = rational_drive(60.0, seed=7, stiffness=0.85)
-    alone, two_drives = (
-        estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}})
-        for spread in (None, 0.2)
-    )
+    alone, two_drives = (unfitted(curves={"deviation": spread}) for spread in (None, 0.2))
     alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
     two_drives.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
     assert np.array_equal(alone.axle_curves, two_drives.axle_curves)
@@ -354,7 +348,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
 
 def test_levels_of_the_data_need_no_search_and_full_settings_no_fit():
     train = rational_drive(30.0, seed=6)
-    estimator = estimator_class("rational_ekf").from_config({"noise": {"tyres": 0.02}})
+    estimator = unfitted(noise={"tyres": 0.02})
     record = estimator.fit(FitData([train], []), NoiseTuningSettings(method="data"))
     assert record.metrics["noise_tyres"] == 0.02
     assert record.metrics["noise_yaw_rate"] == pytest.approx(NOISE["yaw_rate"], rel=0.2)
@@ -372,9 +366,7 @@ def test_levels_of_the_data_need_no_search_and_full_settings_no_fit():
 )
 def test_optuna_reaches_the_minimum_and_improves_levels_within_their_box():
     train = rational_drive(30.0, seed=9)
-    few_trials, many_trials = (
-        estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2)
-    )
+    few_trials, many_trials = (unfitted(tyres="rational") for _ in range(2))
     records = [
         search.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n))
         for search, n in ((few_trials, 3), (many_trials, 25))

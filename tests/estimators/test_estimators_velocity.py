@@ -8,8 +8,8 @@ import torch
 from refusals import refusal
 
 from conftest import flat_weights, planar_drive, stop_after
+from single_track_drive import with_gaps
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.networks import velocity_recurrent
 from vehest.estimators.networks.velocity_recurrent import (
@@ -26,17 +26,10 @@ INPUTS = ["yaw_rate", "ax", "ay"]
 QUICK = SequenceSettings(PhaseSettings(max_epochs=3, learning_rate=1e-2), 60, 100, 20, batch_size=2)
 
 
-def _drive(seconds=2.5, seed=0, scale=1.0):
+def _drive(seconds=2.5, seed=0):
     """A planar drive at 100 Hz with a reference of the yaw rate."""
     drive = planar_drive(seconds, 100.0, seed, noise=0.02, name=f"drive {seed}")
-    channels = {
-        **drive.channels,
-        "yaw_rate_ref": drive["yaw_rate"],
-        "vy_ref": scale * drive["vy_ref"],
-    }
-    return Recording(
-        drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, "simulated"
-    )
+    return drive.with_channels({"yaw_rate_ref": drive["yaw_rate"]})
 
 
 DATA = FitData([_drive(seed=1), _drive(0.5, seed=2)], [_drive(seed=3)])
@@ -84,16 +77,11 @@ def test_error_in_dropped_samples_teaches_nothing(name):
     """
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
     complete = _drive(seed=1)
-    spoilt = {
-        **complete.channels,
-        "vy_ref": np.where(np.arange(250) < 20, -complete["vy_ref"], complete["vy_ref"]),
-    }
+    vy = complete["vy_ref"]
+    spoilt = complete.with_channels({"vy_ref": np.where(np.arange(250) < 20, -vy, vy)})
     # means and deviations of the references must not move either
     estimators = []
-    for drive in (
-        complete,
-        Recording(complete.id, complete.vehicle, 100.0, 0.0, spoilt, "simulated"),
-    ):
+    for drive in (complete, spoilt):
         estimator = _estimator(name, outputs=["vy"])
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(velocity_recurrent.VelocityNetwork, "standardise", lambda *_: None)
@@ -328,11 +316,7 @@ def test_recordings_too_short_or_with_gaps_are_a_clear_error():
         ConfigurationError, match=r"sequence_steps must be more than dropped_steps \(200\), not 100"
     ):
         SequenceSettings(sequence_steps=100)
-    drive = _drive()
-    holes = {**drive.channels, "vy_ref": np.where(np.arange(250) == 7, np.nan, drive["vy_ref"])}
-    gappy = Recording(
-        drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"})
-    )
+    gappy = with_gaps(_drive(), {"vy_ref": 7})
     assert "'vy_ref' has gaps" in refusal(
         lambda: _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK)
     )

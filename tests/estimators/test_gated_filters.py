@@ -72,13 +72,11 @@ def estimator(name, gate=None):
 def drive(name):
     """Two drives one after the other, as if the car had jumped from one motion to another."""
     first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
-    return replace(
-        first,
-        channels={
-            channel: np.concatenate([values, second[channel]])
-            for channel, values in first.channels.items()
-        },
-    )
+    joined = {
+        channel: np.concatenate([values, second[channel]])
+        for channel, values in first.channels.items()
+    }
+    return replace(first, channels=joined)
 
 
 def spoilt(name, value):
@@ -86,7 +84,7 @@ def spoilt(name, value):
     recording = drive(name)
     ay = recording["ay"].copy()
     ay[round(SPIKE * recording.rate_hz)] = value
-    return replace(recording, channels={**recording.channels, "ay": ay})
+    return recording.with_channels({"ay": ay})
 
 
 def vy(gated, recording):
@@ -96,16 +94,16 @@ def vy(gated, recording):
 @pytest.mark.parametrize(
     "name", [name for name in CONFIGS if name != "cnn_ukf"]
 )  # whose network sees the spike, too
-@pytest.mark.parametrize("size", [1e6, -1e3])
-def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
+def test_a_spike_is_as_good_as_a_sample_that_is_missing(name):
     gated = estimator(name, 6.0)
     free = estimator(name)
     at = round(SPIKE * drive(name).rate_hz)
     clean = vy(gated, drive(name))
-    spike = vy(gated, spoilt(name, size))
+    spoilt_drive = spoilt(name, -1e3)
+    spike = vy(gated, spoilt_drive)
     harm = np.abs(spike - clean)[at : at + 20].max()
     assert harm < 0.2
-    believed = np.abs(vy(free, spoilt(name, size)) - vy(free, drive(name)))[at : at + 20]
+    believed = np.abs(vy(free, spoilt_drive) - vy(free, drive(name)))[at : at + 20]
     assert not (believed <= 5.0 * harm).all(), "a free filter believes it"
 
 

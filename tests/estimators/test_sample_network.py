@@ -10,7 +10,6 @@ import torch
 
 from dugoff_drive import dugoff_drive
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.kernels.sample_network import (
     LEVELS,
@@ -20,7 +19,6 @@ from vehest.estimators.kernels.sample_network import (
     outputs_of,
     squared_error,
 )
-from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork
 from vehest.estimators.registry import estimator_class
 from vehest.training.samples import SampleSettings
@@ -34,11 +32,11 @@ SEEDS = torch.tensor([7, 8, 9])
 def loaded_drive(seconds=8.0, seed=0, name="drive"):
     """A drive on Dugoff's tyres with the forces that it lacks: shared out evenly, or at rest."""
     drive = dugoff_drive(seconds, seed, name=name)
-    channels = dict(drive.channels)
+    forces = {}
     for corner in ("fl", "fr", "rl", "rr"):
-        channels[f"fx_{corner}"] = 492.5 * drive["ax"]
-        channels[f"fz_{corner}"] = np.full(len(drive), 4831.0)
-    return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, drive.kind)
+        forces[f"fx_{corner}"] = 492.5 * drive["ax"]
+        forces[f"fz_{corner}"] = np.full(len(drive), 4831.0)
+    return drive.with_channels(forces)
 
 
 DATA = FitData([loaded_drive(seed=1), loaded_drive(4.0, seed=2)], [loaded_drive(4.0, seed=3)])
@@ -177,7 +175,7 @@ def fitted(training=QUICK, **config):
 
 
 @pytest.mark.parametrize("inputs", ["full", "imu"])
-def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs, tmp_path):
+def test_the_feed_forward_network_learns_and_reports_its_error(inputs):
     estimator, record = fitted(LONGER, inputs=inputs)
     assert estimator.channels == INPUTS[inputs]
     assert len(INPUTS["full"]) == 17
@@ -186,12 +184,6 @@ def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs, tmp
     estimate = estimator.estimate([drive.without_references()])[0]
     error = np.mean(np.square(estimate["sideslip"] - drive["sideslip_ref"]))
     assert error == pytest.approx(record.metrics["best_validation_loss"], rel=1e-4)
-    save_model(estimator, tmp_path)
-    stepper = load_model(tmp_path).online()
-    steps = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(50)]
-    np.testing.assert_allclose(
-        [step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6
-    )
 
 
 def test_inputs_are_scaled_by_their_range_or_to_z_scores():

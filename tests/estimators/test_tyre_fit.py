@@ -1,12 +1,12 @@
 """Fits of tyre curves against cars whose curves are known."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from refusals import refusal
 
+from single_track_drive import with_gaps
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import (
@@ -85,22 +85,9 @@ def test_forces_without_noise_are_those_of_the_car_and_refusals_name_the_remedy(
         )
     recording = drive()
     assert "100 are needed" in refusal(lambda: axle_motion([recording.cut(0.0, 1.0)], TRUCK))
+    mirrored = recording.with_channels({name: -recording[name] for name in ("ay", "yaw_rate")})
     with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
-        fit_motion(
-            axle_motion(
-                [
-                    replace(
-                        recording,
-                        channels={
-                            **recording.channels,
-                            "ay": -recording["ay"],
-                            "yaw_rate": -recording["yaw_rate"],
-                        },
-                    )
-                ],
-                TRUCK,
-            )
-        )
+        fit_motion(axle_motion([mirrored], TRUCK))
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
@@ -132,9 +119,7 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
         f"fy_{wheel}": np.full(len(recording), value)
         for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))
     }
-    motion = axle_motion(
-        [replace(recording, channels={**recording.channels, **wheels})], TRUCK, measured_forces=True
-    )
+    motion = axle_motion([recording.with_channels(wheels)], TRUCK, measured_forces=True)
     np.testing.assert_allclose(
         motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1)
     )
@@ -145,19 +130,9 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     )
     recording = drive()
     slow = np.array(recording["vx"])
-    unknown = np.array(recording["ay"])
     slow[:500] = 1.0
-    unknown[1000:1100] = np.nan
-    motion = axle_motion(
-        [
-            replace(
-                recording,
-                channels={**recording.channels, "vx": slow, "ay": unknown},
-                gappy=frozenset({"ay"}),
-            )
-        ],
-        TRUCK,
-    )
+    gappy = with_gaps(recording.with_channels({"vx": slow}), {"ay": slice(1000, 1100)})
+    motion = axle_motion([gappy], TRUCK)
     assert motion.slip.shape == motion.force.shape == (2, len(motion.block))
     assert (
         len(motion.block) == len(recording) - 500 - 100 - 24 - 12

@@ -93,10 +93,11 @@ def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     assert torch.equal(raised[1], large)
 
 
+@pytest.mark.parametrize("is_correlated", [True, False])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-5)])
-def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
+def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance, is_correlated):
     generator = torch.Generator().manual_seed(2)
-    noise = drawn(StateDependentNoise(START, 3), 1.0, 1)
+    noise = drawn(StateDependentNoise(START, 3, is_correlated), 1.0, 1)
     noise.begin(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.2]).diag(), 10.0, torch.tensor([2.0, 0.5, 1.0]))
     noise.to(dtype)
     states = torch.randn(7, 3, generator=generator).to(dtype)

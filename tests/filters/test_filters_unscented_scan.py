@@ -5,7 +5,6 @@ That one is filterpy's to 1e-8 (test_filters_nonlinear).
 
 import dataclasses
 from collections import namedtuple
-from functools import partial
 
 import pytest
 import torch
@@ -66,8 +65,7 @@ def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
 
 def by_the_filter(p, rule, measurements, inputs, lower_bound, _):
     model = dataclasses.replace(
-        pendulum_with_radar(),
-        transition=partial(swung, p.gravity),
+        pendulum_with_radar(p.gravity),
         process_noise=constant(p.process),
         observation_noise=constant(p.observation),
         constrain=lambda x: torch.where(x >= lower_bound, x, lower_bound),
@@ -76,12 +74,8 @@ def by_the_filter(p, rule, measurements, inputs, lower_bound, _):
 
 
 def by_the_scan(p, rule, measurements, inputs, lower_bound, share):
-    model = TorchModel(
-        partial(swung, p.gravity),
-        pendulum_with_radar().observation,
-        [p.gravity],
-        lower_bound.tolist(),
-    )
+    pendulum = pendulum_with_radar(p.gravity)
+    model = TorchModel(pendulum.transition, pendulum.observation, [p.gravity], lower_bound.tolist())
     return unscented_scan(
         model,
         measurements,
@@ -91,18 +85,6 @@ def by_the_scan(p, rule, measurements, inputs, lower_bound, share):
         p.observation,
         rule,
         share=share,
-    )
-
-
-def swung(gravity, x, u):
-    angle, rate, damping = x.unbind(-1)
-    return torch.stack(
-        [
-            angle + STEP * rate,
-            rate + STEP * (u[..., 0] - gravity * torch.sin(angle) - damping * rate),
-            damping,
-        ],
-        -1,
     )
 
 
@@ -317,13 +299,14 @@ def test_stepper_matches_the_scan():
 
 def test_moved_is_the_transition_with_its_gradient():
     gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
-    model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
+    pendulum = pendulum_with_radar(gravity)
+    model = TorchModel(pendulum.transition, pendulum.observation, [gravity])
     states, inputs = (
         torch.randn(6, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
         for n in (3, 1)
     )
     after = moved(model, states, inputs)
-    assert torch.equal(after, swung(gravity.detach(), states, inputs))
+    assert torch.equal(after, pendulum.transition(states, inputs))
     (slope,) = torch.autograd.grad(after[:, 1].sum(), gravity)
     assert slope == pytest.approx(float(-STEP * torch.sin(states[:, 0]).sum()))
 

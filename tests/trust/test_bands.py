@@ -20,7 +20,6 @@ from vehest.trust.bands import (
     TERMS,
     Piece,
     band_inputs,
-    band_rows,
     block_labels,
     calibrated,
     fitted_scale,
@@ -116,13 +115,13 @@ def test_each_block_counts_once_and_blocks_that_say_nothing_as_their_samples():
 
 
 def test_coverage_of_a_further_block_averages_the_level():
-    """Over 4000 draws of 12 blocks of unlike sizes and a further one.
+    """Over 1000 draws of 12 blocks of unlike sizes and a further one.
 
-    Tolerance: three standard errors, each about 0.006 at 0.5.
+    Tolerance: three standard errors, each about 0.012 at 0.5.
     """
     rng = np.random.default_rng(4)
-    covered = {level: np.empty(4000) for level in (0.5, 0.68, 0.9)}
-    for draw in range(4000):
+    covered = {level: np.empty(1000) for level in (0.5, 0.68, 0.9)}
+    for draw in range(1000):
         sizes = rng.integers(5, 60, 13)
         blocks = np.repeat(np.arange(13), sizes)
         scores = np.abs(
@@ -184,53 +183,6 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
         rtol=1e-13,
         equal_nan=True,
     )
-
-
-def test_bands_agree_row_by_row_and_are_finite_where_estimates_are():
-    packed = bands_of().packed()
-    piece = piece_of(np.random.default_rng(7), 50)
-    together = np.empty((50, 2))
-    single_row = np.empty((1, 2))
-    unchecked = np.zeros(50)
-    band_rows(
-        piece.rows, piece.vy, piece.variance, unchecked, packed.columns, packed.numbers, together
-    )
-    for k in range(50):
-        band_rows(
-            piece.rows[k : k + 1],
-            piece.vy[k : k + 1],
-            piece.variance[k : k + 1],
-            unchecked[k : k + 1],
-            packed.columns,
-            packed.numbers,
-            single_row,
-        )
-        assert np.array_equal(single_row[0], together[k])
-    bands = bands_of()
-    piece = piece_of(np.random.default_rng(8), 20)
-    rows = piece.rows.copy()
-    vy = piece.vy.copy()
-    rows[:10] = np.nan
-    vy[15] = np.nan
-    half = bands.half_widths(rows, vy, piece.variance)
-    assert np.isfinite(half).all(axis=1).tolist() == [k != 15 for k in range(20)]
-    assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
-
-
-def test_bands_widen_with_the_excess_over_training_and_where_nothing_was_measured():
-    bands = bands_of()
-    flat = replace(bands, vy=replace(bands.vy, weights={"one": 1.0}))
-    rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
-    rows[1, 2] = 1.7 * bands.largest["ay"]
-    inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
-    assert outside / inside == pytest.approx(1.7)
-    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[
-        0, 0
-    ] == pytest.approx(OTHER_VEHICLE * inside)
-    rows = np.tile([0.0, 25.0, bands.largest["ay"], 0.0, 0.0], (2, 1))
-    rows[1, 2] = np.nan
-    half = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))
-    assert half[0] == pytest.approx(half[1])
 
 
 def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewhere():

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache
 
 import numpy as np
@@ -54,10 +54,10 @@ def judged(model, drive, **faulty):
     return health_rows(model.packed(), np.ascontiguousarray(rows), np.isfinite(rows), model.start())
 
 
-def after(values, change):
+def after(values, change, onset=ONSET):
     """The same samples, changed from the onset on."""
     changed = np.array(values)
-    changed[ONSET:] = change(changed[ONSET:]) if callable(change) else change
+    changed[onset:] = change(changed[onset:]) if callable(change) else change
     return changed
 
 
@@ -125,7 +125,7 @@ def sliding(seed, slide=0.0):
     ramp[first : first + 100] = slide * np.sin(np.linspace(0.0, np.pi, 100)) ** 2
     ax = drive["ax"] - ramp * drive["yaw_rate"]
     ay = drive["ay"] + np.gradient(ramp, 1.0 / RATE)
-    return replace(drive, channels={**drive.channels, "ax": ax, "ay": ay})
+    return drive.with_channels({"ax": ax, "ay": ay})
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_senseless_values_leave_nothing_behind():
 
 def test_constant_training_channel_is_watched_and_a_training_glitch_sets_no_limit():
     drives = [
-        replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))})
+        drive.with_channels({"steer": np.zeros(len(drive))})
         for drive in map(measured_drive, range(4))
     ]
     model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
@@ -264,23 +264,30 @@ def test_constant_training_channel_is_watched_and_a_training_glitch_sets_no_limi
     drive = measured_drive(0)
     steer = np.array(drive["steer"])
     steer[1234] += 0.2
-    glitched = replace(drive, channels={**drive.channels, "steer": steer})
+    glitched = drive.with_channels({"steer": steer})
     model = learn_health([glitched, measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
     np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
 
-def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
-    channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
-    drives = [small_car_drive(60.0, seed) for seed in range(4)]
-    model = learn_health(drives[:2], drives[2:3], channels, 100.0)
-    assert np.mean(judged(model, drives[3]).status == VALID) > 0.99
+MOTOR_CHANNELS = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
+
+
+def assert_faults_are_flagged(model, drive, onset, within):
+    """Without a measured speed a wrong sign, a wrong unit and a frozen motor speed are flagged."""
     for channel, change in (
         ("yaw_rate", np.negative),
         ("ay", lambda part: part / 9.81),
         ("motor_speed", lambda part: part[0]),
     ):
-        health = judged(model, drives[3], **{channel: after(drives[3][channel], change)})
-        assert (health.status[ONSET : ONSET + 100] > VALID).any(), channel
+        health = judged(model, drive, **{channel: after(drive[channel], change, onset)})
+        assert (health.status[onset : onset + within] > VALID).any(), channel
+
+
+def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
+    drives = [small_car_drive(60.0, seed) for seed in range(4)]
+    model = learn_health(drives[:2], drives[2:3], MOTOR_CHANNELS, 100.0)
+    assert np.mean(judged(model, drives[3]).status == VALID) > 0.99
+    assert_faults_are_flagged(model, drives[3], ONSET, 100)
 
 
 @pytest.mark.parametrize("braking", [False, True])
@@ -348,42 +355,30 @@ def test_the_ferrari_is_flagged_at_its_steering_glitches_and_rarely_elsewhere(
     assert turned.status[ONSET] == INVALID
 
 
+def f1tenth(data_root, run):
+    return real_drive(data_root, run, "f1tenth").without_references()
+
+
+def f1tenth_model(data_root, runs):
+    """Health fitted to runs, the last of which is for validation, and that one."""
+    drives = [f1tenth(data_root, f"iros_hoons_1_with_friction_run_{k}") for k in runs]
+    return learn_health(drives[:-1], drives[-1:], MOTOR_CHANNELS, 100.0), drives[-1]
+
+
 def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root):
-    runs = [
-        real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references()
-        for k in (1, 3, 4, 0)
-    ]
-    channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
-    model = learn_health(runs[:3], runs[3:], channels, 100.0)
-    healthy = judged(model, runs[3])
+    model, drive = f1tenth_model(data_root, (1, 3, 4, 0))
+    healthy = judged(model, drive)
     outside = np.array(
         [reason_kind(code) == kernel.OUTSIDE for code in healthy.reason]
     )  # three runs hold less than all of ay
     assert not healthy.status[~outside].any()
-    first = len(runs[3]) // 3
-    for channel, change in (
-        ("yaw_rate", np.negative),
-        ("ay", lambda part: part / 9.81),
-        ("motor_speed", lambda part: part[0]),
-    ):
-        changed = np.array(runs[3][channel])
-        changed[first:] = change(changed[first:])
-        health = judged(model, runs[3], **{channel: changed})
-        assert (health.status[first : first + 300] > VALID).any(), channel
+    assert_faults_are_flagged(model, drive, len(drive) // 3, 300)
 
 
 def test_a_steering_at_its_lock_is_not_frozen(data_root):
-    runs = [
-        real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references()
-        for k in (1, 2, 3, 4, 0)
-    ]
-    model = learn_health(
-        runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0
-    )
+    model, _ = f1tenth_model(data_root, (1, 2, 3, 4, 0))
     assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=3e-3)
-    at_lock = real_drive(
-        data_root, "hoons_all_test_run_21", "f1tenth"
-    ).without_references()  # stays at full lock for 5 s
+    at_lock = f1tenth(data_root, "hoons_all_test_run_21")  # stays at full lock for 5 s
     health = judged(model, at_lock)
     assert kernel.FROZEN not in {
         reason_kind(code)

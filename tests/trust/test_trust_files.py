@@ -22,7 +22,7 @@ from vehest.trust.guard import MAX_TAN_SIDESLIP, MAX_TOP_SPEED
 from vehest.trust.record import TRUST, read_trust, write_trust
 
 YESTERDAY = Path(__file__).parents[1] / "yesterday"
-N_MUTATIONS = 400
+N_MUTATIONS = 200
 CHANNELS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason")
 
 
@@ -118,15 +118,10 @@ def test_something_else_than_a_file_is_refused_and_never_counts_as_no_calibratio
 @pytest.mark.parametrize("entries", [1, 60])
 def test_further_channels_of_bands_are_refused(folder, entries):
     path = folder / TRUST
-    trust = read_trust(folder)
     text = path.read_text(encoding="utf-8")
-    extra_channels = "".join(
-        f"  - wheel_speed_{place}\n" for place in ("fl", "fr", "rl", "rr") * 15
-    )
-    extra_channels = "".join(extra_channels.splitlines(keepends=True)[:entries])
     begin = text.index("  channels:\n", text.index("bands:\n")) + len("  channels:\n")
-    assert trust.bands is not None
-    path.write_text(text[:begin] + extra_channels + text[begin:], encoding="utf-8")
+    further_channels = entries * "  - wheel_speed_fl\n"
+    path.write_text(text[:begin] + further_channels + text[begin:], encoding="utf-8")
     message = answers(folder)
     assert isinstance(message, str)
     assert "channel" in message

@@ -23,30 +23,37 @@ def code(kind, channel):
     return 10_000.0 * kind + 100.0 * NUMBERS[channel]
 
 
-def heeded(kind, channel, *, adapts=False, starts_anew=True, status=2, first=10, last=40):
+def heeded(kind, channel, status=2, first=10, last=40, rows_together=STEPS, **family):
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to
     ``last``.
     """
     statuses = np.zeros(STEPS)
-    reasons = np.zeros(STEPS)
     statuses[first:last] = status
-    reasons[first:last] = code(kind, channel)
+    return isolated(statuses, code(kind, channel), rows_together, **family)
+
+
+def isolated(statuses, reason, rows_together=STEPS, *, adapts=False, starts_anew=True):
+    """The same for any statuses with one reason, some rows at a time."""
+    reasons = np.where(statuses > 0, reason, 0.0)
     rows = np.ones((STEPS, 3))
     measured = np.ones((STEPS, 3), np.bool_)
     flow = np.full(STEPS, USE, np.int8)
-    isolate_rows(
-        statuses,
-        reasons,
-        NUMBERS_OF,
-        SKIPPABLE,
-        starts_anew,
-        adapts,
-        PERSISTENT,
-        rows,
-        measured,
-        flow,
-        np.zeros(2),
-    )
+    state = np.zeros(2)
+    for k in range(0, STEPS, rows_together):
+        part = slice(k, k + rows_together)
+        isolate_rows(
+            statuses[part],
+            reasons[part],
+            NUMBERS_OF,
+            SKIPPABLE,
+            starts_anew,
+            adapts,
+            PERSISTENT,
+            rows[part],
+            measured[part],
+            flow[part],
+            state,
+        )
     return rows, measured, flow
 
 
@@ -72,57 +79,20 @@ def test_a_verdict_that_is_no_sensor_fault_changes_nothing(kind):
 def test_recursive_families_restart_once_and_adaptive_ones_every_second():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
     assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
-    assert np.flatnonzero(
-        heeded(kernel.SCALE, "vx", adapts=True, starts_anew=False)[2] == RESTART
-    ).tolist() == [19, 29, 39]
-    assert not (heeded(kernel.OFFSET, "ay", adapts=True, starts_anew=False)[2] == RESTART).any()
-    reasons = np.zeros(STEPS)
-    statuses = np.zeros(STEPS)
-    statuses[10:40] = 2.0
-    reasons[10:40] = code(kernel.SCALE, "vx")
-    rows = np.ones((STEPS, 3))
-    measured = np.ones((STEPS, 3), np.bool_)
-    flow = np.full(STEPS, USE, np.int8)
-    state = np.zeros(2)
-    for k in range(STEPS):
-        part = slice(k, k + 1)
-        isolate_rows(
-            statuses[part],
-            reasons[part],
-            NUMBERS_OF,
-            SKIPPABLE,
-            False,
-            True,
-            PERSISTENT,
-            rows[part],
-            measured[part],
-            flow[part],
-            state,
-        )
-    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", adapts=True, starts_anew=False)[2])
+    adaptive = {"adapts": True, "starts_anew": False}
+    for rows_together in (STEPS, 1):
+        flow = heeded(kernel.SCALE, "vx", rows_together=rows_together, **adaptive)[2]
+        assert np.flatnonzero(flow == RESTART).tolist() == [19, 29, 39]
+    assert not (heeded(kernel.OFFSET, "ay", **adaptive)[2] == RESTART).any()
 
 
 def test_a_fault_shorter_than_a_second_restarts_nothing():
     statuses = np.zeros(STEPS)
     statuses[10:19] = 2.0
     statuses[19:55] = 1.0
-    reasons = np.where(statuses > 0, code(kernel.SCALE, "vx"), 0.0)
     for adapts in (False, True):
-        flow = np.full(STEPS, USE, np.int8)
-        isolate_rows(
-            statuses,
-            reasons,
-            NUMBERS_OF,
-            SKIPPABLE,
-            not adapts,
-            adapts,
-            PERSISTENT,
-            np.ones((STEPS, 3)),
-            np.ones((STEPS, 3), np.bool_),
-            flow,
-            np.zeros(2),
-        )
-        assert (flow == USE).all()
+        family = {"adapts": adapts, "starts_anew": not adapts}
+        assert (isolated(statuses, code(kernel.SCALE, "vx"), **family)[2] == USE).all()
 
 
 def test_the_verdict_names_the_reasons_of_guard_and_watch():
