@@ -2,13 +2,10 @@
 fault.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
 
-import vehest_papers
 from vehest.data.errors import DataError, MissingError
 from vehest_papers.kit.block_errors import Key, read_blocks, read_training
 from vehest_papers.kit.claim_files import read_paper
@@ -133,13 +130,6 @@ def test_a_recommendation_rests_on_claims_of_the_file(tmp_path):
     assert read_paper(written(tmp_path, ORDER, rests_on=rests_on)).rests_on == rests_on
     with pytest.raises(DataError, match="rests_on: no claim has the id 'a_above_b'"):
         read_paper(written(tmp_path, ORDER, rests_on={"a_above_b": []}))
-
-
-def test_the_papers_that_come_with_vehest_are_read():
-    for path in sorted(Path(vehest_papers.__file__).parent.glob("*/claims.yaml")):
-        paper = read_paper(path)
-        assert paper.paper == path.parent.name
-        assert paper.claims
 
 
 HEADER = "part,candidate,seed,test_set,metric,block,value,size\n"

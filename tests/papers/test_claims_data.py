@@ -13,10 +13,8 @@ import pytest
 import yaml
 
 import vehest_papers
-from vehest_papers.cnn_ukf import paper as cnn_ukf
 from vehest_papers.heavy_ekf import paper as heavy_ekf
 from vehest_papers.ksnn import paper as ksnn
-from vehest_papers.learned_ukf import paper as learned_ukf
 
 FOLDER = Path(vehest_papers.__file__).parent
 RESULTS = Path(__file__).parents[2] / "results"
@@ -95,12 +93,6 @@ def test_paper_is_cited_by_its_doi(paper: str):
 
 
 @pytest.mark.parametrize("paper", PAPERS)
-def test_ids_are_unique(paper: str):
-    ids = [claim["id"] for claim in read_claims(paper)["claims"]]
-    assert sorted(set(ids)) == sorted(ids)
-
-
-@pytest.mark.parametrize("paper", PAPERS)
 def test_every_candidate_is_declared_and_used(paper: str):
     content = read_claims(paper)
     used_candidates = {
@@ -154,31 +146,6 @@ def test_published_figures_are_on_the_side_that_is_claimed(paper: str):
         assert (claim["ratio"] < 1.0) == (claim["direction"] == "lower"), claim["id"]
 
 
-@pytest.mark.parametrize(
-    ("table", "test_set", "constants"),
-    [
-        ("Table I", "tyre_a", learned_ukf.TABLE_I),
-        ("Table II", "tyre_d", learned_ukf.TABLE_II),
-    ],
-)
-def test_tables_of_learned_ukf_are_those_of_the_report(table: str, test_set: str, constants: Any):
-    expected = {
-        (candidate, f"{metric}_weighted"): getattr(row, metric)
-        for candidate, row in constants.items()
-        for metric in ("mse", "mae", "ae99")
-    }
-    assert table_of("learned_ukf", table, test_set) == expected
-
-
-def test_velocity_errors_of_learned_ukf_are_those_of_the_report():
-    sections = {"tyre_a": "Section IV-B", "tyre_d": "Section IV-C"}
-    for (test_set, candidate), (vx, vy) in learned_ukf.RMS.items():
-        assert table_of("learned_ukf", sections[test_set], test_set) == {
-            (candidate, "rmse_vx"): vx,
-            (candidate, "rmse_vy"): vy,
-        }
-
-
 def test_ratios_of_heavy_ekf_are_those_of_the_report():
     orders = [
         claim
@@ -195,23 +162,6 @@ def test_ratios_of_heavy_ekf_are_those_of_the_report():
 def test_fast_lap_of_heavy_ekf_is_that_of_the_report():
     fast = float(heavy_ekf.FAST[heavy_ekf.RATTE])
     assert table_of("heavy_ekf", "Section IV", "nominal_fast") == {("RATTE", "rmse_sideslip"): fast}
-
-
-@pytest.mark.parametrize(("table", "part"), [("Table II", "full"), ("Table III", "limited")])
-def test_tables_of_cnn_ukf_are_those_of_the_report(table: str, part: str):
-    metrics = {
-        "mse_sideslip": "mse",
-        "mse_sideslip_nonlinear": "mse_nonlinear",
-        "max_error_sideslip": "max_error",
-        "max_error_sideslip_nonlinear": "max_error_nonlinear",
-    }
-    expected = {
-        (table, part, "test", candidate, metric): getattr(row, name)
-        for candidate, row in cnn_ukf.TABLES[part].items()
-        for metric, name in metrics.items()
-    }
-    figures = published_figures("cnn_ukf")
-    assert {key: value for key, value in figures.items() if key[0] == table} == expected
 
 
 @pytest.mark.parametrize(

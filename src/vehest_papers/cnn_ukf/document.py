@@ -72,7 +72,7 @@ COMPARED = {
     "free": paper.FREE,
 }
 """Place in the template -> with what CNN-UKF is compared there."""
-FIGURE_CANDIDATES = (*paper.TABLE_II, paper.SMOOTH, paper.FREE)
+FIGURE_CANDIDATES = (*paper.OF_FOUR, paper.SMOOTH, paper.FREE)
 OVERVIEW_CANDIDATES = (
     paper.CNN,
     paper.DEEP,
@@ -214,7 +214,7 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
     outcome.blocks += [
         tables.accuracy(
             ManoeuvreErrors(in_table),
-            paper.TABLE_II,
+            FULL,
             training,
             "table_2",
             caption,
@@ -228,7 +228,7 @@ def _accuracy(outcome: Outcome, subjects: Subjects) -> None:
     for name, candidates in (("networks_alone", ALONE), ("oracles", tables.ORACLES)):
         if among := subjects.among(candidates):
             errors = ManoeuvreErrors(among)
-            outcome.data[name] = tables.accuracy(errors, {}, training, name, "").frame
+            outcome.data[name] = tables.accuracy(errors, "", training, name, "").frame
     outcome.data["within_12_deg"] = kpi_table(subjects.within)
 
 
@@ -317,7 +317,7 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
     runs = {
         name: seeds
         for name, seeds in learnt.comparison.runs.items()
-        if name in paper.TABLE_III or name == paper.SMOOTH
+        if name in paper.OF_FOUR or name == paper.SMOOTH
     }
     training = {
         name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()
@@ -331,7 +331,7 @@ def _limited(outcome: Outcome, subjects: Subjects, learnt: Limited) -> None:
     picked = {name: chosen(seeds) for name, seeds in runs.items()}
     title = "J-turn, learnt on the limited set"
     outcome.blocks += [
-        tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
+        tables.accuracy(learnt.comparison, LIMITED, training, "table_3", caption),
         distributions.errors_figure(runs, 11, "limited set", subjects.kind)[0],
         traces.compared(picked, turn, 12, title, subjects.kind),
     ]

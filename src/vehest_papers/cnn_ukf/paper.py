@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 MODEL = "Model-based"
 DATA = "Data-driven"
@@ -49,37 +48,6 @@ CANDIDATES = (
 OF_FOUR = (MODEL, DATA, DEEP, CNN)
 HYBRIDS = (DEEP, CNN)
 
-
-@dataclass(frozen=True)
-class Published:
-    """A row of Tables II and III."""
-
-    mse: float  # mean squared error of the sideslip angle [deg²]
-    mse_nonlinear: float  # of samples with |ay| ≥ 4 m/s² [deg²]
-    max_error: float  # largest absolute error of a manoeuvre, mean over manoeuvres [deg]
-    max_error_nonlinear: float  # of samples with |ay| ≥ 4 m/s² [deg]
-
-
-TABLE_II: Mapping[str, Published] = {
-    MODEL: Published(0.161, 0.277, 1.111, 0.991),
-    DATA: Published(0.096, 0.157, 1.293, 1.123),
-    DEEP: Published(0.087, 0.157, 0.981, 0.822),
-    CNN: Published(0.086, 0.118, 0.979, 0.776),
-}
-"""Full set."""
-
-TABLE_III: Mapping[str, Published] = {
-    MODEL: Published(0.161, 0.277, 1.111, 0.991),
-    DATA: Published(0.223, 0.358, 1.445, 1.284),
-    DEEP: Published(0.157, 0.270, 1.103, 0.983),
-    CNN: Published(0.156, 0.269, 1.099, 0.975),
-}
-"""Limited set."""
-
-TABLES: Mapping[str, Mapping[str, Published]] = {
-    "full": TABLE_II,
-    "limited": TABLE_III,
-}  # part -> its table
 
 SCALING: Mapping[str, tuple[float, float]] = {
     "full": (-4.2690, 0.7901),

@@ -64,7 +64,7 @@ KPIS = {
     "max_error": "ME [deg]",
     "max_error_nonlinear": "ME_nl [deg]",
 }
-"""Attribute of `Kpis` and of `paper.Published` -> header."""
+"""Attribute of `Kpis` -> header."""
 
 Manoeuvres = Mapping[str, Sequence[Scored]]  # recording -> what was scored of it: one range
 

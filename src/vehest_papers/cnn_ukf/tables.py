@@ -18,7 +18,7 @@ from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.block_errors import network_squares
+from vehest_papers.cnn_ukf.block_errors import METRICS, network_squares
 from vehest_papers.cnn_ukf.indicators import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.manoeuvres import CARS, car_of
 from vehest_papers.cnn_ukf.measures import LATERAL_VELOCITY, YAW_RATE
@@ -34,6 +34,7 @@ from vehest_papers.cnn_ukf.subjects import (
     filter_of,
 )
 from vehest_papers.kit.block_errors import BlockErrors
+from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import metric_values
 from vehest_papers.kit.verdict_table import figure_in_words
 from vehest_papers.kit.verdicts import value_of
@@ -42,26 +43,28 @@ OutputsOf = Mapping[
     str, Sequence[Sequence[Outputs]]
 ]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
+METRIC_OF_KPI = {kpi: metric for metric, kpi in METRICS.items()}
 PROCESS = ("process_vy", "process_yaw_rate")
 
 
 def accuracy(
     comparison: ManoeuvreErrors,
-    published: Mapping[str, paper.Published],
+    part: str,
     training: Mapping[str, float],
     name: str,
     caption: str,
     indicators: Sequence[str] = (MSE, MSE_NL),
 ) -> Table:
-    """Table II or III: our figures with their intervals, the paper's in brackets.
+    """Table II or III: our figures with their intervals, the paper's of a part in brackets.
 
     The CSV file has all indicators, and errors of validation and of training [deg].
     """
+    claims = claims_of("cnn_ukf")
     rows = []
     for candidate, seeds in comparison.runs.items():
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(seeds)}
         for kpi in KPIS:
-            stated = getattr(published[candidate], kpi) if candidate in published else math.nan
+            stated = claims.published(part, TEST, candidate, METRIC_OF_KPI[kpi])
             row[f"paper_{kpi}"] = stated
             row[f"ours_{kpi}"] = comparison.text(candidate, kpi)
             row[kpi] = (

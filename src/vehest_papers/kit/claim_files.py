@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -115,6 +117,15 @@ class Paper:
     rests_on: Mapping[str, list[str]] = field(default_factory=dict)
     """Claim's id -> verdicts with which the recommendation stands; empty: it is shown only."""
 
+    def published(self, part: str, test_set: str, candidate: str, metric: str) -> float:
+        """A figure of the paper's tables; NaN where it states none."""
+        figures = {
+            (table.part, table.test_set, row.candidate, row.metric): row.published
+            for table in self.tables
+            for row in table.rows
+        }
+        return figures.get((part, test_set, candidate, metric), math.nan)
+
     def metrics(self) -> list[tuple[str, str, str]]:
         """Part, test set and metric of every error that claims or tables name."""
         keys = [
@@ -144,6 +155,7 @@ _USELESS: Mapping[Kind, Sequence[str]] = {
 _ID = re.compile(r"[a-z0-9_]+")
 
 
+@cache
 def claims_of(name: str) -> Paper:
     """Claims and tables of one of the papers that are re-created here."""
     return read_paper(CLAIMS_FOLDER / name / "claims.yaml")

@@ -29,7 +29,7 @@ from vehest_papers.kit.block_rows import (
     checked_training,
     seed_rows,
 )
-from vehest_papers.kit.reading import metric_values
+from vehest_papers.kit.reading import metric_values, sideslip_error
 from vehest_papers.learned_ukf import measures, paper
 from vehest_papers.learned_ukf.candidates import (
     candidate_of_training,
@@ -90,8 +90,7 @@ def losses_of(scored: Scored) -> Iterator[tuple[str, float, int]]:
     yield "ae99_weighted", float(np.percentile(absolute, 99.0)) * samples, samples
     for name in WEIGHTS:
         yield f"rmse_{name}", float(np.square(scored.errors[name]).sum()), samples
-    turn = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-    squares = np.square(np.degrees(turn))[scored.is_sideslip_scored]
+    squares = np.square(sideslip_error(scored))[scored.is_sideslip_scored]
     yield "rmse_sideslip", float(squares.sum()), len(squares)
 
 

@@ -49,8 +49,8 @@ def data_table(
     ]
     caption = (
         f"{paper.NNTF_UH} trained on parts of the training data, with as many steps on each. "
-        f"The paper has {paper.TABLE_I[paper.NNTF_UH].mse:g} on tyre A with {at:.1f} min. "
-        f"Data: {data}."
+        f"The paper has {paper.published('tyre_a', paper.NNTF_UH, 'mse_weighted'):g} on tyre A "
+        f"with {at:.1f} min. Data: {data}."
     )
     if frame["minutes"].nunique() >= MIN_AMOUNTS:
         amounts = np.asarray(frame["minutes"])

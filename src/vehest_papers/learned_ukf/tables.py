@@ -18,10 +18,9 @@ from vehest_papers.kit.verdict_table import figure_in_words
 from vehest_papers.kit.verdicts import value_of
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
-from vehest_papers.learned_ukf.paper import Published
 
 METRICS = {"mse": "mse_weighted", "mae": "mae_weighted", "ae99": "ae99_weighted"}
-"""Attribute of `Published` -> metric."""
+"""Column -> metric."""
 
 STATES = ("vx", "vy", "yaw_rate")
 
@@ -30,14 +29,13 @@ def accuracy(blocks: Mapping[Key, BlockErrors], part: str, test: str) -> pd.Data
     """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over
     sequences and seeds.
     """
-    published = paper.TABLES[test]
     rows = []
     for candidate in candidates_in(blocks, part, test):
         row: dict[str, object] = {"candidate": candidate}
         for short, metric in METRICS.items():
             errors = blocks[Key(part, candidate, test, metric)]
             figure = value_of(errors, metric)[1]
-            row[f"paper_{short}"] = _figure(published.get(candidate), short)
+            row[f"paper_{short}"] = paper.published(test, candidate, metric)
             row |= {short: figure.value, f"{short}_low": figure.low, f"{short}_high": figure.high}
             row[f"ours_{short}"] = figure_in_words(figure)
             row["n_seeds"] = len(errors.seeds)
@@ -68,11 +66,10 @@ def overview(blocks: Mapping[Key, BlockErrors], part: str, kind: str) -> Table:
     for candidate in candidates_in(blocks, part, next(iter(SETS))):
         row: dict[str, object] = {"candidate": candidate}
         for test in SETS:
-            published = paper.TABLES[test].get(candidate)
             errors = blocks[Key(part, candidate, test, "mse_weighted")]
             mse = value_of(errors, "mse_weighted")[1]
             row |= {
-                f"paper_{test}": published.mse if published else math.nan,
+                f"paper_{test}": paper.published(test, candidate, "mse_weighted"),
                 f"ours_{test}": mse.value,
                 f"low_{test}": mse.low,
                 f"high_{test}": mse.high,
@@ -101,13 +98,12 @@ def by_state(runs: pd.DataFrame, tests: Sequence[str]) -> pd.DataFrame:
     for candidate in dict.fromkeys(runs["candidate"]):
         row: dict[str, object] = {"candidate": candidate}
         for test in tests:
-            stated = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
             for state in STATES:
                 values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
                 row[f"ours_{state}_{test}"] = median_and_range(values, 3)
                 row |= {
                     f"median_{state}_{test}": np.median(values),
-                    f"paper_{state}_{test}": stated.get(state, math.nan),
+                    f"paper_{state}_{test}": paper.published(test, candidate, f"rmse_{state}"),
                 }
         rows.append(row)
     return pd.DataFrame(rows)
@@ -179,10 +175,6 @@ def budget(part: PartArtefacts, runs: pd.DataFrame) -> pd.DataFrame:
         row["skipped_steps"] = sum(fit.get("skipped_steps", 0.0) for fit in fits)
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _figure(published: Published | None, short: str) -> float:
-    return getattr(published, short) if published else math.nan
 
 
 def _epochs_by_phase(history: pd.DataFrame) -> list[int]:
