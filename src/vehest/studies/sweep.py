@@ -30,6 +30,7 @@ from vehest.report.style import (
 )
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
+from vehest.studies.kit.columns import columns_of
 
 CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
@@ -475,11 +476,11 @@ def _table(artefacts: SweepArtefacts) -> Table:
     names = short_names(artefacts.keys)
     table = artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
-    columns |= {
-        "n_parameters": Column("params", decimals=0),
-        "n_seeds": Column("seeds"),
-        "n_failed": Column("failed"),
-    }
+    columns |= columns_of(
+        n_parameters=("params", 0),
+        n_seeds="seeds",
+        n_failed="failed",
+    )
     for name in artefacts.sets:
         decimals = decimals_for(table[f"{METRIC}.{name}"].tolist())
         columns[f"{METRIC}.{name}"] = Column(f"RMSE(β), {name} [deg]", decimals=decimals)
