@@ -35,7 +35,6 @@ from vehest.report.document import (
 )
 from vehest.report.style import Line, decimals_for, fixed, lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest.studies.kit.drawings import (
     behaviour_blocks,
     busiest_block,
@@ -466,14 +465,14 @@ def how_it_was_made(
         "ranges",
         "What was used for what.",
         ranges_of(artefacts),
-        columns_of(
-            role="role",
-            dataset="data set",
-            kind="kind",
-            recording="recording",
-            range="range",
-            seconds=("length [s]", 0),
-        ),
+        {
+            "role": Column("role"),
+            "dataset": Column("data set"),
+            "kind": Column("kind"),
+            "recording": Column("recording"),
+            "range": Column("range"),
+            "seconds": Column("length [s]", decimals=0),
+        },
     )
     lines = method_lines(artefacts, choice)
     return "## Appendix: method and ranges\n\n" + "\n".join(f"- {line}" for line in lines), ranges
@@ -685,12 +684,12 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
         rows.append(row)
     if not rows:
         return []
-    columns = columns_of(
-        role="used for",
-        minutes=("reference [min]", 1),
-        ay_99=("|ay|, 99 % [m/s²]", 1),
-        sideslip_99=("|β|, 99 % [deg]", 1),
-    )
+    columns = {
+        "role": Column("used for"),
+        "minutes": Column("reference [min]", decimals=1),
+        "ay_99": Column("|ay|, 99 % [m/s²]", decimals=1),
+        "sideslip_99": Column("|β|, 99 % [deg]", decimals=1),
+    }
     frame = pd.DataFrame(rows)
     caption = (
         "Minutes of recording with a reference of v, and 99th percentiles of lateral "
@@ -785,19 +784,19 @@ def _leaderboard_table(
         "standard deviation (s.d.); p99 and peak "
         "are the 99th percentile and the maximum of the absolute error of β of the chosen one.",
         frame,
-        columns_of(
-            title="estimator",
-            seed="seed",
-            n_seeds="seeds",
-            rmse_sideslip_chosen=("chosen [deg]", decimals),
-            rmse_sideslip_median=("median [deg]", decimals),
-            rmse_sideslip_min=("min [deg]", decimals),
-            rmse_sideslip_max=("max [deg]", decimals),
-            rmse_sideslip_std=("s.d. [deg]", decimals),
-            p99_sideslip="p99(β) [deg]",
-            max_error_sideslip="peak(β) [deg]",
-            epochs=("epochs", 0),
-        ),
+        {
+            "title": Column("estimator"),
+            "seed": Column("seed"),
+            "n_seeds": Column("seeds"),
+            "rmse_sideslip_chosen": Column("chosen [deg]", decimals=decimals),
+            "rmse_sideslip_median": Column("median [deg]", decimals=decimals),
+            "rmse_sideslip_min": Column("min [deg]", decimals=decimals),
+            "rmse_sideslip_max": Column("max [deg]", decimals=decimals),
+            "rmse_sideslip_std": Column("s.d. [deg]", decimals=decimals),
+            "p99_sideslip": Column("p99(β) [deg]"),
+            "max_error_sideslip": Column("peak(β) [deg]"),
+            "epochs": Column("epochs", decimals=0),
+        },
     )
     return [ranked, seeds]
 

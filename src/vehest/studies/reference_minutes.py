@@ -36,7 +36,6 @@ from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of,
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.drive import data_of_parts
-from vehest.studies.kit.columns import columns_of
 from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
 TAKES = "parts"
@@ -44,15 +43,15 @@ VERSION = "2"
 TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
 SCRATCH = "from scratch"
-COLUMNS = columns_of(
-    title="estimator",
-    start="training",
-    minutes=("reference [min]", 2),
-    rmse_sideslip=("RMSE(β) [deg]", 3),
-    interval="95 % interval [deg]",
-    n_trainings=("trainings", 0),
-    against_scratch="compared with scratch",
-)
+COLUMNS = {
+    "title": Column("estimator"),
+    "start": Column("training"),
+    "minutes": Column("reference [min]", decimals=2),
+    "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
+    "interval": Column("95 % interval [deg]"),
+    "n_trainings": Column("trainings", decimals=0),
+    "against_scratch": Column("compared with scratch"),
+}
 """Of a table of `rows_of_curve`."""
 COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Amounts of reference with a column in the overview [min]; the last column is all of a drive."""

@@ -30,7 +30,6 @@ from vehest.report.style import (
 )
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
-from vehest.studies.kit.columns import columns_of
 
 CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
@@ -476,11 +475,11 @@ def _table(artefacts: SweepArtefacts) -> Table:
     names = short_names(artefacts.keys)
     table = artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
-    columns |= columns_of(
-        n_parameters=("params", 0),
-        n_seeds="seeds",
-        n_failed="failed",
-    )
+    columns |= {
+        "n_parameters": Column("params", decimals=0),
+        "n_seeds": Column("seeds"),
+        "n_failed": Column("failed"),
+    }
     for name in artefacts.sets:
         decimals = decimals_for(table[f"{METRIC}.{name}"].tolist())
         columns[f"{METRIC}.{name}"] = Column(f"RMSE(β), {name} [deg]", decimals=decimals)

@@ -39,7 +39,6 @@ from vehest.report.style import (
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import data_of_parts
-from vehest.studies.kit.columns import columns_of
 from vehest.studies.kit.runs import titles_of
 from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 
@@ -152,15 +151,15 @@ def _beats_both(board: pd.DataFrame) -> pd.Series:
     return (board["beats_zero"] == "yes") & (board["beats_static_map"] == "yes")
 
 
-SUMMARY_COLUMNS = columns_of(
-    estimator="estimator",
-    tests=("tests", 0),
-    beats_both=("better than both", 0),
-    beats_zero=("better than zero", 0),
-    beats_static_map=("better than static map", 0),
-    median_ratio=("RMSE(β) / zero, median", 2),
-    max_ratio=("highest", 2),
-)
+SUMMARY_COLUMNS = {
+    "estimator": Column("estimator"),
+    "tests": Column("tests", decimals=0),
+    "beats_both": Column("better than both", decimals=0),
+    "beats_zero": Column("better than zero", decimals=0),
+    "beats_static_map": Column("better than static map", decimals=0),
+    "median_ratio": Column("RMSE(β) / zero, median", decimals=2),
+    "max_ratio": Column("highest", decimals=2),
+}
 
 
 def _summary(board: pd.DataFrame) -> pd.DataFrame:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from vehest.report.document import Column, Table
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import FILTERS, WITH_STATE
 from vehest_papers.heavy_ekf.cross_validation import TEST_SET
@@ -148,11 +147,11 @@ def orders_tables(
         }
         for condition in BY_TUNING
     )
-    tuning_columns = columns_of(
-        tuned="noise tuned on",
-        road="road",
-        state="crossfall state",
-    ) | {_title(pair): Column(_title(pair)) for pair in ORDERS.values()}
+    tuning_columns = {
+        "tuned": Column("noise tuned on"),
+        "road": Column("road"),
+        "state": Column("crossfall state"),
+    } | {_title(pair): Column(_title(pair)) for pair in ORDERS.values()}
     every_entry = pd.DataFrame([*main, *by_tuning, *by_condition])
     return (
         Table("orders", ORDERS_CAPTION, orders, columns),
@@ -255,10 +254,7 @@ def overview_table(rows: Sequence[BlockRow], slips: Mapping[str, float]) -> Tabl
         for tyres in ("nominal", "worn", "wet")
     }
     tests["real Ferrari"] = (FERRARI, TEST_SET)
-    columns = columns_of(
-        test="test",
-        slip=("rear slip [deg]", 1),
-    )
+    columns = {"test": Column("test"), "slip": Column("rear slip [deg]", decimals=1)}
     titles = {name: name for name in FILTERS} | {
         name: title for title, name in BASELINE_NAMES.items()
     }

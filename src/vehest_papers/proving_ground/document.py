@@ -25,7 +25,6 @@ from vehest.report.document import (
 from vehest.report.style import fixed, significant
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.proving_ground import drawing, gates
 from vehest_papers.proving_ground.papers import RACE_SETS, profile_of
 from vehest_papers.proving_ground.tally import FLAGS, MIN_SPEED
@@ -196,19 +195,19 @@ def overview_table(vehicles: Mapping[str, VehicleData]) -> Table:
         row |= {key: values[key] for key in ("ay_abs_q99", "sideslip_abs_q99")}
         row |= {flag: values[flag] if kind == SIMULATED else math.nan for flag in FLAGS}
         rows.append(row)
-    columns = columns_of(
-        vehicle="vehicle",
-        dataset="data set",
-        kind="kind",
-        drives=("drives", 0),
-        minutes=("duration [min]", 1),
-        km=("distance [km]", 1),
-        ay_abs_q99=("|ay| 99 % [m/s²]", 2),
-        sideslip_abs_q99=("|β| 99 % [deg]", 2),
-        spun=("spun", 0),
-        left_road=("left the road", 0),
-        stood=("stood", 0),
-    )
+    columns = {
+        "vehicle": Column("vehicle"),
+        "dataset": Column("data set"),
+        "kind": Column("kind"),
+        "drives": Column("drives", decimals=0),
+        "minutes": Column("duration [min]", decimals=1),
+        "km": Column("distance [km]", decimals=1),
+        "ay_abs_q99": Column("|ay| 99 % [m/s²]", decimals=2),
+        "sideslip_abs_q99": Column("|β| 99 % [deg]", decimals=2),
+        "spun": Column("spun", decimals=0),
+        "left_road": Column("left the road", decimals=0),
+        "stood": Column("stood", decimals=0),
+    }
     caption = (
         "Vehicles and data sets. Spun and left the road: by accident. Stood: drives at whose end "
         "the car stands, on purpose or after an accident."
@@ -246,16 +245,16 @@ def flagged_table(flagged: Sequence[FlaggedDrive]) -> Table:
         }
         for drive in flagged
     ]
-    columns = columns_of(
-        recording="drive",
-        vehicle="vehicle",
-        manoeuvre="manoeuvre",
-        stability_control="stability control",
-        spun="spun",
-        left_road="left the road",
-        gave_up_at=("driver gave up at [s]", 1),
-        largest_sideslip=("largest |β| above 1 m/s [deg]", 1),
-    )
+    columns = {
+        "recording": Column("drive"),
+        "vehicle": Column("vehicle"),
+        "manoeuvre": Column("manoeuvre"),
+        "stability_control": Column("stability control"),
+        "spun": Column("spun"),
+        "left_road": Column("left the road"),
+        "gave_up_at": Column("driver gave up at [s]", decimals=1),
+        "largest_sideslip": Column("largest |β| above 1 m/s [deg]", decimals=1),
+    }
     caption = "Drives that spun or left the road by accident."
     return Table("flagged", caption, pd.DataFrame(rows, columns=["dataset", *columns]), columns)
 

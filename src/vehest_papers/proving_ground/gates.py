@@ -21,7 +21,6 @@ from vehest.estimators.static_map import StaticMap
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure
 from vehest.studies.artefacts import StoredDataset
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest_papers.ksnn.data_quality import (
@@ -264,10 +263,7 @@ def counts_table(judged: Sequence[Gate]) -> Table:
         row: dict[str, object] = {"subject": subject, "gates": len(of_subject)}
         row |= {name: sum(gate.is_met(name) for gate in of_subject) for name in (BEFORE, AFTER)}
         rows.append(row)
-    columns = columns_of(
-        subject="set or car",
-        gates=("gates", 0),
-    )
+    columns = {"subject": Column("set or car"), "gates": Column("gates", decimals=0)}
     columns |= {name: Column(f"met by {name}", decimals=0) for name in (BEFORE, AFTER)}
     return Table("gates_met", "Gates that are met. SIMULATED.", pd.DataFrame(rows), columns)
 
@@ -292,15 +288,15 @@ def excitation_table(datasets: Sequence[StoredDataset]) -> Table:
             | _excitation(recordings)
             for vehicle, recordings in cars.items()
         ]
-    columns = columns_of(
-        vehicle="vehicle",
-        dataset="data set",
-        kind="kind",
-        drives=("drives", 0),
-        ay=("|ay| 99 % [m/s²]", 2),
-        sideslip=("|β| 99 % [deg]", 2),
-        map=("FVU of a static map fitted to it", 3),
-    )
+    columns = {
+        "vehicle": Column("vehicle"),
+        "dataset": Column("data set"),
+        "kind": Column("kind"),
+        "drives": Column("drives", decimals=0),
+        "ay": Column("|ay| 99 % [m/s²]", decimals=2),
+        "sideslip": Column("|β| 99 % [deg]", decimals=2),
+        "map": Column("FVU of a static map fitted to it", decimals=3),
+    }
     columns |= {
         f"above_{hz:g}": Column(f"v̇ over noise at {hz:g} Hz [dB]", decimals=1)
         for hz in EXCITATION_HZ
@@ -346,15 +342,9 @@ def static_maps_table(drives: Mapping[str, Drives]) -> Table:
             }
             row |= {"b": static_map.values["b"], "k": 1000.0 * static_map.values["k"]}
             rows.append(row)
-    columns = columns_of(
-        dataset="data set",
-        fitted="fitted to",
-    )
+    columns = {"dataset": Column("data set"), "fitted": Column("fitted to")}
     columns |= {letter: Column(f"FVU on the {car}", decimals=3) for letter, car in CARS.items()}
-    columns |= columns_of(
-        b=("b [m]", 2),
-        k=("k [10⁻³ s²/m]", 2),
-    )
+    columns |= {"b": Column("b [m]", decimals=2), "k": Column("k [10⁻³ s²/m]", decimals=2)}
     caption = (
         "FVU that the static map v = r·(b − k·u²) of one simulated car leaves on another: how far "
         "the cars differ."

@@ -16,7 +16,6 @@ from vehest.report.document import REPORT, Column, Document, Figure, Table, as_c
 from vehest.report.style import MISSING, fixed
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.real_cars.figure import distributions
 from vehest_papers.real_cars.planted import detections
 from vehest_papers.real_cars.statistics import (
@@ -38,14 +37,14 @@ RANGES = {
 }
 """Ranges of the Ferrari's drive into which errors are injected [s]."""
 UNDOCUMENTED_POINTS = ("at a point that is not known", "not said")
-ERROR_COLUMNS = columns_of(
-    sideslip_99=("β 99 %", 2),
-    rms=("zero", 2),
-    static_map=("static map", 2),
-    noise=("noise", 3),
-    bound=("bound", 2),
-    correlation=("correlation", 2),
-)
+ERROR_COLUMNS = {
+    "sideslip_99": Column("β 99 %", decimals=2),
+    "rms": Column("zero", decimals=2),
+    "static_map": Column("static map", decimals=2),
+    "noise": Column("noise", decimals=3),
+    "bound": Column("bound", decimals=2),
+    "correlation": Column("correlation", decimals=2),
+}
 OVERVIEW_CAPTION = (
     "Data sets while driving; angles in deg. β 99 %: 99th percentile of |β|. zero: RMSE(β) of the "
     "zero-sideslip baseline. Static map: RMSE(β) of v = r·(b − k·u²), fitted to the same samples. "
@@ -232,13 +231,13 @@ def _findings_by_check(findings: pd.DataFrame) -> Table:
         }
         for (level, check), group in findings.groupby(["level", "check"])
     ]
-    columns = columns_of(
-        check="check",
-        level="level",
-        findings=("findings", 0),
-        recordings=("recordings", 0),
-        datasets="data sets",
-    )
+    columns = {
+        "check": Column("check"),
+        "level": Column("level"),
+        "findings": Column("findings", decimals=0),
+        "recordings": Column("recordings", decimals=0),
+        "datasets": Column("data sets"),
+    }
     frame = pd.DataFrame(rows, columns=list(columns))
     return Table("findings_by_check", "Findings of `vehest data check`.", frame, columns)
 
@@ -270,14 +269,14 @@ def _injected_by_error(injected: pd.DataFrame) -> Table:
             or MISSING,
         }
         rows.append(row)
-    columns = columns_of(
-        fault="error",
-        cases=("cases", 0),
-        detectable=("detectable", 0),
-        detected=("detected", 0),
-        false_alarms=("false alarms", 0),
-        missed="not detected",
-    )
+    columns = {
+        "fault": Column("error"),
+        "cases": Column("cases", decimals=0),
+        "detectable": Column("detectable", decimals=0),
+        "detected": Column("detected", decimals=0),
+        "false_alarms": Column("false alarms", decimals=0),
+        "missed": Column("not detected"),
+    }
     caption = (
         "Errors injected into the real Ferrari drive. Detectable: the other channels contain the "
         "information. False alarms: cases in which an unchanged channel is named."

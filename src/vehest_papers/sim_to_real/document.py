@@ -11,11 +11,10 @@ import pandas as pd
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.ranking import BASELINES
 from vehest.report import figures
-from vehest.report.document import REPORT, Block, Document, Figure, Table, as_code
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import REFERENCE, fixed, line_of
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.kit.methods import scoring
 from vehest_papers.kit.reading import median_and_range
 from vehest_papers.sim_to_real.spread import Spread, spread_figure
@@ -54,21 +53,21 @@ SPREAD_CAPTION = (
     "first, second and third choice. Diamonds: the seed with the lowest error on the simulated "
     "cars that choose; ticks: medians."
 )
-COLUMNS = columns_of(
-    step="trained on: estimator",
-    recordings=("drives", 0),
-    validation_rmse_vy=("RMSE(v) [m/s], validation cars", 3),
-    race_cars_rmse_vy=("race cars", 3),
-    other_simulator_rmse_vy=("other simulation", 3),
-    other_simulator_fvu=("FVU, other simulation", 2),
-    chosen="choice",
-    fvu_median=("FVU, real", 3),
-    fvu_min=("lowest", 3),
-    fvu_max=("highest", 3),
-    rmse_vy=("RMSE(v) [m/s], real", 3),
-    rmse_sideslip=("RMSE(β) [deg], real", 3),
-    weight=("β₁(0)", 2),
-)
+COLUMNS = {
+    "step": Column("trained on: estimator"),
+    "recordings": Column("drives", decimals=0),
+    "validation_rmse_vy": Column("RMSE(v) [m/s], validation cars", decimals=3),
+    "race_cars_rmse_vy": Column("race cars", decimals=3),
+    "other_simulator_rmse_vy": Column("other simulation", decimals=3),
+    "other_simulator_fvu": Column("FVU, other simulation", decimals=2),
+    "chosen": Column("choice"),
+    "fvu_median": Column("FVU, real", decimals=3),
+    "fvu_min": Column("lowest", decimals=3),
+    "fvu_max": Column("highest", decimals=3),
+    "rmse_vy": Column("RMSE(v) [m/s], real", decimals=3),
+    "rmse_sideslip": Column("RMSE(β) [deg], real", decimals=3),
+    "weight": Column("β₁(0)", decimals=2),
+}
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -13,7 +13,6 @@ from vehest.report.document import Column, Figure, Table, as_text
 from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import fixed, lines_of
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest.studies.kit.drives import COVERAGES
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
@@ -148,17 +147,17 @@ def overview(board: pd.DataFrame) -> Table:
             "interval_score": group["interval_score"].median(),
         }
         rows.append(row)
-    columns = columns_of(
-        part="part",
-        tests=("tests", 0),
-        contained=("contained", 0),
-        too_wide=("too wide", 0),
-        too_narrow=("too narrow", 0),
-        if_shuffled=("if shuffled [%]", 0),
-        coverage_90=("coverage [%]", 1),
-        width_90=("width [deg]", 2),
-        interval_score=("interval score [deg]", 2),
-    )
+    columns = {
+        "part": Column("part"),
+        "tests": Column("tests", decimals=0),
+        "contained": Column("contained", decimals=0),
+        "too_wide": Column("too wide", decimals=0),
+        "too_narrow": Column("too narrow", decimals=0),
+        "if_shuffled": Column("if shuffled [%]", decimals=0),
+        "coverage_90": Column("coverage [%]", decimals=1),
+        "width_90": Column("width [deg]", decimals=2),
+        "interval_score": Column("interval score [deg]", decimals=2),
+    }
     return Table("overview", OVERVIEW_CAPTION, pd.DataFrame(rows), columns)
 
 
@@ -212,12 +211,12 @@ def by_other_test(board: pd.DataFrame) -> Table:
         }
         for (title, test_set), group in board.groupby(["title", "test_set"], sort=False)
     ]
-    columns = columns_of(
-        test="test",
-        estimators=("estimators", 0),
-        coverage=("coverage, median [%]", 0),
-        lowest=("lowest [%]", 0),
-        without=("without the factor, median [%]", 0),
-        lowest_without=("lowest [%]", 0),
-    )
+    columns = {
+        "test": Column("test"),
+        "estimators": Column("estimators", decimals=0),
+        "coverage": Column("coverage, median [%]", decimals=0),
+        "lowest": Column("lowest [%]", decimals=0),
+        "without": Column("without the factor, median [%]", decimals=0),
+        "lowest_without": Column("lowest [%]", decimals=0),
+    }
     return Table("bands_by_other_test", OTHER_CAPTION, pd.DataFrame(rows), columns)

@@ -13,7 +13,6 @@ from vehest.evaluation.under_fault import FAULTED
 from vehest.report.document import Column, Table, as_text
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.columns import columns_of
 from vehest_papers.trust.faults import FaultTrials
 from vehest_papers.trust.integrity import false_alarms_per_hour
 
@@ -69,19 +68,19 @@ def by_data(counted: pd.DataFrame, trials: Sequence[FaultTrials]) -> Table:
             "interval": f"{fixed(rate.low, 1)} … {fixed(rate.high, 1)}",
         }
         rows.append({**row, **alarms})
-    columns = columns_of(
-        data="data",
-        cases=("faults", 0),
-        detectable=("detectable", 0),
-        in_time=("in time", 0),
-        in_time_percent=("in time [%]", 1),
-        test_delay=("delay of the test [s]", 2),
-        health_delay=("delay of health [s]", 2),
-        flagged_not_detectable=("flagged, not detectable", 0),
-        hours=("without faults [h]", 2),
-        alarms=("false alarms", 0),
-        interval="an hour",
-    )
+    columns = {
+        "data": Column("data"),
+        "cases": Column("faults", decimals=0),
+        "detectable": Column("detectable", decimals=0),
+        "in_time": Column("in time", decimals=0),
+        "in_time_percent": Column("in time [%]", decimals=1),
+        "test_delay": Column("delay of the test [s]", decimals=2),
+        "health_delay": Column("delay of health [s]", decimals=2),
+        "flagged_not_detectable": Column("flagged, not detectable", decimals=0),
+        "hours": Column("without faults [h]", decimals=2),
+        "alarms": Column("false alarms", decimals=0),
+        "interval": Column("an hour"),
+    }
     return Table("faults_by_data", DATA_CAPTION, pd.DataFrame(rows), columns)
 
 
