@@ -206,6 +206,7 @@ def test_cells_of_the_map_are_better_not_different_or_worse():
     of_cells = factorial.changes(cells, [PAIR])
     outcomes = [of_cells[position, PAIR].outcome for position in range(3)]
     assert outcomes == [factorial.BETTER, factorial.NOT_DIFFERENT, factorial.WORSE]
+    assert region_map.counts(of_cells, PAIR) == dict.fromkeys(outcomes, 1)
     ratios = [of_cells[position, PAIR].ratio for position in range(3)]
     assert ratios == pytest.approx([0.8, 1.0, 1.25], rel=0.02)
     assert of_cells[1, PAIR].power > 0.99, "seeds are paired, so that 65 % would be found"
@@ -219,17 +220,6 @@ def test_intervals_and_power_of_a_cell_allow_for_the_cells_of_its_map():
     among = factorial.changes([noisy] * 40, [PAIR])[0, PAIR]
     assert among.low < alone.low < alone.high < among.high
     assert among.power < alone.power
-
-
-def test_regions_count_every_cell_of_the_map():
-    generator = np.random.default_rng(2)
-    cells = [cell_with_ratio(generator, ratio) for ratio in (0.7, 0.7, 1.0, 1.3)]
-    of_cells = factorial.changes(cells, [PAIR])
-    assert region_map.counts(of_cells, PAIR) == {
-        factorial.BETTER: 2,
-        factorial.NOT_DIFFERENT: 1,
-        factorial.WORSE: 1,
-    }
 
 
 def test_tracks_are_identified_from_rolling_wheels():

@@ -11,7 +11,6 @@ from refusals import refusal
 from study_parts import metric_rows, part_of
 
 from conftest import planar_drive
-from place import undrawn
 from vehest.configuration.composition import compose_config
 from vehest.configuration.files import choices
 from vehest.data.errors import DataError
@@ -167,14 +166,25 @@ def artefacts(tmp_path_factory):
     )
 
 
-def overview(document):
+@pytest.fixture(scope="module")
+def document(artefacts):
+    return documents(artefacts)["report"]
+
+
+@pytest.fixture
+def steps(document):
+    """Table ``overview``."""
     (table,) = (block.frame for block in document.blocks if isinstance(block, Table))
-    assert table["step"].is_unique
-    return table[table["step"] != "Level: v = 0"].set_index("part")
+    return table.set_index("step", verify_integrity=True)
 
 
-def test_validation_race_cars_and_another_simulation_choose_in_turn_and_ship_a_seed(artefacts):
-    table = overview(documents(artefacts)["report"])
+@pytest.fixture
+def table(steps):
+    """Trained steps by part."""
+    return steps.drop("Level: v = 0").set_index("part")
+
+
+def test_validation_race_cars_and_another_simulation_choose_in_turn_and_ship_a_seed(table):
     assert table.loc["rough", "chosen"] == "first", (
         "the lowest error on validation cars of those laid down beforehand, the highest on the real"
     )
@@ -193,31 +203,22 @@ def test_validation_race_cars_and_another_simulation_choose_in_turn_and_ship_a_s
     assert table["model_fvu"].notna().sum() == 1
 
 
-def test_report_lists_baselines_and_counts_candidates_worse_on_the_third_choice(
-    artefacts,
-):
-    document = documents(artefacts)["report"]
-    (table,) = (
-        block.frame.set_index("step") for block in document.blocks if isinstance(block, Table)
-    )
-    zero = table.loc["Level: v = 0"]
+def test_report_lists_baselines_and_counts_candidates_worse_on_the_third_choice(document, steps):
+    zero = steps.loc["Level: v = 0"]
     assert (zero["fvu_median"], zero["other_simulator_fvu"], zero["chosen"]) == (1.0, 1.0, "")
     assert (
-        table.loc["Rough: KS-NN", "other_simulator_fvu"]
+        steps.loc["Rough: KS-NN", "other_simulator_fvu"]
         > 1.0
-        > table.loc["Level: KS-NN", "other_simulator_fvu"]
+        > steps.loc["Level: KS-NN", "other_simulator_fvu"]
     )
     assert any("1 of 2 candidates of the third choice are worse" in str(b) for b in document.blocks)
 
 
 def test_report_states_errors_of_each_choice_and_whether_the_first_suffices(
-    artefacts, tmp_path, monkeypatch
+    document, table, tmp_path
 ):
-    undrawn(monkeypatch)
-    document = documents(artefacts)["report"]
     write_document(document, tmp_path)
     text = " ".join((tmp_path / "report.md").read_text(encoding="utf-8").split())
-    table = overview(document)
     for name in ("rough", "one", "level"):
         low, high = table.loc[name, "fvu_min"], table.loc[name, "fvu_max"]
         assert f"| {table.loc[name, 'fvu_median']:.3f} [{low:.3f}, {high:.3f}] |" in text

@@ -32,9 +32,7 @@ from vehest_papers.trust.shuffled import Scores, share_if_shuffled, together
     ],
 )
 def test_each_sample_lies_in_its_region(error, level, flagged, region):
-    integrity = integrity_of(
-        np.array([error]), np.array([level]), np.array([flagged]), alert_limit=2.0
-    )
+    integrity = integrity_of(np.array([error]), np.array([level]), np.array([flagged]))
     assert integrity.shares()[region] == 1.0
     assert sum(integrity.shares().values()) == 1.0
 

@@ -17,7 +17,6 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.files import file_name
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_classes
 from vehest.evaluation.metrics import is_fast_enough, pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES
@@ -258,11 +257,7 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
     None where a recording lacks it.
     """
     samples = []
-    for span in spans:
-        file = part.references.get((span.dataset, span.recording))
-        if file is None:
-            continue
-        recording = read_recording(file).cut(span.start, span.stop)
+    for recording in part.reference_ranges(spans):
         if channel not in recording:
             return np.zeros(0)
         samples.append(recording[channel][np.isfinite(recording[channel])])
@@ -289,14 +284,10 @@ def not_compared(part: PartArtefacts) -> list[str]:
         name.split("-")[0] for name in part.failed
     }
     spans = (*part.split.train, *part.split.test_spans)
-    files = [
-        part.references[key]
-        for span in spans
-        if (key := (span.dataset, span.recording)) in part.references
-    ]
-    if not files:
+    recorded = [span for span in spans if (span.dataset, span.recording) in part.references]
+    if not recorded:
         return lines
-    channels = set(read_recording(files[0]).channels)
+    channels = part.reference(recorded[0]).channels
     for name, family in estimator_classes().items():
         if name in compared:
             continue

@@ -56,7 +56,7 @@ def drive_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
         recordings = [spans[int(piece)].recording for piece in first.piece]
         names = names_of_blocks(labels, recordings, first.start)
         for title, model in models.items():
-            head = BlockRow(name, _named(title), model.seed, test, "rmse_sideslip", "", 0.0, 0)
+            head = BlockRow(name, _named(title), model.seed, test, "rmse_sideslip")
             errors = segments[title]
             sums = block_sums(errors.squared_error_sideslip, labels)
             rows += block_rows(head, names, sums, block_sums(errors.sideslip_samples, labels))
@@ -76,7 +76,7 @@ def twin_rows(twin: Factorial) -> list[BlockRow]:
         sign = "minus_" if mismatch < 0 else ""
         test = f"slip_{slip:g}_stiffness_{sign}{100 * abs(mismatch):.0f}"
         for title in NAMES:
-            head = BlockRow("twin", _named(title), 0, test, "rmse_sideslip", "", 0.0, 0)
+            head = BlockRow("twin", _named(title), 0, test, "rmse_sideslip")
             rows += block_rows(head, names, samples * cell.squared[title], samples)
     return rows
 
@@ -90,7 +90,7 @@ def wheel_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
         for drive, (measured, corrected, sizes) in of_drives.items():
             names = [f"{drive}, block {k}" for k in range(1, len(sizes) + 1)]
             for title, values in ((MEASURED, measured), (CORRECTED, corrected)):
-                head = BlockRow(name, title, 0, test, "rmse_wheel_speed_spread", "", 0.0, 0)
+                head = BlockRow(name, title, 0, test, "rmse_wheel_speed_spread")
                 rows += block_rows(head, names, values, sizes)
     return rows
 
@@ -117,13 +117,13 @@ def measured_rows(
             continue
         changes = accuracy.log_change_of_last_lap(drives[LAPS], estimates[LAPS][title], min_speed)
         blocks = [f"segment {number} of {len(changes)}" for number in range(1, len(changes) + 1)]
-        head = BlockRow(name, _named(title), 0, LAPS, "ratte_better_on_faster_laps", "", 0.0, 0)
+        head = BlockRow(name, _named(title), 0, LAPS, "ratte_better_on_faster_laps")
         rows += block_rows(head, blocks, changes, 1.0)
         errors = [
             accuracy.error_before_stop(drives[f"{tyres}_laps"], estimates[f"{tyres}_laps"][title])
             for tyres in TYRES
         ]
-        head = BlockRow(name, _named(title), 0, STOPS, "ratte_until_0_4_s_before_stop", "", 0.0, 0)
+        head = BlockRow(name, _named(title), 0, STOPS, "ratte_until_0_4_s_before_stop")
         rows += block_rows(head, list(TYRES.values()), np.array(errors), 1.0)
     return rows
 

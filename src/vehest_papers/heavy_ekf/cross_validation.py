@@ -92,6 +92,6 @@ def _rows(name: str, drive: Recording, sideslip: dict[str, FloatArray]) -> list[
         errors = measured.squared_error(values)
         sums = np.bincount(labels, errors, n_blocks).astype(np.float64)
         title = BASELINE_NAMES.get(candidate, candidate)
-        head = BlockRow(name, title, 0, TEST_SET, "rmse_sideslip", "", 0.0, 0)
+        head = BlockRow(name, title, 0, TEST_SET, "rmse_sideslip")
         rows += block_rows(head, blocks, sums, sizes)
     return rows

@@ -9,7 +9,7 @@ measured.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -157,7 +157,7 @@ def _rows(
     masks["rmse_sideslip_turning"] = turning
     rows = []
     for name, of_laps in estimates.items():
-        head = BlockRow(part_name, BASELINE_NAMES.get(name, name), 0, condition, "", "", 0.0, 0)
+        head = BlockRow(part_name, BASELINE_NAMES.get(name, name), 0, condition, "")
         for metric, of_metric in masks.items():
             sums = np.array(
                 [
@@ -174,18 +174,14 @@ def _rows(
                 ],
                 dtype=np.float64,
             )
-            rows += block_rows(_with_metric(head, metric), laps.trucks, sums, sizes)
+            rows += block_rows(replace(head, metric=metric), laps.trucks, sums, sizes)
         if part_name == TUNED_ON_ALL and name in (paper.LINT, paper.RATT):
             gains = np.array(
                 [bend_gain(*pair) for pair in zip(laps.recordings, of_laps, strict=True)]
             )
             metric = UNDERESTIMATION.format(name.lower())
-            rows += block_rows(_with_metric(head, metric), laps.trucks, gains, 1.0)
+            rows += block_rows(replace(head, metric=metric), laps.trucks, gains, 1.0)
     return rows
-
-
-def _with_metric(row: BlockRow, metric: str) -> BlockRow:
-    return BlockRow(row.part, row.candidate, row.seed, row.test_set, metric, "", 0.0, 0)
 
 
 def _rows_of_road(rows: Sequence[BlockRow], road: str) -> list[BlockRow]:

@@ -120,14 +120,10 @@ class Course:
 class Drive:
     """A drive at the filters' rate."""
 
-    conditions: Conditions  # of the plant
     samples: FloatArray  # yaw_rate, vx, ay and steer with the sensors' noise, (T, 4)
     sideslip: FloatArray  # β as it is [rad], (T,)
     yaw_rate: FloatArray  # r as it is [rad/s], (T,)
     rear_slip: FloatArray  # α_R as it is [rad], (T,)
-    lateral: FloatArray  # a_y as it is [m/s²], (T,)
-    friction: FloatArray  # μ, (T,)
-    plant: Plant  # what was driven
 
     @cached_property
     def recording(self) -> Recording:
@@ -206,16 +202,7 @@ def drive(conditions: Conditions, seed: int, seconds: float = SECONDS) -> Drive:
     noise = np.array([NOISE[name] for name in ("yaw_rate", "vx", "ay", "steer")])
     samples = clean + noise * generator.standard_normal(clean.shape)
     rear_slip = -sideslip + float(plant.car.cg_to_rear_axle) * yaw_rate / speed
-    return Drive(
-        conditions,
-        samples,
-        sideslip.copy(),
-        yaw_rate.copy(),
-        rear_slip,
-        lateral[sampled].copy(),
-        planned.friction[sampled].copy(),
-        plant,
-    )
+    return Drive(samples, sideslip.copy(), yaw_rate.copy(), rear_slip)
 
 
 def driven(plant: Plant, planned: Course) -> tuple[FloatArray, FloatArray, FloatArray]:

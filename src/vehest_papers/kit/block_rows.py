@@ -38,9 +38,9 @@ class BlockRow:
     seed: int
     test_set: str
     metric: str
-    block: str  # a name that is unique within the test set
-    value: float  # sum of the loss over the block; squared errors where the metric is a root
-    size: float  # samples in the sum
+    block: str = ""  # a name that is unique within the test set
+    value: float = 0.0  # sum of the loss over the block; squared errors where the metric is a root
+    size: float = 0.0  # samples in the sum
 
 
 @dataclass(frozen=True)

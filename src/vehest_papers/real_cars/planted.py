@@ -83,16 +83,14 @@ def planted_faults() -> list[Fault]:
         Fault("in another unit", (name,), unit, checks_of_units, partial(_scaled, factor))
         for name, unit, factor in units
     ]
+    offsets = [
+        ("ay", "0.3 m/s²", 0.3),
+        ("ay", "1 m/s²", 1.0),
+        ("steer", "4 deg", float(np.radians(4.0))),
+    ]
     faults += [
-        Fault("offset", ("ay",), "0.3 m/s²", frozenset({"offset"}), partial(_shifted, 0.3)),
-        Fault("offset", ("ay",), "1 m/s²", frozenset({"offset"}), partial(_shifted, 1.0)),
-        Fault(
-            "offset",
-            ("steer",),
-            "4 deg",
-            frozenset({"offset"}),
-            partial(_shifted, float(np.radians(4.0))),
-        ),
+        Fault("offset", (name,), size, frozenset({"offset"}), partial(_shifted, offset))
+        for name, size, offset in offsets
     ]
     faults += [
         Fault(
@@ -157,17 +155,7 @@ def detections(recording: Recording) -> pd.DataFrame:
                 ),
             }
         )
-    columns = [
-        "fault",
-        "channel",
-        "size",
-        "detectable",
-        "detected",
-        "reported",
-        "message",
-        "false_alarms",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows)
 
 
 def _counted(recording: Recording) -> list[Finding]:

@@ -25,6 +25,7 @@ DRIVEN_SHARE_OF_SPEED = 0.2
 """Share of its 99th percentile above which the speed counts as driving: the sideslip of a standing
 car is noise."""
 QUANTILES = (0.5, 0.9, 0.99)
+NO_QUANTILES = (math.nan,) * len(QUANTILES)
 MIN_SEGMENT_SECONDS = 3.0
 
 # Rules by which a recording can rank estimators, fixed before the table was first computed.
@@ -47,17 +48,19 @@ class Statistics:
     native_rate: float  # [Hz]
     speed: tuple[float, float]  # quantiles of vx at 1 and 99 % [m/s]
     ay: tuple[float, ...]  # `QUANTILES` of |ay| [m/s²]
-    sideslip: tuple[float, ...]  # `QUANTILES` of the reference's |β| [deg]
-    rms: float  # root mean square of the reference's β, the error of v = 0 [deg]
-    # RMSE(β) of v = r (b - k u²), both numbers fitted on the recording itself [deg]
-    static_map: float
-    correlation: float  # of v with the yaw rate
-    noise: float  # white noise of the reference [deg]
-    bound: float  # posterior Cramér-Rao bound with every measured input, axles known [deg]
-    # the same by kinematics alone, from u, ω, a_y and a_x where they are measured [deg]
-    kinematic_bound: float
     point: str  # where the reference was measured, as text
-    missing: str = ""  # the channel that is missing; empty where all are there
+    missing: str  # the channel that is missing; empty where all are there
+    sideslip: tuple[float, ...] = NO_QUANTILES  # `QUANTILES` of the reference's |β| [deg]
+    rms: float = math.nan  # root mean square of the reference's β, the error of v = 0 [deg]
+    # RMSE(β) of v = r (b - k u²), both numbers fitted on the recording itself [deg]
+    static_map: float = math.nan
+    correlation: float = math.nan  # of v with the yaw rate
+    noise: float = math.nan  # white noise of the reference [deg]
+    bound: float = (
+        math.nan
+    )  # posterior Cramér-Rao bound with every measured input, axles known [deg]
+    # the same by kinematics alone, from u, ω, a_y and a_x where they are measured [deg]
+    kinematic_bound: float = math.nan
 
     @property
     def reasons(self) -> list[str]:
@@ -87,37 +90,25 @@ def statistics_of(recordings: Sequence[Recording]) -> Statistics:
     labelled = [recording for recording in recordings if "vy_ref" in recording]
     recordings = labelled or recordings
     names = {"vx": "speed", "yaw_rate": "yaw rate", "vy_ref": "reference of v"}
-    missing = next(
-        (
-            word
-            for name, word in names.items()
-            if any(name not in recording for recording in recordings)
-        ),
-        "",
-    )
+    absent = [
+        word
+        for name, word in names.items()
+        if not all(name in recording for recording in recordings)
+    ]
     segments = [segment for recording in recordings for segment in _driven(recording)]
-    native = recordings[0].rate_hz
-    seconds = sum(recording.duration for recording in recordings)
-    driven = sum(segment.duration for segment in segments)
-    no_quantiles = (math.nan,) * len(QUANTILES)
-    point = _point(recordings[0])
     vx = _joined(segments, "vx")
-    speed = tuple(np.quantile(vx, (0.01, 0.99)).tolist()) if len(vx) else (math.nan, math.nan)
     ay = _joined(segments, "ay")
-    ay_quantiles = tuple(np.quantile(np.abs(ay), QUANTILES).tolist()) if len(ay) else no_quantiles
     without_reference = Statistics(
-        seconds,
-        driven,
-        native,
-        speed,
-        ay_quantiles,
-        no_quantiles,
-        *(math.nan,) * 6,
-        point=point,
-        missing=missing,
+        seconds=sum(recording.duration for recording in recordings),
+        driven=sum(segment.duration for segment in segments),
+        native_rate=recordings[0].rate_hz,
+        speed=tuple(np.quantile(vx, (0.01, 0.99)).tolist()) if len(vx) else (math.nan, math.nan),
+        ay=tuple(np.quantile(np.abs(ay), QUANTILES).tolist()) if len(ay) else NO_QUANTILES,
+        point=_point(recordings[0]),
+        missing=absent[0] if absent else "",
     )
     vy = _joined(segments, "vy_ref")
-    if missing or not len(vy):
+    if absent or not len(vy):
         return without_reference
     yaw_rate = _joined(segments, "yaw_rate")
     beta = np.degrees(np.arctan2(vy, vx))

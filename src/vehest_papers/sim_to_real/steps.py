@@ -21,6 +21,7 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.estimators.model_files import load_model
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.kit.runs import by_name
 from vehest_papers.kit.reading import metric_values
 
 RACE_CARS = "race_cars"
@@ -40,7 +41,7 @@ class Step:
     part: str  # name in the pipeline
     title: str  # of the part
     artefacts: PartArtefacts  # of the part
-    models: tuple[EvaluatedModel, ...]  # S of them
+    models: Sequence[EvaluatedModel]  # S of them
     validation: dict[str, FloatArray]  # metric -> (S,), on simulated validation cars
     race_cars: dict[str, FloatArray]  # on simulated race cars
     other: dict[str, FloatArray]  # on a car of another simulation
@@ -119,10 +120,7 @@ def steps_of(artefacts: StudyArtefacts) -> list[Step]:
     steps = []
     for name, part in parts.items():
         _check_is_simulated(artefacts.study, name, part)
-        for key in dict.fromkeys((model.estimator, model.variant) for model in part.models):
-            models = tuple(
-                model for model in part.models if (model.estimator, model.variant) == key
-            )
+        for models in by_name(part.models).values():
             steps.append(
                 Step(
                     part=name,
@@ -168,17 +166,12 @@ def _weights_at_zero(models: Sequence[EvaluatedModel]) -> FloatArray:
 
 
 def _values(
-    part: PartArtefacts, models: tuple[EvaluatedModel, ...], test_set: str
+    part: PartArtefacts, models: Sequence[EvaluatedModel], test_set: str
 ) -> dict[str, FloatArray]:
     """Metric -> (S,); NaN where the part has no such test set."""
     has_set = test_set in (VALIDATION, *part.split.tests)
     values = metric_values(part) if has_set else defaultdict(lambda: math.nan)
     return {
-        metric: np.array(
-            [
-                values[model.estimator, model.variant, model.seed, test_set, metric]
-                for model in models
-            ]
-        )
+        metric: np.array([values[*model.name, model.seed, test_set, metric] for model in models])
         for metric in METRICS
     }

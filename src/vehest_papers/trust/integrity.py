@@ -35,16 +35,15 @@ UNAVAILABLE = "unavailable"
 class Integrity:
     """Errors and protection levels of K samples, and their regions in the Stanford diagram."""
 
-    error: FloatArray  # size of the error [deg, or the unit of the levels]
-    level: FloatArray  # protection level
+    error: FloatArray  # size of the error of the sideslip angle [deg]
+    level: FloatArray  # protection level [deg]
     flagged: NDArray[np.bool_]  # whether the estimate was flagged as invalid
-    alert_limit: float = ALERT_LIMIT  # the same for all
 
     def masks(self) -> dict[str, NDArray[np.bool_]]:
         """Region -> samples in it, (K,); each sample lies in one."""
-        unavailable = self.flagged | ~(self.level <= self.alert_limit)
+        unavailable = self.flagged | ~(self.level <= ALERT_LIMIT)
         outside = ~unavailable & ~(self.error <= self.level)
-        hazardous = outside & ~(self.error <= self.alert_limit)
+        hazardous = outside & ~(self.error <= ALERT_LIMIT)
         return {
             NOMINAL: ~unavailable & ~outside,
             MISLEADING: outside & ~hazardous,
@@ -60,12 +59,7 @@ class Integrity:
         }
 
 
-def integrity_of(
-    error: FloatArray,
-    level: FloatArray,
-    flagged: NDArray[np.bool_],
-    alert_limit: float = ALERT_LIMIT,
-) -> Integrity:
+def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_]) -> Integrity:
     """Integrity from signed errors; samples without error or level are omitted.
 
     Parameters
@@ -76,21 +70,17 @@ def integrity_of(
         Protection level in the same unit, (T,).
     flagged
         Whether the estimate was flagged as invalid, (T,).
-    alert_limit
-        In the same unit.
     """
     has_both = ~np.isnan(error) & ~np.isnan(level)
-    is_flagged = np.asarray(flagged, bool)[has_both]
-    return Integrity(np.abs(error[has_both]), level[has_both], is_flagged, alert_limit)
+    return Integrity(np.abs(error[has_both]), level[has_both], flagged[has_both])
 
 
 def joined(parts: Sequence[Integrity]) -> Integrity:
-    """Integrity of several drives with the same alert limit together."""
+    """Integrity of several drives together."""
     return Integrity(
         np.concatenate([part.error for part in parts]),
         np.concatenate([part.level for part in parts]),
         np.concatenate([part.flagged for part in parts]),
-        parts[0].alert_limit,
     )
 
 
@@ -100,7 +90,6 @@ class AlarmRate:
 
     alarms: int  # number of false alarms
     hours: float  # of healthy driving
-    per_hour: float  # alarms an hour; NaN without any time
     low: float  # of the 95 % interval of the rate, exact for a Poisson process
     high: float  # likewise
 
@@ -121,8 +110,8 @@ def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) 
     alarms = sum(len(true_runs(drive)) for drive in flagged)
     hours = sum(len(drive) for drive in flagged) / rate_hz / 3600.0
     if hours == 0.0:
-        return AlarmRate(0, 0.0, math.nan, 0.0, math.inf)
+        return AlarmRate(0, 0.0, 0.0, math.inf)
     tail = 0.5 * (1.0 - CONFIDENCE)
     low = 0.5 * float(stats.chi2.ppf(tail, 2 * alarms)) if alarms else 0.0
     high = 0.5 * float(stats.chi2.ppf(1.0 - tail, 2 * alarms + 2))
-    return AlarmRate(alarms, hours, alarms / hours, low / hours, high / hours)
+    return AlarmRate(alarms, hours, low / hours, high / hours)

@@ -23,6 +23,7 @@ from vehest.studies.kit.runs import by_name
 from vehest_papers.kit.reading import sideslip_error
 from vehest_papers.trust.faults import health_of, tests_trained_car
 from vehest_papers.trust.integrity import (
+    ALERT_LIMIT,
     HAZARDOUS,
     MISLEADING,
     NOMINAL,
@@ -34,8 +35,8 @@ from vehest_papers.trust.integrity import (
 
 BINS = 60
 COLUMNS = 3
-AXIS_OVER_LIMIT = 2.0
-"""End of both axes over the alert limit."""
+AXIS_END = 2.0 * ALERT_LIMIT
+"""End of both axes [deg]."""
 _TEXT_BOX = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
 LABELS = {
     NOMINAL: (0.25, 0.75),
@@ -113,11 +114,10 @@ def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
             figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         ).ravel()
         for axes, (title, family) in zip(panels, families.items(), strict=False):
-            end = AXIS_OVER_LIMIT * family.alert_limit
             level = np.where(family.flagged | ~np.isfinite(family.level), np.inf, family.level)
-            edges = np.linspace(0.0, end, BINS + 1)
+            edges = np.linspace(0.0, AXIS_END, BINS + 1)
             across, up = (
-                np.clip(values, 0.0, end * (1.0 - 1e-9)) for values in (family.error, level)
+                np.clip(values, 0.0, AXIS_END * (1.0 - 1e-9)) for values in (family.error, level)
             )
             counts = np.histogram2d(across, up, bins=[edges, edges])[0]
             filled_bins = np.ma.masked_equal(counts.T, 0)
@@ -143,8 +143,8 @@ def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
 
 def _draw_regions(axes: Any, family: Integrity) -> None:
     """Limits between regions, and the share of the samples in each."""
-    limit = family.alert_limit
-    end = AXIS_OVER_LIMIT * limit
+    limit = ALERT_LIMIT
+    end = AXIS_END
     axes.fill(
         [0.0, limit, limit], [0.0, 0.0, limit], color=NONLINEAR_ORANGES[0], alpha=0.15, linewidth=0
     )

@@ -58,7 +58,6 @@ class Detection:
 
     is_detectable: bool  # whether it is detected within the horizon
     delay: float  # from the onset to the alarm [s]; NaN if it is not detected
-    threshold: float  # log A
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +147,7 @@ class Oracle:
         at = min(first_broken, int(above[0]) if len(above) else length)
         is_detectable = at < within
         delay = (at + 1) / self.rate_hz if is_detectable else math.nan
-        return Detection(is_detectable, delay, threshold)
+        return Detection(is_detectable, delay)
 
     def _threshold(self, test: Test, within: int) -> float:
         """log A, by the rate of false alarms and not below the largest value on healthy drives."""
