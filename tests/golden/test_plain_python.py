@@ -23,7 +23,7 @@ def numbers():
     return {
         "weights": dict(estimator.weights()),
         "estimates": dict(estimate.channels),
-        **in_folder(partial(simulated, seconds=0.4, **CAR)),
+        **in_folder(partial(simulated, seconds=0.2, **CAR)),
     }
 
 

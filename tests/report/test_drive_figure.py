@@ -134,7 +134,8 @@ def test_ranges_are_drawn_alone_and_empty_ranges_are_refused(drive):
 
 
 def test_a_notebook_shows_it_and_the_same_drive_gives_the_same_bytes(drive):
-    first, second = (drive_figure(drive, [estimate_of(drive)])._repr_png_() for _ in range(2))
+    few_panels = drive.select(["vx", "vy_ref"])
+    first, second = (drive_figure(few_panels)._repr_png_() for _ in range(2))
     assert first.startswith(b"\x89PNG")
     assert first == second
 

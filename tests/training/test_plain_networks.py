@@ -134,8 +134,10 @@ def network_type(name, dtype="float64"):
     return fit(NETWORKS[name], [0], dtype=dtype)[0][0]
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
+@pytest.mark.parametrize(
+    ("name", "dtype", "tolerance"),
+    [*((name, "float64", 1e-9) for name in NETWORKS), ("attention", "float32", 1e-4)],
+)
 def test_online_agrees_with_batch(name, dtype, tolerance):
     member = network_type(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()

@@ -166,9 +166,9 @@ def _plant(monkeypatch, member, bad_above, epoch=5):
 
 
 @pytest.mark.parametrize(
-    ("bad_above", "halvings", "ended"), [(3e-3, 1, 0.0), (6e-4, 3, 0.0), (0.0, 3, 1.0)]
+    ("bad_above", "halvings", "ended", "averaging"),
+    [(3e-3, 1, 0.0, 0.0), (6e-4, 3, 0.0, 0.9), (0.0, 3, 1.0, 0.0), (0.0, 3, 1.0, 0.9)],
 )
-@pytest.mark.parametrize("averaging", [0.0, 0.9])
 def test_diverged_member_goes_on_from_its_best_and_leaves_the_others_alone(
     tmp_path, monkeypatch, bad_above, halvings, ended, averaging
 ):
