@@ -196,6 +196,35 @@ def test_a_unit_of_time_that_is_not_known_is_asked(tmp_path):
     assert (clock.unit, clock.asked) == ("ms", True)
 
 
+@pytest.mark.parametrize("times", ["fewer", "others"])
+def test_a_column_of_times_for_each_channel_is_refused(tmp_path, times):
+    table = usual(drive()).rename(columns={"Time [s]": "Time_v [s]"})
+    lateral = table[["Gyro", "LatAcc"]].assign(**{"Time_r [ms]": 1e3 * table["Time_v [s]"]})
+    if times == "fewer":
+        lateral = lateral[::5].reset_index(drop=True)
+    else:
+        lateral["Time_r [ms]"] = 120e3 * np.linspace(0.0, 1.0, 6000) ** 1.1
+    table = pd.concat([table.drop(columns=["Gyro", "LatAcc"]), lateral], axis=1)
+    with pytest.raises(DataError, match=r"of times, Time_v \[s\], Time_r \[ms\], which differ"):
+        inspect("my_car", [write(tmp_path / "lap.csv", table)])
+
+
+def test_further_columns_of_times_that_agree_or_count_otherwise_are_read(tmp_path):
+    table = usual(drive())
+    seconds = table["Time [s]"]
+    table = table.assign(
+        **{
+            "t_received [s]": seconds + 0.1 * np.sin(seconds),
+            "UTC [s]": 43_200.0 + seconds,
+            "Lap Time [s]": seconds % 70.0,
+            "time_cam [s]": seconds.where(seconds < 60.0),
+            "GNSS time [s]": seconds.where(np.arange(6000) % 10 == 0),
+            "timestamp": 1e3 * seconds,
+        }
+    )
+    assert_yaw_rate_is(read_back(write(tmp_path / "lap.csv", table))[1], table)
+
+
 DURATIONS = {
     "ISO 8601": lambda seconds: f"PT{seconds:.2f}S",
     "ISO 8601 with minutes": lambda s: (
