@@ -279,6 +279,12 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
     return f"{header}\n" + "".join(f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows)
 
 
+def test_a_trace_of_pcan_is_refused_with_the_conversion(tmp_path):
+    (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"by 'can_logconvert lap.trc lap.asc'"):
+        inspect("my_car", [tmp_path / "lap.trc"])
+
+
 UNSUITED = {
     "long format": (long_format(), "'telemetry_name' names the quantity, 'telemetry_value' holds"),
     "names of a database": (long_format("_time,lap,_field,_value"), "'_field' names the quantity"),
@@ -548,6 +554,19 @@ def test_a_clock_of_two_rows_a_second_without_a_unit_is_asked_and_not_read_as_ms
     table = usual(drive(60.0)).iloc[::25].rename(columns={"Time [s]": "t"})
     clock = survey_table(write(tmp_path / "lap.csv", table)).clock
     assert (clock.unit, clock.asked) == ("s", True)
+
+
+def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):
+    d = drive(100.0)
+    fixes = pd.DataFrame({"time": 10**18 + 10**9 * np.arange(100), "speed": d["vx"][::50]})
+    odometry = pd.DataFrame({"t": d["t"], "twist.linear.x": d["vx"], "twist.angular.z": d["r"]})
+    for table, lacking in (
+        (fixes, r"a yaw rate \(yaw_rate\) or a lateral acceleration \(ay\)$"),
+        (odometry, r"a lateral acceleration \(ay\)$"),
+    ):
+        examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+        with pytest.raises(ConfigurationError, match=f"; no column looks like {lacking}"):
+            ask(examined, [], interactive=False)
 
 
 def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):
