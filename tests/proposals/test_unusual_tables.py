@@ -152,7 +152,9 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize(("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01)])
+@pytest.mark.parametrize(
+    ("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01), ("秒", 1.0)]
+)
 def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, seconds):
     table = usual(drive())
     table["Time [s]"] /= seconds
@@ -507,6 +509,7 @@ def test_minutes_and_seconds_are_times():
     ("units", "factors"),
     [
         (("m/s", "mdeg/s", "m/s²"), (1.0, np.radians(1e-3), 1.0)),
+        (("knots", "deg/min", "mg"), (1852.0 / 3600.0, np.radians(1.0 / 60.0), G * 1e-3)),
         (("cm/s", "mrad/s", "milli-g"), (0.01, 1e-3, G * 1e-3)),
         (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
         (("kn", "gradi/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),

@@ -29,14 +29,14 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
 STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
-    "s": "s sec secs second seconds sekunden",
-    "ms": "ms msec millis milliseconds",
+    "s": "s sec secs second seconds sekunden 秒",
+    "ms": "ms msec millis milliseconds ミリ秒",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
     "0.1*ms": "100us 100µs 100μs 0.1ms",
     "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
-    "min": "min mins minute minutes",
+    "min": "min mins minute minutes 分",
     "h": "h hr hrs hour hours stunden",
 }
 SPELLINGS = {
