@@ -140,6 +140,8 @@ def test_two_wrong_units_are_both_named_or_all_that_may_be_listed():
         in odd[0].message
     )
     drive = broadband_drive()
+    slipping = warned(changed(without(drive, "sideslip_ref"), vy_ref=lambda vy: 2.2 * vy))
+    assert "and whether the reference is at the centre of gravity" in slipping[0].message
     for slip in (
         1.0 + 6.0 * (np.sin(0.5 * drive.time) > 0.3),
         3.4 + 0.8 * np.sin(0.5 * drive.time),

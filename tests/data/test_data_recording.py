@@ -196,6 +196,7 @@ def test_units_of_something_else_and_unknown_channels_are_refused():
     [
         ("km/h", "m/s", 1000 / 3600),
         ("mdeg/s", "rad/s", np.deg2rad(1.0) / 1000),
+        ("deg/min", "rad/s", np.deg2rad(1.0) / 60),
         ("0.01*deg/s", "rad/s", np.deg2rad(1.0) * 0.01),
         ("mph", "m/s", 1609.344 / 3600),
         ("knots", "m/s", 1852 / 3600),

@@ -151,7 +151,9 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize(("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01)])
+@pytest.mark.parametrize(
+    ("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01), ("秒", 1.0)]
+)
 def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, seconds):
     table = usual(drive())
     table["Time [s]"] /= seconds
@@ -178,6 +180,35 @@ def test_fixes_of_a_receiver_of_1_hz_are_bridged_though_they_jitter(tmp_path):
     log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
     assert "drop_rows" not in log_draft.dataset
     assert recording.duration > 58.0
+
+
+@pytest.mark.parametrize("times", ["fewer", "others"])
+def test_a_column_of_times_for_each_channel_is_refused(tmp_path, times):
+    table = usual(drive()).rename(columns={"Time [s]": "Time_v [s]"})
+    lateral = table[["Gyro", "LatAcc"]].assign(**{"Time_r [ms]": 1e3 * table["Time_v [s]"]})
+    if times == "fewer":
+        lateral = lateral[::5].reset_index(drop=True)
+    else:
+        lateral["Time_r [ms]"] = 120e3 * np.linspace(0.0, 1.0, 6000) ** 1.1
+    table = pd.concat([table.drop(columns=["Gyro", "LatAcc"]), lateral], axis=1)
+    with pytest.raises(DataError, match=r"of times, Time_v \[s\], Time_r \[ms\], which differ"):
+        inspect("my_car", [write(tmp_path / "lap.csv", table)])
+
+
+def test_further_columns_of_times_that_agree_or_count_otherwise_are_read(tmp_path):
+    table = usual(drive())
+    seconds = table["Time [s]"]
+    table = table.assign(
+        **{
+            "t_received [s]": seconds + 0.1 * np.sin(seconds),
+            "UTC [s]": 43_200.0 + seconds,
+            "Lap Time [s]": seconds % 70.0,
+            "time_cam [s]": seconds.where(seconds < 60.0),
+            "GNSS time [s]": seconds.where(np.arange(6000) % 10 == 0),
+            "timestamp": 1e3 * seconds,
+        }
+    )
+    assert_yaw_rate_is(read_back(write(tmp_path / "lap.csv", table))[1], table)
 
 
 DURATIONS = {
@@ -232,6 +263,12 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
     if n_rows > 600:  # one quantity after the other
         rows = sorted(rows, key=lambda row: row[1])
     return f"{header}\n" + "".join(f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows)
+
+
+def test_a_trace_of_pcan_is_refused_with_the_conversion(tmp_path):
+    (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"by 'can_logconvert lap.trc lap.asc'"):
+        inspect("my_car", [tmp_path / "lap.trc"])
 
 
 UNSUITED = {
@@ -450,6 +487,7 @@ def test_minutes_and_seconds_are_times():
     ("units", "factors"),
     [
         (("m/s", "mdeg/s", "m/s²"), (1.0, np.radians(1e-3), 1.0)),
+        (("knots", "deg/min", "mg"), (1852.0 / 3600.0, np.radians(1.0 / 60.0), G * 1e-3)),
         (("cm/s", "mrad/s", "milli-g"), (0.01, 1e-3, G * 1e-3)),
         (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
         (("kn", "gradi/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),
@@ -494,6 +532,19 @@ def test_the_unit_of_time_is_as_the_header_states_or_asked_where_it_states_none(
     table = table.rename(columns={"Time [s]": name}).assign(**{name: factor * table["Time [s]"]})
     clock = survey_table(write(tmp_path / "lap.csv", table)).clock
     assert (clock.unit, clock.asked) == (unit, is_asked)
+
+
+def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):
+    d = drive(100.0)
+    fixes = pd.DataFrame({"time": 10**18 + 10**9 * np.arange(100), "speed": d["vx"][::50]})
+    odometry = pd.DataFrame({"t": d["t"], "twist.linear.x": d["vx"], "twist.angular.z": d["r"]})
+    for table, lacking in (
+        (fixes, r"a yaw rate \(yaw_rate\) or a lateral acceleration \(ay\)$"),
+        (odometry, r"a lateral acceleration \(ay\)$"),
+    ):
+        examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+        with pytest.raises(ConfigurationError, match=f"; no column looks like {lacking}"):
+            ask(examined, [], interactive=False)
 
 
 def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):

@@ -266,7 +266,10 @@ def test_without_a_speed_no_pipeline_is_written(
     assert log("data", "check", "my_car")[0] == 0
     log.write("gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     _, err = log.new("gyro.csv", "--yes", "--force", code=2)
-    assert err.endswith('confirm those that are right: --answer "Gyro=yaw_rate deg/s"\n')
+    assert err.endswith(
+        'confirm those that are right: --answer "Gyro=yaw_rate deg/s"; '
+        "no column looks like a speed (vx) or a lateral acceleration (ay)\n"
+    )
     answer = ("--answer", "Gyro=yaw_rate deg/s")
     out, err = log.new("gyro.csv", "--yes", "--force", *answer)
     assert (err, "lacks vx, ay" in out) == ("", True)

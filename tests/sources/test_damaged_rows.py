@@ -36,6 +36,18 @@ DATASET = {
     },
 }
 CUT_ENDS = {
+    "statistics": (
+        b"\r\nStatistics\r\nChannel,Min\r\nvx,20.0\r\nyaw_rate,0.1\r\n",
+        "4 lines of text below the rows ('Statistics')",
+    ),
+    "comment": (
+        b"# end of log, 500 records",
+        "1 line of text below the rows ('# end of log, 500 records')",
+    ),
+    "comment and zeros": (
+        "# Länge, 500 records\n\0\0".encode(),
+        "1 line of text below the rows ('# Länge, 500 records') and 2 zero bytes at the end",
+    ),
     "zeros": (b"\0" * 200_000, "200000 zero bytes at the end"),
     "row": (b"10.00,20.1", "a last row that is cut short ('10.00,20.1')"),
     "cell": (b"10.00,20.100,-", "a last row that is cut short ('10.00,20.100,-')"),
@@ -75,6 +87,9 @@ def test_the_end_of_a_table_whose_logger_was_switched_off_is_left_out_and_named(
         ("10.00,20.100,-", ("-",)),
         ("10.00,20.100,NaN", ()),
         ("end of log", ()),
+        ("vx,20.0\n", ()),  # of a row or of statistics
+        ("\nvx,20.0\n10.02,20.1", ()),
+        ("\nMean,20.0,0.1", ()),
         ("", ()),
     ],
 )

@@ -474,6 +474,11 @@ class WrongUnit:
         if not self.explanations:
             names = dict.fromkeys(name for relation in self.relations for name in relation.channels)
             advice = f"check the units of {listed(list(names))}"
+            if {"vy_ref", "sideslip_ref"} & set(names):
+                advice += (
+                    ", and whether the reference is at the centre of gravity (the transform "
+                    "reference_lever moves it there)"
+                )
             return Finding("warning", "unit", next(iter(names)), f"{figures}; {advice}")
         first = self.explanations[0]
         causes = " or ".join(

@@ -37,6 +37,7 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
         "rev/s": 2.0 * math.pi,
         "mrad/s": 0.001,
         "mdeg/s": math.pi / 180e3,
+        "deg/min": math.pi / 10_800.0,
     },
     "N": {"N": 1.0, "kN": 1e3},
     "N·m": {"N·m": 1.0, "Nm": 1.0},

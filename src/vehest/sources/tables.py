@@ -34,6 +34,10 @@ TAIL = 1 << 16  # bytes at the end of the rows, in which the last ones are
 BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
 # a row with a cell that is a number, or whose first one is missing
 ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
+BEGINS_AS_ROW = re.compile(
+    r'\s*"?([-+]?[.,]?\d|[,;|\t]|(nan|na|n/a|null|none|inf)\b)', re.IGNORECASE
+)
+COMMENT = re.compile(r"\s*(#|%|//)\s")
 UNFINISHED = re.compile(r"[-+]|[-+]?\.|[-+]?[\d.]+e[-+]?", re.IGNORECASE)  # a number, cut short
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
@@ -424,10 +428,11 @@ def table_stream(file: Path, n_bytes: int | None = None) -> pa.NativeFile:
 
 
 def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
-    """End of a table whose logger was switched off while it wrote: bytes before it, and its text.
+    """End of a table that is none of its rows: bytes before it, and its text.
 
-    It is zero bytes, a last row without an end that has fewer cells than the row above or ends
-    within a number, or both. None where the table is complete, packed or in UTF-16.
+    Of a logger that was switched off while it wrote, it is zero bytes, a last row without an end
+    that has fewer cells than the row above or ends within a number, or both; else a `_footer`.
+    None where the table is complete, packed or in UTF-16.
     """
     if is_parquet(file) or file.suffix.lower() in PACKED or layout.encoding.startswith("utf-16"):
         return None
@@ -441,6 +446,7 @@ def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
             end = start + len(tail)
     *above, last = re.split(r"\r\n|\n|\r", tail.decode(layout.encoding, errors="replace"))
     has_zeros = end < size
+    footer = _footer(tail, layout)
     cells, full = (
         next(csv.reader([line], delimiter=layout.delimiter), [])
         for line in (last, above[-1] if above else "")
@@ -450,12 +456,41 @@ def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
     is_cut = (
         len(cells) < len(full) or has_zeros or (is_unfinished and cells[-1] not in layout.missing)
     )
-    if not (last.strip() and is_row and is_cut and len(cells) <= len(full)):
+    if footer or not (last.strip() and is_row and is_cut and len(cells) <= len(full)):
         last = ""
     texts = [f"a last row that is cut short ('{printable(last[-40:])}')"] if last else []
     texts += [f"{number_of(size - end, 'zero byte')} at the end"] if has_zeros else []
     n_bytes = end - len(last.encode(layout.encoding, errors="replace"))
+    if footer:
+        n_bytes = end - sum(map(len, footer))
+        lines = [line.decode(layout.encoding, errors="replace").strip() for line in footer]
+        filled = [line for line in lines if line]
+        number = number_of(len(filled), "line")
+        texts = [f"{number} of text below the rows ('{printable(filled[0][:40])}')", *texts]
     return (n_bytes, " and ".join(texts)) if texts else None
+
+
+def _footer(tail: bytes, layout: TextLayout) -> list[bytes]:
+    """Lines of text with numbers below the rows, such as statistics or a count of records.
+
+    They begin with an empty line, a comment or text alone, and none has the first cell or the
+    number of cells of a row; empty where there are none, or where the reader leaves them out as
+    they hold no numbers.
+    """
+    lines = tail.splitlines(keepends=True)
+    texts = [line.decode(layout.encoding, errors="replace").strip("\r\n") for line in lines]
+    first = max((k + 1 for k, text in enumerate(texts) if BEGINS_AS_ROW.match(text)), default=0)
+    filled = [text for text in texts[first:] if text.strip()]
+    if not (first and filled):
+        return []
+    cells = [next(csv.reader([text], delimiter=layout.delimiter)) for text in texts[first - 1 :]]
+    has_numbers = [
+        bool(re.search(ROW_OF_NUMBERS, text, re.IGNORECASE)) and len(row) > 1
+        for text, row in zip(texts[first:], cells[1:], strict=True)
+    ]
+    begins = not has_numbers[0] or COMMENT.match(texts[first])
+    is_apart = all(len(row) != len(cells[0]) for row in cells[1:])
+    return lines[first:] if begins and any(has_numbers) and is_apart else []
 
 
 def require_memory(file: Path, layout: TextLayout) -> None:

@@ -36,6 +36,7 @@ _SPELLINGS_OF = {
     "mdeg": "mdeg m° millideg millidegree millidegrees",
     "mrad/s": "mrad/s mrads-1 mrads^-1 milliradian/s milliradians/s",
     "mdeg/s": "mdeg/s m°/s mdps mdegs-1 mdegs^-1 millideg/s millidegree/s millidegrees/s",
+    "deg/min": "deg/min °/min º/min degree/min degrees/min degree/minute degrees/minute degmin-1",
     "mg": "mg millig milli-g milligs",
     "cm/s²": "cm/s² cm/s^2 cm/s2 cm/s/s cms-2 cms^-2",
     "mm/s²": "mm/s² mm/s^2 mm/s2 mm/s/s mms-2 mms^-2",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,12 @@ from vehest.sources.surveys.clocks import STATED_UNITS
 
 LEAVE_OUT = "-"
 UNKNOWN = "unknown"
+REQUIRED = {
+    r"\b(vx|wheel_speed)": "a speed (vx)",
+    r"\byaw_rate": "a yaw rate (yaw_rate)",
+    r"\bay\b": "a lateral acceleration (ay)",
+}
+"""Channels without which nothing can be estimated: pattern of their names -> in words."""
 KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 
 
@@ -127,14 +134,20 @@ def ask(
             left.append(question)
             examined = _answered(examined, question, question.proposed)
     if left and not examined.proposals.channels:
+        unsure = [
+            question for question in left if question.candidates and question.proposed == LEAVE_OUT
+        ]
         takes = " ".join(
-            f'--answer "{question.key}={question.candidates[0]}"'
-            for question in left
-            if question.candidates and question.proposed == LEAVE_OUT
+            f'--answer "{question.key}={question.candidates[0]}"' for question in unsure
         )
+        candidates = " ".join(question.candidates[0] for question in unsure)
+        lacking = [
+            quantity for name, quantity in REQUIRED.items() if not re.search(name, candidates)
+        ]
+        lacks = f"; no column looks like {' or '.join(lacking)}" if lacking else ""
         raise ConfigurationError(
             "no channel is supported by two pieces of evidence; confirm those that are right: "
-            f"{takes}{unread(examined.log)}"
+            f"{takes}{lacks}{unread(examined.log)}"
         )
     return examined, tuple(left)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -28,14 +29,14 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
 STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
-    "s": "s sec secs second seconds sekunden",
-    "ms": "ms msec millis milliseconds",
+    "s": "s sec secs second seconds sekunden 秒",
+    "ms": "ms msec millis milliseconds ミリ秒",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
     "0.1*ms": "100us 100µs 100μs 0.1ms",
     "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
-    "min": "min mins minute minutes",
+    "min": "min mins minute minutes 分",
     "h": "h hr hrs hour hours stunden",
 }
 SPELLINGS = {
@@ -61,6 +62,9 @@ REGULAR = 0.8  # share of the steps within half a median step
 # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
 GROWING = 0.9
 MOST_RESTARTS = 0.01  # of the rows
+MAX_APART = 1.0  # s between the times of one row
+MIN_TIMES = 10
+LIKE = 0.05  # of the longer span, within which two columns of times end alike
 
 
 def find_clock(
@@ -120,6 +124,47 @@ def find_clock(
         runs, pause = between_pauses(seconds, step * STATED_UNITS[best.unit])
         options = pause | ({"time_restarts": True} if starts.any() else {})
     return best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), options
+
+
+def times_apart(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> list[str]:
+    """Columns of times that contradict one another: each channel has a clock of its own.
+
+    They grow from the first row on, perhaps to fewer rows, start and end alike, and are more than
+    `MAX_APART` from one another in a row.
+
+    Parameters
+    ----------
+    columns : mapping
+        Name -> numbers, shape (N,), NaN where a cell is empty.
+    units : mapping
+        Name -> unit as the file writes it, of those that have one.
+
+    Returns
+    -------
+    list of str
+        Their names in the order of the file; empty where all times agree.
+    """
+    times: dict[str, FloatArray] = {}
+    for name, values in columns.items():
+        written = units.get(name, "").replace(" ", "").strip("#[]()").lower()
+        unit = SPELLINGS.get(written, "")
+        n_times = int(np.isfinite(values).sum())
+        leading = values[:n_times]
+        is_named = bool(unit) or (not written and NAMED.match(plain_name(name)))
+        if is_named and n_times >= MIN_TIMES and (np.diff(leading) > 0.0).all():
+            times[name] = leading * STATED_UNITS[unit or "s"]
+    apart: set[str] = set()
+    for first, second in combinations(times, 2):
+        one, other = times[first], times[second]
+        n_both = min(len(one), len(other))
+        longest_step = max(np.median(np.diff(one)), np.median(np.diff(other)))
+        starts_alike = abs(one[0] - other[0]) <= longest_step
+        span = max(np.ptp(one), np.ptp(other))
+        ends_alike = abs(one[-1] - other[-1]) <= LIKE * span
+        distance = np.abs(one[:n_both] - other[:n_both]).max()
+        if starts_alike and ends_alike and distance > MAX_APART:
+            apart |= {first, second}
+    return [name for name in times if name in apart]
 
 
 def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:

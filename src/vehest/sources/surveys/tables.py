@@ -37,7 +37,14 @@ from vehest.data.parquet import (
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import past_midnight, seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
-from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
+from vehest.sources.surveys.clocks import (
+    MAX_APART,
+    NAMED,
+    SPELLINGS,
+    find_clock,
+    plain_name,
+    times_apart,
+)
 from vehest.sources.surveys.log import Log, RawColumn
 from vehest.sources.surveys.unsuited import require_columns_of_numbers, require_columns_of_signals
 from vehest.sources.tables import (
@@ -45,6 +52,7 @@ from vehest.sources.tables import (
     TextLayout,
     cut_end,
     is_parquet,
+    listed,
     names_of,
     parse_table,
     read_head,
@@ -118,8 +126,8 @@ def survey_table(file: Path) -> Log:
     Raises
     ------
     DataError
-        It is no table, has no names, holds no numbers or fewer than two rows of them, or is in long
-        format.
+        It is no table, has no names, holds no numbers or fewer than two rows of them, is in long
+        format, or each of its channels has times of its own.
     """
     clocks: dict[str, FloatArray] = {}
     options: dict[str, Any] = {}
@@ -166,6 +174,12 @@ def survey_table(file: Path) -> Log:
         )
     written = {name: units.get(name) or unit_in_name(name) for name in values}
     times_and_values = clocks | values
+    if apart := times_apart(times_and_values, written | dict.fromkeys(clocks, "s")):
+        raise DataError(
+            f"'{file}' has several columns of times, {listed(apart)}, which differ within a row by "
+            f"more than {MAX_APART:g} s: its channels have clocks of their own; export it with one "
+            "common column of times (resampled to one rate)"
+        )
     stamps, seconds, runs, cuts = find_clock(times_and_values, written | dict.fromkeys(clocks, "s"))
     if stamps is not None and stamps.column in clocks:
         stamps = replace(
