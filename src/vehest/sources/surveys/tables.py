@@ -517,7 +517,8 @@ def _table(file: Path, shape: Shape) -> tuple[pa.Table, list[str]]:
             problem = printable(first_line(error))
     raise DataError(
         f"'{file}' cannot be read as a table ({problem}); is it truncated, is a line of text or a "
-        "second table below its rows, or are its columns aligned by blanks?"
+        "second table below its rows, or are its columns aligned by blanks? A file needs one table "
+        "alone, with a separator between its cells"
     )
 
 
