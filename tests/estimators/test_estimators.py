@@ -300,10 +300,10 @@ def test_training_without_epochs_keeps_the_start_and_foreign_settings_are_refuse
 
 def test_models_are_inputs_and_are_resolved_by_name(place):
     common = ("estimator=ksnn", "split=mine", "training.max_epochs=1", "tracking=none", *OF_SHIPPED)
-    assert place("train", *common)[0] == 0
-    code, out, _ = place("train", *common, "training.start_from=pretrained")
-    assert code == 0
-    assert "skipped: False" in out or "up to date" not in out
+    plain = place.told("train", *common)
+    started = place.told("train", *common, "training.start_from=pretrained")
+    assert plain["model"] != started["model"]
+    assert not started["skipped"]
     refusal = place.refused("train", *common, "training.start_from=nobody")[1]
     assert refusal.startswith("error: there is no model 'nobody'")
     assert refusal.rstrip().endswith("comes with vehest: pretrained, self_calibrating")
