@@ -482,6 +482,27 @@ def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio, offset):
     assert alignment.residuals == ()
 
 
+def test_steering_intervals_contain_the_truth():
+    """Twenty drives: by a binomial law of 95 % fewer than 16 have a chance of 0.3 %."""
+    road = single_track(15.5, 0.05)
+    generator = np.random.default_rng(0)
+    inside = 0
+    for _ in range(20):
+        wander = lfilter(
+            [0.05 * math.sqrt(1 - 0.998**2)],
+            [1.0, -0.998],
+            generator.standard_normal(len(road) + 5000),
+        )[5000:]  # 5 s
+        recording = replace(
+            road, channels={**road.channels, "handwheel": road["handwheel"] + wander}
+        )
+        ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))[
+            "steering_ratio"
+        ]
+        inside += ratio.low <= 15.5 <= ratio.high
+    assert inside >= 16
+
+
 def understeering(seed):
     """Three minutes of a car whose tyres give way, at a speed, with a ratio and an understeer of
     its own.
