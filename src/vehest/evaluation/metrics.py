@@ -258,7 +258,8 @@ class Scored:
         """Lateral velocity and sideslip at some of the samples; without other states, covariances,
         innovations and bands.
         """
-        return Scored(*(getattr(self, name)[chosen] for name in SAMPLED))
+        arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in SAMPLED}
+        return Scored(**arrays)
 
     @classmethod
     def joined(cls, parts: Sequence[Scored]) -> Scored:
@@ -270,7 +271,7 @@ class Scored:
 
 
 SAMPLED = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay", "is_sideslip_scored")
-"""Arrays that every `Scored` has, its first fields."""
+"""Arrays that every `Scored` has."""
 
 
 def sequences(

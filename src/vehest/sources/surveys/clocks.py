@@ -64,7 +64,7 @@ GROWING = 0.9
 MOST_RESTARTS = 0.01  # of the rows
 MAX_APART = 1.0  # s between the times of one row
 MIN_TIMES = 10
-LIKE = 0.05  # of the longer span, within which two columns of times end alike
+MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ
 
 
 def find_clock(
@@ -155,14 +155,14 @@ def times_apart(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> 
             times[name] = leading * STATED_UNITS[unit or "s"]
     apart: set[str] = set()
     for first, second in combinations(times, 2):
-        one, other = times[first], times[second]
-        n_both = min(len(one), len(other))
-        longest_step = max(np.median(np.diff(one)), np.median(np.diff(other)))
-        starts_alike = abs(one[0] - other[0]) <= longest_step
-        span = max(np.ptp(one), np.ptp(other))
-        ends_alike = abs(one[-1] - other[-1]) <= LIKE * span
-        distance = np.abs(one[:n_both] - other[:n_both]).max()
-        if starts_alike and ends_alike and distance > MAX_APART:
+        n_both = min(len(times[first]), len(times[second]))
+        longest_step = max(np.median(np.diff(times[name])) for name in (first, second))
+        longest_span = max(np.ptp(times[name]) for name in (first, second))
+        start_error = abs(times[first][0] - times[second][0])
+        end_error = abs(times[first][-1] - times[second][-1])
+        in_a_row = np.abs(times[first][:n_both] - times[second][:n_both]).max()
+        is_same_drive = start_error <= longest_step and end_error <= MAX_END_SHARE * longest_span
+        if is_same_drive and in_a_row > MAX_APART:
             apart |= {first, second}
     return [name for name in times if name in apart]
 
