@@ -18,8 +18,10 @@ KILLS ?= 100
 PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
+# Byte code of the tests is kept: without it each process that runs them compiles them anew, 10 to 15 s.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_planted unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare friction_slip
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-studies test-slow ui docs reference docs-site screenshots notebooks example_log clean ferrari_drive ksnn learned_ukf learned_ukf_quick heavy_ekf cnn_ukf scorecard planted_truth error_traces proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_planted unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills interrupts golden lock pilots pilots-compare friction_slip
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -45,16 +47,16 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (after installing, three minutes of processor time the first time, seconds when repeated)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) ## tests (22 minutes on two idle cores); `make lint` has style, types and layers
+test: $(INSTALLED) ## tests (NN minutes on two idle cores); whole studies are in `make test-apart`, style and types in `make lint`
 	$(TESTS)
 
 test-durations: $(INSTALLED) ## the same, with the 50 that take longest
 	$(TESTS) --durations=50
 
-test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
+test-apart: $(INSTALLED) ## tests that are slow by nature: whole studies, documentation, fuzzing, the wheel, many processes (NN minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
 
-test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
+test-docs test-fuzz test-wheel test-processes test-studies: $(INSTALLED) ## one kind of them
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow" $(TESTS_$(@:test-%=%))
 
 test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rules and emulators, as far as these are installed (15 minutes)
@@ -65,13 +67,14 @@ test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, worker
 	$(BIN)/python -m pytest -rs -m "cluster and not slow" tests/cluster
 
 test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
-	$(BIN)/python -m pytest -m "page and not slow" -rs
+	$(BIN)/python -m pytest -m "page and not slow" -rs tests/report/test_page.py tests/test_site.py
 
 TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
 TESTS_docs := tests/test_docs.py tests/test_shown_commands.py tests/test_examples.py tests/test_notebooks.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py
+TESTS_studies := tests/golden tests/papers tests/report tests/run --ignore=tests/run/test_locks.py --ignore=tests/run/test_tracking.py
 
 lint: $(INSTALLED) ## style, types, layers of imports, published results that are stale
 	$(BIN)/ruff check .

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from functools import partial
 
+import pytest
 from golden_numbers import FIXED, Subject, in_folder, moved, simulated
 
 from every_estimator import drive_for, fitted
@@ -31,6 +32,7 @@ def record():
     return Subject({"any": "1"}, FIXED, numbers).record()
 
 
+@pytest.mark.apart
 def test_plain_python_gives_the_numbers_of_compiled_code():
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     ran = subprocess.run(

@@ -19,6 +19,8 @@ from vehest_papers.ksnn.data_quality import PUBLISHED, velocity_ratio
 from vehest_papers.ksnn.document import TEMPLATE
 from vehest_papers.ksnn.sub_models import variance_shares
 
+pytestmark = pytest.mark.apart
+
 
 def test_residuals_are_those_of_a_hand_calculation():
     reference = np.array([1.0, -1.0, 2.0, -2.0])

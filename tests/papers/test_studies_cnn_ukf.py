@@ -60,6 +60,8 @@ from vehest_papers.kit.block_rows import BlockRow
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.verdicts import VERDICTS
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).parents[2]
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=1.0, skip_seconds=0.5)
 TESTS = ("test_j_turn_1", "test_slalom_1", "test_spiral_1", "test_lap_1")

@@ -570,6 +570,7 @@ write_document(comparison(study(made)), report)
 """
 
 
+@pytest.mark.apart
 def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
     artefacts, written, tmp_path
 ):

@@ -10,6 +10,8 @@ import pytest
 from place import DATASET, write_drives
 from vehest.data.store import read_estimate, read_recording
 
+pytestmark = pytest.mark.apart
+
 PLAIN = ["estimator=zero,static_map,kinematic"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
 UNUSABLE = ["estimator=kalman"]  # there is no steering angle

@@ -21,6 +21,8 @@ from vehest.run.calibrate import STAGE
 from vehest.trust.bands import LEVELS
 from vehest.trust.record import About, Trust, write_trust
 
+pytestmark = pytest.mark.apart
+
 TRAIN = (
     "estimator=luenberger",
     "split=mine",

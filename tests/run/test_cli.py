@@ -73,6 +73,7 @@ def test_pipeline_reuses_artefacts_and_reruns_only_changed_stages(place):
     assert not any(" ingest " in line or " downsample " in line for line in done)
 
 
+@pytest.mark.apart
 def test_two_processes_give_the_same_numbers_and_a_dry_run_writes_nothing(place):
     place.change("pipelines/small.yaml", sweeps=PIPELINE["sweeps"][1:])
     assert ("would", "ingest") in _statuses(place.done("run", "small", "--dry-run")[1])
@@ -454,6 +455,7 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
     place.refused("ingest", "mine", code=4, says="no data root is set")
 
 
+@pytest.mark.apart
 def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypatch):
     outputs = place.folder / "outputs"
 
@@ -480,6 +482,7 @@ def test_unfinished_jobs_of_a_time_limit_are_named_and_continued(place, monkeypa
     assert "GRU" in out
 
 
+@pytest.mark.apart
 def test_the_next_command_that_is_printed_finds_data_and_results_elsewhere(place, monkeypatch):
     folder = place.folder / "my results"
     monkeypatch.setenv("VEHEST_DATA", str(place.folder))
@@ -516,6 +519,7 @@ def test_the_training_that_an_evaluation_asks_for_can_be_pasted(place):
     place.done("eval", *words)
 
 
+@pytest.mark.apart
 def test_only_the_study_as_it_is_written_is_published(place):
     place.change("pipelines/small.yaml", publish=True, sweeps=PIPELINE["sweeps"][:1])
     results = place.folder / "results" / "small"
@@ -582,6 +586,7 @@ def _epochs(place, monkeypatch, *arguments):
     return [checkpoint.values["epoch"] for _, checkpoint in save.calls], json.loads(out)
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("number", "code", "options", "first"),
     [
@@ -606,6 +611,7 @@ def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(
     )
 
 
+@pytest.mark.apart
 def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, monkeypatch):
     _killed(place, *SAVES, 3, "train", *BUDGET)
     assert not list((place.folder / "outputs").glob("train/[!.]*"))
@@ -621,6 +627,7 @@ def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, m
     assert not any("checkpoint" in name for name in place.files())
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, monkeypatch, number):
     if number == signal.SIGTERM:
@@ -638,6 +645,7 @@ def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, mo
     )
 
 
+@pytest.mark.apart
 def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
     place.change("pipelines/small.yaml", sweeps=PIPELINE["sweeps"][:2])
     endless = (

@@ -22,6 +22,8 @@ from vehest.run.study import jobs_of, read_study
 from vehest.run.versions import code_of
 from vehest.trust.faults import KINDS, is_fault
 
+pytestmark = pytest.mark.apart
+
 TRAINED = ("split=mine", "estimator=kinematic", "tracking=none")
 FROZEN = (
     "fault=frozen",

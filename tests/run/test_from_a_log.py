@@ -7,6 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "from_a_log.md").read_text(encoding="utf-8")
 LOG = ROOT / "docs" / "examples" / "lap.csv"

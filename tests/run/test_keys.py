@@ -13,6 +13,8 @@ from vehest.estimators.gru import Gru
 from vehest.run.comparison import lower_rate
 from vehest.run.train import training_options
 
+pytestmark = pytest.mark.apart
+
 STUDY = PIPELINE | {
     "publish": True,
     "sweeps": [

@@ -350,6 +350,7 @@ def _small_disk(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, former)
 
 
+@pytest.mark.apart
 def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     trained = (
         "estimator=luenberger",

@@ -16,6 +16,8 @@ from place import run_vehest
 from vehest.cli import app
 from vehest.data.files import ASIDE_PREFIX
 
+pytestmark = pytest.mark.apart
+
 FILES = ("conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_car.yaml")
 
 

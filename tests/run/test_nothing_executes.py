@@ -21,6 +21,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.apart
+
 WATCHED = {
     "exec",
     "compile",

@@ -20,6 +20,8 @@ from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
+pytestmark = pytest.mark.apart
+
 PIPELINE_OF_BOTH = "pipelines/both.yaml"
 CANDIDATES = [
     ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],

@@ -9,6 +9,7 @@ from pathlib import Path
 import make_pretrained
 import numpy as np
 import pandas as pd
+import pytest
 import yaml
 
 import vehest
@@ -46,6 +47,7 @@ def test_estimate_without_a_model_uses_and_names_the_pretrained_model(place):
     assert (bands > 0.0).all()
 
 
+@pytest.mark.apart
 def test_estimate_of_the_shipped_model_loads_no_torch_pandas_or_scipy_signal(place):
     write_csv(place.folder / "lap.csv", 9)
     program = (

@@ -24,6 +24,8 @@ from vehest.run.publishing import PROVENANCE, published_content
 from vehest.run.versions import VERSIONS, code_of
 from vehest.run.weights import uncompressed
 
+pytestmark = pytest.mark.apart
+
 QUICK = PIPELINE | {
     "publish": True,
     "sweeps": [

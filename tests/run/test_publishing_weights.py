@@ -19,6 +19,8 @@ from vehest.data.text_files import read_json
 from vehest.run import downsample, runner, weights
 from vehest.run.weights import PublishedWeights, WeightsTooLargeError
 
+pytestmark = pytest.mark.apart
+
 GRU = ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]
 RUN = ("run", "pair", "tracking=none", "--publish-weights", "--jobs", "1")

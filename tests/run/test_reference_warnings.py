@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+pytestmark = pytest.mark.apart
+
 NAMES = ("one", "two", "three")
 RIGHT = {"column": "Vy", "unit": "m/s"}
 JOB = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5")

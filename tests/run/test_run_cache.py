@@ -12,6 +12,8 @@ import pytest
 from vehest.data.files import stamp_of
 from vehest.run.run_cache import RunCache
 
+pytestmark = pytest.mark.apart
+
 HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
 WORDS = ("small", "tracking=none")
 SWEEP = (

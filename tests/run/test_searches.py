@@ -11,6 +11,8 @@ from place import write_drives
 from vehest.run import searches
 from vehest.run.study import jobs_of, read_study
 
+pytestmark = pytest.mark.apart
+
 GRU = ["estimator=gru", "estimator.n_states=2", "training.max_epochs=2"]
 RATES = "training.learning_rate=0.001,0.01"
 RUN = ("run", "tuned", "tracking=none", "--jobs", "1")

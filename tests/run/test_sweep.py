@@ -24,6 +24,8 @@ from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.sweep import SweepArtefacts, build, heat_map, heat_maps, interval, table_of
 
+pytestmark = pytest.mark.apart
+
 QUICK = (
     "split=mine",
     "estimator=ksnn",

@@ -654,6 +654,7 @@ def test_new_car_lists_requirements_of_plugins_without_a_settings_file(place):
         assert f"of another package cannot be {PLUGINS[name][1]}" in requirements[name]
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("plugins")
 @pytest.mark.parametrize("name", PLUGINS)
 def test_studies_naming_a_broken_plugin_are_a_single_line_and_train_nothing(place, name):
@@ -665,6 +666,7 @@ def test_studies_naming_a_broken_plugin_are_a_single_line_and_train_nothing(plac
     place.refused("run", "logged", "tracking=none", code=2, says=message)
 
 
+@pytest.mark.apart
 @pytest.mark.usefixtures("plugins")
 def test_broken_study_modules_are_a_single_line(place):
     place.change(

@@ -4,10 +4,13 @@ import json
 
 import numpy as np
 import pandas as pd
+import pytest
 import yaml
 
 from conftest import planar_drive
 from place import run_vehest, undrawn
+
+pytestmark = pytest.mark.apart
 
 
 def test_two_commands_lead_to_a_verdict_and_two_more_to_an_estimate_and_to_c(

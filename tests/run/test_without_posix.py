@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from conftest import planar_drive
 from place import write_yaml
+
+pytestmark = pytest.mark.apart
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 CHILD = """
