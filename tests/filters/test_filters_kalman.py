@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numba.core.event import install_recorder
 from readable_filters import log_likelihood
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
@@ -139,6 +140,18 @@ def test_covariances_stay_symmetric_and_positive():
         lowest = min(lowest, np.linalg.eigvalsh(short + short.T).min())
         short = A @ short @ A.T + Q
     assert lowest < 0, "otherwise this example would show nothing"
+
+
+def test_the_loop_is_compiled_once_for_varying_constant_and_fixed_models():
+    model, measurements, initial = example(4)
+    kalman_scan(model, measurements, initial)
+    constant = LinearModel(*(part[0] for part in model))
+    for part in initial:
+        part.flags.writeable = False
+    with install_recorder("numba:compile") as recorder:
+        kalman_scan(constant, measurements, initial)
+        kalman_scan(constant, measurements[:1], initial)
+    assert not recorder.buffer
 
 
 def test_shapes_that_do_not_fit_are_refused():

@@ -95,20 +95,20 @@ def kalman_scan(
 
 
 def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
-    """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names
-    it.
+    """Array in float64 of a shape, from one that is of it or broadcasts to it. It can be written:
+    for one that cannot, the loop would be compiled once more.
 
     Raises
     ------
     ValueError
         The shape does not broadcast; the message names the array.
     """
-    if values.shape == shape and values.dtype == np.float64:
-        return np.ascontiguousarray(values)
-    try:
-        return np.ascontiguousarray(np.broadcast_to(np.asarray(values, dtype=np.float64), shape))
-    except ValueError:
-        raise ValueError(f"{name} of shape {np.shape(values)} does not fit {shape}") from None
+    if np.shape(values) != shape:
+        try:
+            values = np.broadcast_to(values, shape)
+        except ValueError:
+            raise ValueError(f"{name} of shape {np.shape(values)} does not fit {shape}") from None
+    return np.require(values, np.float64, ("C", "W"))
 
 
 @numba.njit(cache=True, error_model="numpy")
