@@ -72,8 +72,13 @@ MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
-# letters of Japanese, which accents in Windows-1252 make only one by one
-WIDE = re.compile(r"[ぁ-ヿ一-鿿]{2}")
+# encoding -> bytes that texts in Windows-1252 hardly have, its letters, and their least share of
+# all letters beyond ASCII: Chinese that is read as Korean has few other ones
+EAST_ASIAN = {
+    "cp932": (rb"[\x80-\x9f]", "[ぁ-ヿ一-鿿]", 0.5),  # Shift-JIS as Windows writes it
+    "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
+    "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
+}
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
@@ -386,8 +391,9 @@ def _is_unit(text: str) -> bool:
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """Encoding and text of the beginning of a file.
 
-    UTF-16 by its mark, then UTF-8, then Shift-JIS if it makes Japanese words, then Windows-1252;
-    Latin-1 where none of them fits. `DataError` where control characters say that it is no text.
+    UTF-16 by its mark, then UTF-8, then one of `EAST_ASIAN` if it makes words of its language, then
+    Windows-1252; Latin-1 where none of them fits. `DataError` where control characters say that it
+    is no text.
     """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
@@ -396,14 +402,23 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
     encodings = {"utf8": "utf-8-sig"}
-    if re.search(rb"[\x80-\x9f]", head):
-        encodings |= {"cp932": "cp932", "cp1252": "cp1252"}  # Shift-JIS as Windows writes it
+    encodings |= {name: name for name, (rare, *_) in EAST_ASIAN.items() if re.search(rare, head)}
+    encodings |= {"cp1252": "cp1252"} if re.search(rb"[\x80-\x9f]", head) else {}
     for name, encoding in encodings.items():
         with suppress(UnicodeDecodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
-            if name != "cp932" or WIDE.search(text):
+            if name not in EAST_ASIAN or _has_words(text, *EAST_ASIAN[name][1:]):
                 return name, text
     return "latin-1", head.decode("latin-1")
+
+
+def _has_words(text: str, letter: str, min_share: float) -> bool:
+    """Whether two of some letters stand together, as accents in Windows-1252 hardly make them, and
+    they have a share of all letters beyond ASCII.
+    """
+    n_letters = sum(not character.isascii() and character.isalpha() for character in text)
+    is_language = len(re.findall(letter, text)) >= min_share * n_letters
+    return is_language and bool(re.search(f"{letter}{{2}}", text))
 
 
 def _without_texts(
