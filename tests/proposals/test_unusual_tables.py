@@ -148,6 +148,7 @@ TIMES = {
     "day of the year": lambda at: at.strftime("%j:%H:%M:%S.%f"),
     "year and its day": lambda at: at.strftime("%Y-%j-%H:%M:%S.%f"),
     "hhmmss": lambda at: at.strftime("%H%M%S.%f"),
+    "date and time in digits": lambda at: at.strftime("%Y%m%d%H%M%S%f")[:-3],
 }
 
 

@@ -479,16 +479,30 @@ def _columns(
                 digits = values.pop(name)
                 minutes = digits // 100 % 100 + 60 * (digits // 10_000)
                 clocks[name] = past_midnight(digits % 100 + 60 * minutes)
+            elif _may_be_dates(column) and (dated := _seconds(column)) is not None:
+                del values[name]
+                clocks[name] = dated
             marks |= column_marks
             skipped += [
                 f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
                 for text, row in odd.items()
             ]
-        elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
+        elif (seconds := _seconds(column)) is not None:
             clocks[name] = seconds
         else:
             skipped.append(f"column '{printable(name)}' holds {_kind_of_text(column)}")
     return values, clocks, marks, skipped
+
+
+def _seconds(column: pa.ChunkedArray) -> FloatArray | None:
+    """Times of a clock, shape (N,) [s]; None where a column holds anything else."""
+    return seconds_of_text(column.cast(pa.string(), safe=False))
+
+
+def _may_be_dates(column: pa.ChunkedArray) -> bool:
+    """Whether numbers may be yyyymmddhhmmss of this century, perhaps with milliseconds."""
+    first = column[0].as_py() if pa.types.is_integer(column.type) else None
+    return first is not None and any(2.0 <= first / 10**zeros < 2.1 for zeros in (13, 16))
 
 
 def _shows_a_clock(numbers: FloatArray) -> bool:
