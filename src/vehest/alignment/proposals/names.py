@@ -17,7 +17,7 @@ WEAK = 2.0
 _STRONG = {  # over the name without blanks
     "other": (
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
-        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|"
+        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|jerk|"
         r"ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|"
         r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|"
         r"zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"

@@ -249,8 +249,9 @@ def _fault(name: str, times: FloatArray) -> str:
 def unit_in_name(name: str) -> str:
     """The unit that a column's name ends in, as it is written there.
 
-    It stands in brackets, ``Speed [km/h]``, or behind the last blank or underscore, ``ay_mps2``,
-    where it is a known unit or abbreviation of two letters or more; ``ms`` of a velocity is m/s.
+    It stands in brackets, ``Speed [km/h]``, unless they hold an index, ``xyz[2]``, or behind the
+    last blank or underscore, ``ay_mps2``, where it is a known unit or abbreviation of two letters
+    or more; ``ms`` of a velocity is m/s.
 
     Returns
     -------
@@ -259,7 +260,8 @@ def unit_in_name(name: str) -> str:
     """
     bracketed = BRACKETED.match(name.strip())
     if bracketed:
-        return bracketed["unit"].strip()
+        unit = bracketed["unit"].strip()
+        return "" if unit.isdigit() else unit
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
     if last == "ms" and VELOCITY.fullmatch(name.strip()):
