@@ -1595,6 +1595,17 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     channels, open_questions = left_out(tmp_path, table)
     assert {"vx", "vy_ref"}.isdisjoint(channels)
     assert "an axis of the world" in open_questions["vy"].text
+    table = table.assign(ax=np.gradient(east, d["t"]), ay=np.gradient(north, d["t"]))
+    channels, open_questions = left_out(tmp_path, table.drop(columns="acc_lat"))
+    assert {"vx", "vy_ref", "ax", "ay"}.isdisjoint(channels)
+    table = table.rename(columns={"acc_lat": "accelerometer_m_s2[1]", "wz": "xyz[2]"})
+    by_channel = proposed(tmp_path, table.assign(groundspeed=d["vx"]))
+    assert {name: by_channel[name].column for name in ("vx", "yaw_rate", "ay")} == {
+        "vx": "groundspeed",
+        "yaw_rate": "xyz[2]",
+        "ay": "accelerometer_m_s2[1]",
+    }
+    assert {"ax", "vy_ref"}.isdisjoint(by_channel)
 
 
 def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):

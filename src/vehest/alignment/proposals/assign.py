@@ -152,6 +152,10 @@ def propose(
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
     is_standing = _is_standing(usable)
+    in_world = _along_world_axes(usable)
+    of_car = [column for column in usable if column.name not in in_world]
+    is_car_measured = bool(in_world and find_turning(of_car))
+    usable = of_car if is_car_measured else usable
     usable, turnings = (usable, []) if is_standing else _turnings_of_any_axes(usable)
     if turnings and rate_hz is None:
         rate_by_ax = _rate_by_ax(_search_around(turnings[0], usable, clock_hz))
@@ -166,7 +170,13 @@ def propose(
         proposals = proposals.with_notes(
             f"the car stands still throughout ({standstill}); channels are proposed by name only"
         )
-    proposals = _ask_about_world_axes(proposals, usable, clock_hz)
+    if is_car_measured:
+        left_out = [f"'{name}'" for name, *_ in columns if name in in_world]
+        proposals = proposals.with_notes(
+            "left out as derivatives of a position along axes of the world: "
+            f"{abbreviated(left_out, MAX_LISTED)}"
+        )
+    proposals = _ask_about_world_axes(proposals, in_world)
     if search is not None:
         proposals = _ask_about_speed(proposals, search, wheels, usable)
     clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
@@ -640,31 +650,50 @@ def _possible_sideslip_angles(columns: Sequence[Candidate], motion: Motion) -> I
 # --- doubts ----------------------------------------------------------------------------------
 
 
-def _ask_about_world_axes(
-    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
-) -> Proposals:
-    """Question velocities where the speed is the derivative of a coordinate of a position."""
-    speed = proposals.by_channel.get("vx")
+def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
+    """Columns that are derivatives of a coordinate of a position, the first or the second.
+
+    Those of a car that turns which agree more with the motion along or across its path are its own.
+    """
     positions = [_first_named(columns, role) for role in ("position_x", "position_y")]
-    if speed is None or None in positions:
-        return proposals
-    along, across = (np.gradient(column.slow) for column in positions if column is not None)
-    by_name = {column.name: column for column in columns}
-    slow = by_name[speed.column].slow if speed.column in by_name else along
-    is_turning = float(np.std(across)) > MIN_WORLD_CROSSING * float(np.std(along))
-    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
-    of_path = abs(correlation(slow, np.hypot(along, across)))
-    if not (is_turning and of_axis > MIN_WORLD_CORRELATION and of_axis > of_path):
+    if None in positions:
+        return set()
+    steps = [np.gradient(column.slow) for column in positions if column is not None]
+    along, across = (float(np.std(each)) for each in steps)
+    if across <= MIN_WORLD_CROSSING * along:
+        return set()
+    changes = [np.gradient(each) for each in steps]
+    path = np.hypot(*steps)
+    normal = (steps[0] * changes[1] - steps[1] * changes[0]) / np.maximum(path, 1e-9)
+    of_world = (*steps, *changes)
+    of_car = (path, np.gradient(path), normal)
+
+    def agreement(column: Candidate, signals: Iterable[FloatArray]) -> float:
+        return max(abs(correlation(column.slow, samples)) for samples in signals)
+
+    return {
+        column.name
+        for column in columns
+        if agreement(column, of_world) > max(MIN_WORLD_CORRELATION, agreement(column, of_car))
+    }
+
+
+def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Proposals:
+    """Question velocities where the speed is one along an axis of the world, and accelerations
+    along one.
+    """
+    speed = proposals.by_channel.get("vx")
+    if speed is None or speed.column not in in_world:
         return proposals
     question = (
-        "it is the derivative of a position: "
-        "is it a velocity along an axis of the world, not of the car?"
+        "it is the derivative of a position: is it along an axis of the world, not of the car?"
     )
     return proposals.changed(
         {
             proposal.channel: replace(proposal, question=question, is_weak=True)
             for proposal in proposals.channels
             if proposal.channel in ("vx", "vy_ref")
+            or (proposal.channel in ("ax", "ay") and proposal.column in in_world)
         }
     )
 
