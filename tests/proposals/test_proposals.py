@@ -1606,6 +1606,24 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
         "ay": "accelerometer_m_s2[1]",
     }
     assert {"ax", "vy_ref"}.isdisjoint(by_channel)
+    east, north, places = places_of(d, turning=3.0)
+    table = pd.DataFrame({"t": d["t"], "Vel_X": east, "Vel_Y": north, **places, "wz": d["r"]})
+    table.assign(acc_lat=d["ay"]).to_csv(tmp_path / "places.csv", index=False)
+    by_channel = inspect("my_car", [tmp_path / "places.csv"]).proposals.by_channel
+    assert "an axis of the world" in by_channel["vx"].question
+    assert "an axis of the world" in by_channel["vy_ref"].question
+
+
+def test_gravity_is_no_speed_and_units_that_rest_on_a_speed_left_out_are_too(tmp_path):
+    d = drive()
+    noise = np.random.default_rng(0).standard_normal((2, len(d["t"])))
+    table = {"t": d["t"], "Gyr_Z": d["r"], "Acc_X": d["ax"], "Acc_Y": d["ay"]}
+    by_channel = proposed(tmp_path, pd.DataFrame({**table, "Acc_Z": G + 0.3 * noise[0]}))
+    assert "vx" not in by_channel
+    counts = {"SAS_raw": 7800.0 + 20.0 * noise[1], "YawRate_raw": 32768.0 + 11459.0 * d["r"]}
+    counts |= {"LatAcc_raw": 2040.0 + 100.0 * d["ay"], "VLat": d["vy"]}
+    channels, _ = left_out(tmp_path, pd.DataFrame({"t": d["t"], **counts}))
+    assert channels == {"vy_ref": "VLat"}
 
 
 def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):

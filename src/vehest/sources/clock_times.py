@@ -34,9 +34,9 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times that are written as a clock's, in seconds.
 
     ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``105930.25``, ``2024-05-03T10:59:30.25Z``,
-    ``20240503T105930``, ``20240503105930250``, ``2024-124-10:59:30.25``, ``124:10:59:30``, ``3.5.2024 10:59:30,25``,
-    ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM`` and ``0 days 00:00:30.25``, or as a duration,
-    ``PT1M30.25S`` or ``90.25 s``. The zone is not
+    ``20240503T105930``, ``20240503105930250``, ``2024-124-10:59:30.25``, ``124:10:59:30``,
+    ``3.5.2024 10:59:30,25``, ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM`` and
+    ``0 days 00:00:30.25``, or as a duration, ``PT1M30.25S`` or ``90.25 s``. The zone is not
     read. Where the year does not come first, the day does as in Europe, or the month as in the
     United States where AM or PM is written; the other order holds if this one makes impossible
     dates or a step of `MAX_STEP` or more.

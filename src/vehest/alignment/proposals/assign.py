@@ -514,7 +514,7 @@ def _ask_for_second_evidence(
     Pieces are the relation ay ≈ vx·yaw_rate, a relation to another channel, a second measurement,
     the unit of the header and the name. yaw_rate ≈ steer·vx/wheelbase and a lateral velocity
     follow a turn alike. Where speed or yaw rate is left out, so is what was compared with them, if
-    it has a question.
+    it has a question, and a unit that their gain decides.
     """
     is_related = "ay" in turning.columns and not is_scale_wrong(turning)
     sure = {name for name, proposal in channels.items() if not proposal.question}
@@ -530,13 +530,16 @@ def _ask_for_second_evidence(
         evidence += [bool(column.unit), role in column.hints]
         if sum(evidence) < 2:
             checked[name] = replace(proposal.questioned(SINGLE_EVIDENCE), is_weak=True)
-    channels_of_turn = [name for name in channels if channels[name].column in columns]
+    confirmed = {
+        name
+        for name, proposal in channels.items()
+        if proposal.column in columns and (turning.decided or columns[proposal.column][1].unit)
+    }
     if any(checked[name].is_weak for name in ("vx", "yaw_rate") if name in checked):
         checked = {
             name: replace(
                 proposal,
-                is_weak=proposal.is_weak
-                or (bool(proposal.question) and name not in channels_of_turn),
+                is_weak=proposal.is_weak or (bool(proposal.question) and name not in confirmed),
             )
             for name, proposal in checked.items()
         }
@@ -655,10 +658,15 @@ def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
 
     Those of a car that turns which agree more with the motion along or across its path are its own.
     """
-    positions = [_first_named(columns, role) for role in ("position_x", "position_y")]
-    if None in positions:
+    for roles in (("position_x", "position_y"), ("longitude", "latitude")):
+        positions = [_first_named(columns, role) for role in roles]
+        if None not in positions:
+            break
+    else:
         return set()
     steps = [np.gradient(column.slow) for column in positions if column is not None]
+    if roles[0] == "longitude":
+        steps[0] *= _cosine(positions[1])  # type: ignore[arg-type]
     along, across = (float(np.std(each)) for each in steps)
     if across <= MIN_WORLD_CROSSING * along:
         return set()
@@ -825,8 +833,7 @@ def _left_right_clues(
     longitude = _first_named(columns, "longitude")
     if latitude is None or longitude is None:
         return
-    cosine = math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
-    east = longitude.slow * (-1.0 if is_vbo else 1.0) * cosine
+    east = longitude.slow * (-1.0 if is_vbo else 1.0) * _cosine(latitude)
     yaw_rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     speed = slow_of(np.abs(motion.vx), motion.rate_hz)
     steps = np.gradient(east), np.gradient(latitude.slow)
@@ -840,6 +847,11 @@ def _left_right_clues(
             "positive",
             correlation(turned[is_sound], yaw_rate[is_sound]),
         )
+
+
+def _cosine(latitude: Candidate) -> float:
+    """Of a log's mean latitude, by which a degree of longitude is shorter than one of latitude."""
+    return math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
 
 
 def _first_named(columns: Sequence[Candidate], role: str) -> Candidate | None:

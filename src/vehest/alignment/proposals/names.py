@@ -1,5 +1,5 @@
-"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x``
-and ``_y``, ``other``.
+"""Roles that a name suggests: channels, ``az``, ``heading``, ``latitude``, ``longitude``,
+``position_x`` and ``_y``, ``other``.
 
 Names are compared in lower case without marks, umlauts and units in brackets; patterns are English
 and German, as loggers of both languages write them. A strong hint is a name of its own, a weak one
@@ -38,6 +38,7 @@ _STRONG = {  # over the name without blanks
     r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
     r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
+    "az": r"acc(el|eleration)?z|zacc|^az$|verta|accvert",
     "handwheel": (
         r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
         r"volant"
