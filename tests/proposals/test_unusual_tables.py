@@ -492,6 +492,7 @@ def test_minutes_and_seconds_are_times():
         (("cm/s", "mrad/s", "milli-g"), (0.01, 1e-3, G * 1e-3)),
         (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
         (("kn", "gradi/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),
+        (("0.005 m/s", "0.0625 deg/s", "5e-4*g"), (0.005, np.radians(0.0625), 5e-4 * G)),
     ],
 )
 def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
