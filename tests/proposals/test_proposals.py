@@ -463,10 +463,13 @@ ROLES = {
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
     "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
     "VelDown": "other", "Pos Lat (deg)": "latitude", "GNSS_Lon": "longitude",
+    "Y Body Velocity": "vy_ref", "X-BdyVel": "vx", "poseDevice.acceleration.y": "ay",
+    "LFspeed": "wheel_speed_fl", "VxTarget": "other", "v_soll": "other", "Acc_Z": "az",
 }  # fmt: skip
 
 
 def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
+    assert list(hints("HL [km/h]", "km/h")) == ["wheel_speed_rl"]
     assert {name: list(hints(name)) for name in ROLES} == {
         name: [role] for name, role in ROLES.items()
     }
@@ -1568,6 +1571,9 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
         "ax": "AccelerationZ",
         "vy_ref": "VelocityX",
     }
+    table.columns = [re.sub(r"(.*)([XYZ])$", r"\2 \1", name) for name in table.columns]
+    assert proposed(tmp_path, table)["vx"].column == "Z Velocity"
+    table.columns = [re.sub(r"([XYZ]) (.*)", r"\2\1", name) for name in table.columns]
     table.columns = [name.replace("AngularVelocityX", "Gyro X (rad/s)") for name in table.columns]
     table.columns = [name.replace("AngularVelocity", "Gyro ") for name in table.columns]
     assert "roll_rate" not in proposed(tmp_path, table)  # about X, which is no forward axis here

@@ -49,7 +49,7 @@ _SPELLINGS_OF = {
     "psi": "psi",
     "A": "a amp ampere",
     "V": "v volt",
-    "%": "% percent",
+    "%": "% percent pct prozent",
     "°C": "°c degc",
     "m": "m meter metre",
     "another unit": "mm cm km mv ma hpa mbar hz kg ms s",
