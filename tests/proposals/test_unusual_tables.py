@@ -536,6 +536,26 @@ def test_the_unit_of_time_is_as_the_header_states_or_asked_where_it_states_none(
     assert (clock.unit, clock.asked) == (unit, is_asked)
 
 
+@pytest.mark.parametrize(
+    ("name", "ticks_per_second", "start", "unit"),
+    [
+        ("SampleTimeFine", 1e4, 1234567, "0.1*ms"),
+        ("Ticks", 1e7, 133_591_643_700_000_000, "0.1*us"),  # since 1601
+        ("time", 1e7, 0, "0.1*us"),
+    ],
+)
+def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_fits(
+    tmp_path, name, ticks_per_second, start, unit
+):
+    table = usual(drive())
+    ticks = start + np.rint(ticks_per_second * table["Time [s]"]).astype(np.int64)
+    table = table.drop(columns="Time [s]").assign(**{name: ticks})
+    log_draft, recording = read_back(exact(tmp_path / "lap.csv", table))
+    assert log_draft.examined.log.clock.asked
+    assert log_draft.dataset["time"] == {"column": name, "unit": unit}
+    assert recording.rate_hz == pytest.approx(50.0, rel=1e-6)
+
+
 def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):
     d = drive(100.0)
     fixes = pd.DataFrame({"time": 10**18 + 10**9 * np.arange(100), "speed": d["vx"][::50]})

@@ -40,7 +40,7 @@ from vehest.alignment.proposals.fitting import (
     longitudinal,
     may_be_ax,
 )
-from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
+from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered, is_pair
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.scales import find_wrong_scale, is_scale_wrong
@@ -85,6 +85,7 @@ MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the
 MIN_SIDE_CORRELATION = 0.5  # of wheels or a course, from which they decide left and right
 PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
 NOMINAL_RATE_HZ = 50.0  # of a log without times
+MAX_DECADE_ERROR = 0.1
 MIN_COURSE_SAMPLES = 50
 MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
 MAX_COURSE_STEP = 1.0  # rad
@@ -127,6 +128,7 @@ def propose(
     rate_hz: float | None,
     *,
     is_vbo: bool = False,
+    is_rate_sure: bool = True,
 ) -> Proposals:
     """Propose channels for the columns of a log.
 
@@ -139,11 +141,14 @@ def propose(
         Sampling rate; None where it is unknown, and then estimated from d(vx)/dt and ax.
     is_vbo : bool
         Whether ``heading`` is clockwise and longitudes count to the west, as in a VBOX log.
+    is_rate_sure : bool
+        Whether the rate is not to be corrected by a power of ten, as d(vx)/dt and ax indicate it.
 
     Returns
     -------
     Proposals
-        At most one proposal for a channel and for a column, with evidence and open questions.
+        At most one proposal for a channel and for a column, with evidence and open questions;
+        ``rate_hz`` where the rate was unknown or is corrected.
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     magnitudes = magnitudes_beside_signs(columns)
@@ -161,6 +166,11 @@ def propose(
         rate_by_ax = _rate_by_ax(_search_around(turnings[0], usable, clock_hz))
         if rate_by_ax is not None:
             return replace(propose(columns, rate_by_ax, is_vbo=is_vbo), rate_hz=rate_by_ax)
+    if turnings and rate_hz is not None and not is_rate_sure:
+        decades = _wrong_decades(_search_around(turnings[0], usable, clock_hz))
+        if decades:
+            corrected_hz = rate_hz * 10.0**decades
+            return replace(propose(columns, corrected_hz, is_vbo=is_vbo), rate_hz=corrected_hz)
     search = None if is_standing else _best_search(usable, turnings, clock_hz)
     motion = search.motion if search else None
     proposals = _assign(usable, search, wheels)
@@ -381,6 +391,23 @@ def _rate_by_ax(search: Search) -> float | None:
     scale = np.linalg.lstsq(np.stack(regressors, axis=1), column.slow, rcond=None)[0][0]
     rate_hz = motion.rate_hz * abs(scale) * si_factor(best.unit, "ax")
     return float(min(PLAIN_RATES_HZ, key=lambda plain: abs(math.log(plain / rate_hz))))
+
+
+def _wrong_decades(search: Search) -> int:
+    """Power of ten by which the rate is too low, where an acceleration is d(vx)/dt at another rate
+    only; else 0.
+    """
+    ay = search.turning.columns["ay"]
+    motion = search.motion
+    change = slow_of(motion.derivative(motion.vx), motion.rate_hz)
+    for column in search.free:
+        is_of_same_sensor = is_pair(column.name, ay.name)
+        agreement = correlation(column.slow, change)
+        if may_be_ax(column) and is_of_same_sensor and abs(agreement) >= CLEAR_CORRELATION:
+            size = si_factor(column.unit or search.turning.units["ay"], "ax")
+            decades = math.log10(size * float(np.std(column.slow) / np.std(change)))
+            return round(decades) if abs(decades - round(decades)) < MAX_DECADE_ERROR else 0
+    return 0
 
 
 # --- channels --------------------------------------------------------------------------------

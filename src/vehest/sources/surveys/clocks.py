@@ -27,7 +27,7 @@ COUNTER = re.compile(
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
-STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
+STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "0.1*us": 1e-7, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
     "s": "s sec secs second seconds sekunden 秒 초",
     "ms": "ms msec millis milliseconds ミリ秒",
@@ -35,6 +35,7 @@ SPELLINGS_OF = {
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
     "0.1*ms": "100us 100µs 100μs 0.1ms",
+    "0.1*us": "100ns 0.1us 0.1µs 0.1μs",
     "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
     "min": "min mins minute minutes 分",
     "h": "h hr hrs hour hours stunden",
@@ -308,7 +309,8 @@ def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> St
         evidence = f"unit in the header, {rate:.6g} Hz"
     elif unit:
         evidence += f", {1.0 / (step * STATED_UNITS[unit]):.6g} Hz in {unit}, as the header says"
-    return Stamps(name, chosen, evidence, asked=chosen not in fitting or unit not in ("", chosen))
+    is_asked = chosen not in fitting or unit not in ("", chosen)
+    return Stamps(name, chosen, evidence, asked=is_asked, is_stated=bool(unit))
 
 
 def _run_starts(
