@@ -67,6 +67,15 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     assert recording.rate_hz == 50.0
 
 
+def test_a_row_of_types_between_names_and_units_holds_no_names(tmp_path):
+    table = usual(drive())
+    names, *rows = lines_of(table)
+    types = ",".join(["f8"] * len(table.columns))
+    file = text_file(tmp_path, "ASCII record", names, types, "s,km/h,deg/s,g,g,deg,deg", *rows)
+    assert_yaw_rate_is(read_back(file)[1], table)
+    assert set(inspect("my_car", [file]).log.by_name) == {*table.columns} - {"Time [s]"}
+
+
 @pytest.mark.parametrize(
     ("of_names", "of_rows"), [(",", ""), ("", ","), ("", ",,"), (",", ",,"), (",,", "")]
 )
@@ -443,6 +452,8 @@ def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
         (lambda v: f"{v:.3f}".replace("-", "−"), "another minus sign, such as '−"),
         (lambda v: f"{v:.3f} deg/s", "a unit, such as '"),
         (lambda v: f"{v:.4E}".replace("E", "D"), "another mark of the exponent, such as '"),
+        (lambda v: f"({abs(v):.3f})" if v < 0.0 else f"{v:.3f}", "parentheses for a minus sign,"),
+        (lambda v: f"[{v:.4f} 0.02 -1e-05]", "brackets around several of them, such as '["),
     ],
 )
 def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, message_part):

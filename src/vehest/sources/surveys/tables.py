@@ -91,6 +91,10 @@ VELOCITY = re.compile(
 DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
+    "parentheses for a minus sign": r"^\s*\(\d+([.,]\d+)?\)\s*$",
+    "brackets around several of them": (
+        r"^\s*[\[(][-+.\d\s]+(e[-+]?\d+)?([\s,;]+[-+.\d]+(e[-+]?\d+)?)+\s*[\])]\s*$"
+    ),
     "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
     "a separator of thousands": (
         "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$"
@@ -345,11 +349,10 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
 
 
 def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
-    """Line of the names among those above the numbers: over the units, else of most names."""
+    """Line of the names among those above the numbers: of most names, over the units if any."""
     block = [k for k in above if k > above[-1] - MAX_HEADER_LINES]
-    for before, k in pairwise(block):
-        if _are_units(rows[k]):
-            return before
+    units_at = next((k for k in block[1:] if _are_units(rows[k])), None)
+    block = [k for k in block if units_at is None or k < units_at]
     n_names = {
         k: len({cell for cell in rows[k] if cell.strip() and not _is_unit(cell)}) for k in block
     }
