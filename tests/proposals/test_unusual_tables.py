@@ -13,7 +13,7 @@ import pytest
 from mdf_log import write_mdf
 from planted_logs import G, drive, usual, write
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import ask
@@ -342,6 +342,10 @@ UNSUITED = {
         ),
         "messages of a satellite receiver",
     ),
+    "a row for each signal": (
+        usual(drive(10.0)).round(4).T.to_csv(header=False),
+        "has a row for each signal; transpose it",
+    ),
     "quoted rows": (
         "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
         "each row in one pair of quotes; remove them",
@@ -479,14 +483,24 @@ def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path)
         survey_table(file)
 
 
-def test_decimals_of_parquet_are_numbers(tmp_path):
+@pytest.mark.parametrize("form", ["decimal", "dictionary"])
+def test_decimals_and_dictionaries_of_parquet_are_numbers(tmp_path, form):
     table = usual(drive())
     stored = pa.Table.from_pandas(table, preserve_index=False)
     at = stored.column_names.index("Gyro")
-    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
+    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4))
+    gyro = gyro.cast(pa.decimal128(12, 4)) if form == "decimal" else gyro.dictionary_encode()
     file = tmp_path / "lap.parquet"
     pq.write_table(stored.set_column(at, "Gyro", gyro), file)
     assert_yaw_rate_is(read_back(file)[1], table)
+
+
+def test_a_folder_of_tables_is_refused_with_the_names_of_its_files(tmp_path):
+    for number in range(2):
+        (tmp_path / f"part-{number}.parquet").touch()
+    (tmp_path / "_SUCCESS").touch()
+    with pytest.raises(MissingError, match=r"such as .*\*\.parquet"):
+        inspect("my_car", [tmp_path])
 
 
 def test_minutes_and_seconds_are_times():
