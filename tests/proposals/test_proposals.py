@@ -1210,12 +1210,16 @@ def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
     assert unit_in_name(name) == unit
 
 
-def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
+@pytest.mark.parametrize("is_sorted", [True, False])
+def test_rows_of_several_rasters_by_their_times_or_one_after_the_other_are_read(
+    tmp_path, is_sorted
+):
     d = drive()
     table = usual(d)
     slow = table[["Time [s]", "Speed", "Beta"]][::2]
     slow = slow.assign(**{"Time [s]": slow["Time [s]"] + 0.003})
-    mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow]).sort_values("Time [s]")
+    mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow])
+    mixed = mixed.sort_values("Time [s]") if is_sorted else mixed
     log_draft = drafted(tmp_path, mixed)
     assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= log_draft.channels
     recording = read_back(log_draft)

@@ -73,7 +73,8 @@ def find_clock(
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
     """The column that is the clock of a table.
 
-    It grows evenly, by name or unit before another, or is named so and grows. One that counts rows,
+    It grows evenly, by name or unit before another, or is named so and grows, perhaps once its rows,
+    those of one device after those of another, are sorted. One that counts rows,
     by 1 from 0 or 1 without a name or unit of time, is none.
 
     Parameters
@@ -101,6 +102,8 @@ def find_clock(
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
+        if may_be_time and not repair and _is_of_several_devices(columns, name):
+            values, repair = np.sort(raw), {"sort": True}
         step = _step(values, named=named)
         counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         if step is None or counts_rows:
@@ -206,6 +209,20 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     repeats_no_more = (sorted_steps == 0).sum() <= (steps == 0).sum()
     is_out_of_order = is_even and (is_apart or (is_near and repeats_no_more))
     return (ordered, {"sort": True}) if is_out_of_order else (times, {})
+
+
+def _is_of_several_devices(columns: Mapping[str, FloatArray], clock: str) -> bool:
+    """Whether the rows of each device follow those of another: where times go back, other columns
+    have samples.
+    """
+    goes_back = np.diff(columns[clock]) < 0
+    if not 0 < goes_back.sum() < len(columns):
+        return False
+    measured = [
+        {name for name in columns if name != clock and np.isfinite(columns[name][rows]).any()}
+        for rows in stretches(goes_back, len(columns[clock]))
+    ]
+    return all(a and b and a.isdisjoint(b) for a, b in combinations(measured, 2))
 
 
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:

@@ -52,8 +52,8 @@ def require_columns_of_signals(
     ------
     DataError
         It holds JSON, messages of a satellite receiver, raw frames of a bus, InfluxDB's line
-        protocol, columns that are aligned by blanks, a row for each signal, rows in one pair of quotes, or a value a row
-        (long format).
+        protocol, columns that are aligned by blanks, a row for each signal, rows in one pair of
+        quotes, or a value a row (long format).
     """
     filled = [line.strip() for line in lines if line.strip()]
     if filled and _JSON.fullmatch(filled[0]):
