@@ -147,6 +147,9 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     mirrored = usual(d)
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(tmp_path, mirrored) == ["left_right"]
+    heading = np.degrees(-np.cumsum(3.0 * d["r"]) / 50.0) % 360.0
+    proposals = proposals_of(tmp_path, mirrored.assign(**{"GPS Heading": heading}))
+    assert (proposals.by_channel["yaw_rate"].sign, proposals.left_right) == (-1, "")
     proposals = proposals_of(tmp_path, mirrored.assign(**wheels_of(d)))
     assert "right wheels are faster" in proposals.left_right
     assert {proposals.by_channel[name].sign for name in LATERAL} == {-1}

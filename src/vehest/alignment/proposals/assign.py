@@ -12,6 +12,7 @@ columns -> candidates
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -804,7 +805,9 @@ def _with_left_right(
     motion: Motion | None,
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
-    """With signs by the first clue that decides, else by a pose, else as most columns count."""
+    """With signs by the first clue that decides, else by a pose, else by a heading as a compass
+    counts, else as most columns count.
+    """
     for text, agreement in clues:
         if abs(agreement) > MIN_SIDE_CORRELATION:
             sign = "+1" if agreement > 0.0 else "-1"
@@ -815,10 +818,33 @@ def _with_left_right(
         _, name, unit = proposals.pose[-1]
         yaw = next(column for column in columns if column.name == name)
         is_mirrored = turning_of(yaw, unit, motion) < 0.0
+    elif compass := _compass(columns, motion):
+        name, agreement = compass
+        is_mirrored = agreement > 0.0
+        proposals = proposals.with_notes(
+            f"left and right are proposed as by '{name}', if it is clockwise as that of a compass"
+        )
     else:
         signs = [proposal.sign for proposal in proposals.channels if proposal.channel in LATERAL]
         is_mirrored = sum(signs) < 0
     return proposals.mirrored() if is_mirrored else proposals
+
+
+def _compass(columns: Sequence[Candidate], motion: Motion | None) -> tuple[str, float] | None:
+    """Name of the first heading from 0 to 360 degrees that turns as the yaw rate does, and their
+    correlation; None where none does.
+    """
+    if motion is None:
+        return None
+    for column in columns:
+        is_yaw = re.search("yaw|psi", column.name.lower())  # which may count the other way round
+        is_angle = column.hints.get("heading") == STRONG and column.unit in ("", "deg")
+        low, high = float(column.values.min()), float(column.values.max())
+        if is_angle and not is_yaw and 0.0 <= low < 180.0 < high <= 360.0:
+            agreement = turning_of(column, "deg", motion)
+            if abs(agreement) > MIN_SIDE_CORRELATION:
+                return column.name, agreement
+    return None
 
 
 def _with_signs_of_majority(proposals: Proposals) -> Proposals:

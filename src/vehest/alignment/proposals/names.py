@@ -50,7 +50,7 @@ _STRONG = {  # over the name without blanks
     ),
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
     "heading": (
-        r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
+        r"heading|truehead|course|bearing|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
         r"headimu"
     ),
     "latitude": r"latitude|(gps|gnss|pos)lat$|^lat$|breitengrad",

@@ -73,9 +73,9 @@ def find_clock(
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
     """The column that is the clock of a table.
 
-    It grows evenly, by name or unit before another, or is named so and grows, perhaps once its rows,
-    those of one device after those of another, are sorted. One that counts rows,
-    by 1 from 0 or 1 without a name or unit of time, is none.
+    It grows evenly, by name or unit before another, or is named so and grows, perhaps once rows of
+    one device after those of another are sorted. One that counts rows, by 1 from 0 or 1 without a
+    name or unit of time, is none.
 
     Parameters
     ----------
