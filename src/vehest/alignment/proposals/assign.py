@@ -686,15 +686,9 @@ def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
 
     Those of a car that turns which agree more with the motion along or across its path are its own.
     """
-    for roles in (("position_x", "position_y"), ("longitude", "latitude")):
-        positions = [_first_named(columns, role) for role in roles]
-        if None not in positions:
-            break
-    else:
+    steps = [np.gradient(coordinate) for coordinate in _places(columns)]
+    if not steps:
         return set()
-    steps = [np.gradient(column.slow) for column in positions if column is not None]
-    if roles[0] == "longitude":
-        steps[0] *= _cosine(positions[1])  # type: ignore[arg-type]
     along, across = (float(np.std(each)) for each in steps)
     if across <= MIN_WORLD_CROSSING * along:
         return set()
@@ -712,6 +706,19 @@ def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
         for column in columns
         if agreement(column, of_world) > max(MIN_WORLD_CORRELATION, agreement(column, of_car))
     }
+
+
+def _places(columns: Sequence[Candidate]) -> list[FloatArray]:
+    """Coordinates of a position, or longitude and latitude in one scale; empty without either."""
+    x, y, longitude, latitude = (
+        _first_named(columns, role)
+        for role in ("position_x", "position_y", "longitude", "latitude")
+    )
+    if x is not None and y is not None:
+        return [x.slow, y.slow]
+    if longitude is not None and latitude is not None:
+        return [longitude.slow * _cosine(latitude), latitude.slow]
+    return []
 
 
 def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Proposals:

@@ -228,9 +228,9 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     families: dict[str, list[Candidate]] = {}
     for column in columns:
         words = bare(column.name)
-        family = _LETTER_OF_AXIS.sub("", words)
-        if family != words:
-            families.setdefault(family, []).append(column)
+        without_letter = _LETTER_OF_AXIS.sub("", words)
+        if without_letter != words:
+            families.setdefault(without_letter, []).append(column)
     changed = {}
     for family in families.values():
         roles = {role for column in family for role in column.hints}
