@@ -147,6 +147,9 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     mirrored = usual(d)
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(tmp_path, mirrored) == ["left_right"]
+    heading = np.degrees(-np.cumsum(3.0 * d["r"]) / 50.0) % 360.0
+    proposals = proposals_of(tmp_path, mirrored.assign(**{"GPS Heading": heading}))
+    assert (proposals.by_channel["yaw_rate"].sign, proposals.left_right) == (-1, "")
     proposals = proposals_of(tmp_path, mirrored.assign(**wheels_of(d)))
     assert "right wheels are faster" in proposals.left_right
     assert {proposals.by_channel[name].sign for name in LATERAL} == {-1}
@@ -463,10 +466,13 @@ ROLES = {
     "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other", "latitude": "latitude",
     "AngRateDown": "yaw_rate", "AngRateForward": "roll_rate", "AccelRight": "ay",
     "VelDown": "other", "Pos Lat (deg)": "latitude", "GNSS_Lon": "longitude",
+    "Y Body Velocity": "vy_ref", "X-BdyVel": "vx", "poseDevice.acceleration.y": "ay",
+    "LFspeed": "wheel_speed_fl", "VxTarget": "other", "v_soll": "other", "Acc_Z": "az",
 }  # fmt: skip
 
 
 def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
+    assert list(hints("HL [km/h]", "km/h")) == ["wheel_speed_rl"]
     assert {name: list(hints(name)) for name in ROLES} == {
         name: [role] for name, role in ROLES.items()
     }
@@ -1207,12 +1213,16 @@ def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
     assert unit_in_name(name) == unit
 
 
-def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
+@pytest.mark.parametrize("is_sorted", [True, False])
+def test_rows_of_several_rasters_by_their_times_or_one_after_the_other_are_read(
+    tmp_path, is_sorted
+):
     d = drive()
     table = usual(d)
     slow = table[["Time [s]", "Speed", "Beta"]][::2]
     slow = slow.assign(**{"Time [s]": slow["Time [s]"] + 0.003})
-    mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow]).sort_values("Time [s]")
+    mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow])
+    mixed = mixed.sort_values("Time [s]") if is_sorted else mixed
     log_draft = drafted(tmp_path, mixed)
     assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= log_draft.channels
     recording = read_back(log_draft)
@@ -1283,10 +1293,13 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
     [
         ("cp932", "車速[km/h]", "ヨーレート[°/s]"),
         ("cp932", "速度[km/h]", "角速度[deg/s]"),
+        ("gb18030", "车速(km/h)", "横摆角速度(°/s)"),
+        ("cp949", "차속(km/h)", "요레이트(deg/s)"),
         ("cp1252", "„v“", "‰r"),
+        ("latin-1", "vitesse générée", "dérivé de Hélène [°/s]"),
     ],
 )
-def test_names_in_shift_jis_are_read_and_windows_1252_is_not_taken_for_it(
+def test_names_in_east_asian_encodings_are_read_and_windows_1252_is_not_taken_for_them(
     tmp_path, encoding, speed, rate
 ):
     table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})
@@ -1565,6 +1578,9 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
         "ax": "AccelerationZ",
         "vy_ref": "VelocityX",
     }
+    table.columns = [re.sub(r"(.*)([XYZ])$", r"\2 \1", name) for name in table.columns]
+    assert proposed(tmp_path, table)["vx"].column == "Z Velocity"
+    table.columns = [re.sub(r"([XYZ]) (.*)", r"\2\1", name) for name in table.columns]
     table.columns = [name.replace("AngularVelocityX", "Gyro X (rad/s)") for name in table.columns]
     table.columns = [name.replace("AngularVelocity", "Gyro ") for name in table.columns]
     assert "roll_rate" not in proposed(tmp_path, table)  # about X, which is no forward axis here
@@ -1592,6 +1608,35 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     channels, open_questions = left_out(tmp_path, table)
     assert {"vx", "vy_ref"}.isdisjoint(channels)
     assert "an axis of the world" in open_questions["vy"].text
+    table = table.assign(ax=np.gradient(east, d["t"]), ay=np.gradient(north, d["t"]))
+    channels, open_questions = left_out(tmp_path, table.drop(columns="acc_lat"))
+    assert {"vx", "vy_ref", "ax", "ay"}.isdisjoint(channels)
+    table = table.rename(columns={"acc_lat": "accelerometer_m_s2[1]", "wz": "xyz[2]"})
+    by_channel = proposed(tmp_path, table.assign(groundspeed=d["vx"]))
+    assert {name: by_channel[name].column for name in ("vx", "yaw_rate", "ay")} == {
+        "vx": "groundspeed",
+        "yaw_rate": "xyz[2]",
+        "ay": "accelerometer_m_s2[1]",
+    }
+    assert {"ax", "vy_ref"}.isdisjoint(by_channel)
+    east, north, places = places_of(d, turning=3.0)
+    table = pd.DataFrame({"t": d["t"], "Vel_X": east, "Vel_Y": north, **places, "wz": d["r"]})
+    table.assign(acc_lat=d["ay"]).to_csv(tmp_path / "places.csv", index=False)
+    by_channel = inspect("my_car", [tmp_path / "places.csv"]).proposals.by_channel
+    assert "an axis of the world" in by_channel["vx"].question
+    assert "an axis of the world" in by_channel["vy_ref"].question
+
+
+def test_gravity_is_no_speed_and_units_that_rest_on_a_speed_left_out_are_too(tmp_path):
+    d = drive()
+    noise = np.random.default_rng(0).standard_normal((2, len(d["t"])))
+    table = {"t": d["t"], "Gyr_Z": d["r"], "Acc_X": d["ax"], "Acc_Y": d["ay"]}
+    by_channel = proposed(tmp_path, pd.DataFrame({**table, "Acc_Z": G + 0.3 * noise[0]}))
+    assert "vx" not in by_channel
+    counts = {"SAS_raw": 7800.0 + 20.0 * noise[1], "YawRate_raw": 32768.0 + 11459.0 * d["r"]}
+    counts |= {"LatAcc_raw": 2040.0 + 100.0 * d["ay"], "VLat": d["vy"]}
+    channels, _ = left_out(tmp_path, pd.DataFrame({"t": d["t"], **counts}))
+    assert channels == {"vy_ref": "VLat"}
 
 
 def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from mdf_log import write_mdf
 from planted_logs import G, drive, usual, write
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import ask
@@ -65,6 +65,15 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     assert channels == {"yaw_rate": "z_rate", "ay": "y_acc"}
     np.testing.assert_allclose(recording["ay"], d["ay"], atol=1e-4)
     assert recording.rate_hz == 50.0
+
+
+def test_a_row_of_types_between_names_and_units_holds_no_names(tmp_path):
+    table = usual(drive())
+    names, *rows = lines_of(table)
+    types = ",".join(["f8"] * len(table.columns))
+    file = text_file(tmp_path, "ASCII record", names, types, "s,km/h,deg/s,g,g,deg,deg", *rows)
+    assert_yaw_rate_is(read_back(file)[1], table)
+    assert set(inspect("my_car", [file]).log.by_name) == {*table.columns} - {"Time [s]"}
 
 
 @pytest.mark.parametrize(
@@ -148,6 +157,7 @@ TIMES = {
     "day of the year": lambda at: at.strftime("%j:%H:%M:%S.%f"),
     "year and its day": lambda at: at.strftime("%Y-%j-%H:%M:%S.%f"),
     "hhmmss": lambda at: at.strftime("%H%M%S.%f"),
+    "date and time in digits": lambda at: at.strftime("%Y%m%d%H%M%S%f")[:-3],
 }
 
 
@@ -332,6 +342,10 @@ UNSUITED = {
         ),
         "messages of a satellite receiver",
     ),
+    "a row for each signal": (
+        usual(drive(10.0)).round(4).T.to_csv(header=False),
+        "has a row for each signal; transpose it",
+    ),
     "quoted rows": (
         "".join(f'"{line}"\n' for line in lines_of(usual(drive(10.0)))),
         "each row in one pair of quotes; remove them",
@@ -442,6 +456,8 @@ def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
         (lambda v: f"{v:.3f}".replace("-", "−"), "another minus sign, such as '−"),
         (lambda v: f"{v:.3f} deg/s", "a unit, such as '"),
         (lambda v: f"{v:.4E}".replace("E", "D"), "another mark of the exponent, such as '"),
+        (lambda v: f"({abs(v):.3f})" if v < 0.0 else f"{v:.3f}", "parentheses for a minus sign,"),
+        (lambda v: f"[{v:.4f} 0.02 -1e-05]", "brackets around several of them, such as '["),
     ],
 )
 def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, message_part):
@@ -467,14 +483,24 @@ def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path)
         survey_table(file)
 
 
-def test_decimals_of_parquet_are_numbers(tmp_path):
+@pytest.mark.parametrize("form", ["decimal", "dictionary"])
+def test_decimals_and_dictionaries_of_parquet_are_numbers(tmp_path, form):
     table = usual(drive())
     stored = pa.Table.from_pandas(table, preserve_index=False)
     at = stored.column_names.index("Gyro")
-    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
+    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4))
+    gyro = gyro.cast(pa.decimal128(12, 4)) if form == "decimal" else gyro.dictionary_encode()
     file = tmp_path / "lap.parquet"
     pq.write_table(stored.set_column(at, "Gyro", gyro), file)
     assert_yaw_rate_is(read_back(file)[1], table)
+
+
+def test_a_folder_of_tables_is_refused_with_the_names_of_its_files(tmp_path):
+    for number in range(2):
+        (tmp_path / f"part-{number}.parquet").touch()
+    (tmp_path / "_SUCCESS").touch()
+    with pytest.raises(MissingError, match=r"such as .*\*\.parquet"):
+        inspect("my_car", [tmp_path])
 
 
 def test_minutes_and_seconds_are_times():
@@ -491,6 +517,7 @@ def test_minutes_and_seconds_are_times():
         (("cm/s", "mrad/s", "milli-g"), (0.01, 1e-3, G * 1e-3)),
         (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
         (("kn", "gradi/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),
+        (("0.005 m/s", "0.0625 deg/s", "5e-4*g"), (0.005, np.radians(0.0625), 5e-4 * G)),
     ],
 )
 def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
@@ -532,6 +559,26 @@ def test_the_unit_of_time_is_as_the_header_states_or_asked_where_it_states_none(
     table = table.rename(columns={"Time [s]": name}).assign(**{name: factor * table["Time [s]"]})
     clock = survey_table(write(tmp_path / "lap.csv", table)).clock
     assert (clock.unit, clock.asked) == (unit, is_asked)
+
+
+@pytest.mark.parametrize(
+    ("name", "ticks_per_second", "start", "unit"),
+    [
+        ("SampleTimeFine", 1e4, 1234567, "0.1*ms"),
+        ("Ticks", 1e7, 133_591_643_700_000_000, "0.1*us"),  # since 1601
+        ("time", 1e7, 0, "0.1*us"),
+    ],
+)
+def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_fits(
+    tmp_path, name, ticks_per_second, start, unit
+):
+    table = usual(drive())
+    ticks = start + np.rint(ticks_per_second * table["Time [s]"]).astype(np.int64)
+    table = table.drop(columns="Time [s]").assign(**{name: ticks})
+    log_draft, recording = read_back(exact(tmp_path / "lap.csv", table))
+    assert log_draft.examined.log.clock.asked
+    assert log_draft.dataset["time"] == {"column": name, "unit": unit}
+    assert recording.rate_hz == pytest.approx(50.0, rel=1e-6)
 
 
 def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):

@@ -176,6 +176,7 @@ def test_json_says_all_of_it_to_a_script(log):
         "unit": "s",
         "evidence": "unit in the header, 50 Hz",
         "asked": False,
+        "is_stated": True,
         "repair": {},
     }
     assert ([question["key"] for question in result["open"]], result["has_reference"]) == (

@@ -8,7 +8,7 @@ from functools import cache
 
 from vehest.data.errors import DataError
 
-STEP = re.compile(r"(0?\.0*1|1e-\d)?", re.IGNORECASE)  # before a unit, of raw counts
+STEP = re.compile(r"((?=.*[1-9])\d*\.?\d+(e[-+]?\d)?)?", re.IGNORECASE)  # of a raw count
 _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "m/s": {
         "m/s": 1.0,
@@ -63,7 +63,7 @@ _UNITS = {
 
 @cache  # thousands of combinations of columns ask for the same few
 def factor_to_si(unit: str, si_unit: str) -> float:
-    """Factor that brings a value in ``unit``, such as ``deg/s`` or ``0.01*deg/s``, to ``si_unit``.
+    """Factor that brings a value in ``unit``, such as ``deg/s`` or ``0.005*deg/s``, to ``si_unit``.
 
     Raises
     ------

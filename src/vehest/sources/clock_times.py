@@ -16,7 +16,7 @@ MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one ano
 CLOCK = (
     r"^\s*(?:(?P<date>\d{4}[-/.]?\d{1,2}[-/.]?\d{1,2}|\d{1,2}[-/. ]\w{1,3}[-/. ]\d{2,4})[T _]+"
     r"|(?P<days>\d+) days?,? *|(?:\d{4}[-:/ ])?(?P<day_of_year>\d{3})[-:/T ])?"
-    r"(?:(?P<hour>\d{1,2}):?(?P<minute>\d{2}):?(?P<second>\d{2}(?:[.,:]\d+)?)"
+    r"(?:(?P<hour>\d{1,2}):?(?P<minute>\d{2}):?(?P<second>\d{2}(?:[.,:]\d*)?)"
     r"|(?P<minutes>\d{1,3}):(?P<seconds>\d{2}[.,]\d+))"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
@@ -25,6 +25,7 @@ DURATION = (
     r"(?:P(?:(?P<days>\d+)D)?T(?:(?P<hour>\d+)H)?(?:(?P<minute>\d+)M)?)?"
     r"(?:(?P<second>\d+(?:[.,]\d+)?)\s*s(?:ec)?)?\s*$"
 )
+DIGITS = r"^\s*(\d{8})(\d{6})(\d{0,6})\s*$"  # of date and time without a mark, to the microsecond
 DATE = r"^(?P<first>\d{4}|\d{1,2})[-/. ]?(?P<second>\d{1,2})[-/. ]?(?P<third>\d+)$"
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
@@ -33,9 +34,9 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times that are written as a clock's, in seconds.
 
     ``10:59:30.25``, ``59:30.25``, ``10:59:30:250``, ``105930.25``, ``2024-05-03T10:59:30.25Z``,
-    ``20240503T105930``, ``2024-124-10:59:30.25``, ``124:10:59:30``, ``3.5.2024 10:59:30,25``,
-    ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM`` and ``0 days 00:00:30.25``, or as a duration,
-    ``PT1M30.25S`` or ``90.25 s``. The zone is not
+    ``20240503T105930``, ``20240503105930250``, ``2024-124-10:59:30.25``, ``124:10:59:30``,
+    ``3.5.2024 10:59:30,25``, ``03-May-2024 10:59:30``, ``5/3/24 10:59:30 AM`` and
+    ``0 days 00:00:30.25``, or as a duration, ``PT1M30.25S`` or ``90.25 s``. The zone is not
     read. Where the year does not come first, the day does as in Europe, or the month as in the
     United States where AM or PM is written; the other order holds if this one makes impossible
     dates or a step of `MAX_STEP` or more.
@@ -53,7 +54,7 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """
     from pyarrow import compute
 
-    texts = column.combine_chunks()
+    texts = compute.replace_substring_regex(column.combine_chunks(), DIGITS, r"\1T\2.\3")
     for pattern in (CLOCK, DURATION):
         parts = compute.extract_regex(texts, pattern=pattern)
         if len(parts) and not parts.null_count:

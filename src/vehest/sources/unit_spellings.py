@@ -49,7 +49,7 @@ _SPELLINGS_OF = {
     "psi": "psi",
     "A": "a amp ampere",
     "V": "v volt",
-    "%": "% percent",
+    "%": "% percent pct prozent",
     "°C": "°c degc",
     "m": "m meter metre",
     "another unit": "mm cm km mv ma hpa mbar hz kg ms s",
@@ -64,7 +64,9 @@ _CASES = {
     "Mpa": "MPa",
     "mPa": "another unit",
 }
-_STEPPED = re.compile(r"(?:(0?[.,]0*1|1e-\d)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL)
+_STEPPED = re.compile(
+    r"(?:((?=.*?[1-9])\d*[.,]?\d+(?:e[-+]?\d)?)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL
+)
 _SECOND = re.compile(r"sec(on(d[saeoi]?)?)?|sek(unden?)?|秒")
 
 

@@ -12,6 +12,7 @@ columns -> candidates
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -40,7 +41,7 @@ from vehest.alignment.proposals.fitting import (
     longitudinal,
     may_be_ax,
 )
-from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
+from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered, is_pair
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.scales import find_wrong_scale, is_scale_wrong
@@ -85,6 +86,7 @@ MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the
 MIN_SIDE_CORRELATION = 0.5  # of wheels or a course, from which they decide left and right
 PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
 NOMINAL_RATE_HZ = 50.0  # of a log without times
+MAX_DECADE_ERROR = 0.1
 MIN_COURSE_SAMPLES = 50
 MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
 MAX_COURSE_STEP = 1.0  # rad
@@ -127,6 +129,7 @@ def propose(
     rate_hz: float | None,
     *,
     is_vbo: bool = False,
+    is_rate_sure: bool = True,
 ) -> Proposals:
     """Propose channels for the columns of a log.
 
@@ -139,11 +142,14 @@ def propose(
         Sampling rate; None where it is unknown, and then estimated from d(vx)/dt and ax.
     is_vbo : bool
         Whether ``heading`` is clockwise and longitudes count to the west, as in a VBOX log.
+    is_rate_sure : bool
+        Whether the rate is not to be corrected by a power of ten, as d(vx)/dt and ax indicate it.
 
     Returns
     -------
     Proposals
-        At most one proposal for a channel and for a column, with evidence and open questions.
+        At most one proposal for a channel and for a column, with evidence and open questions;
+        ``rate_hz`` where the rate was unknown or is corrected.
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     magnitudes = magnitudes_beside_signs(columns)
@@ -152,11 +158,20 @@ def propose(
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
     is_standing = _is_standing(usable)
+    in_world = _along_world_axes(usable)
+    of_car = [column for column in usable if column.name not in in_world]
+    is_car_measured = bool(in_world and find_turning(of_car))
+    usable = of_car if is_car_measured else usable
     usable, turnings = (usable, []) if is_standing else _turnings_of_any_axes(usable)
     if turnings and rate_hz is None:
         rate_by_ax = _rate_by_ax(_search_around(turnings[0], usable, clock_hz))
         if rate_by_ax is not None:
             return replace(propose(columns, rate_by_ax, is_vbo=is_vbo), rate_hz=rate_by_ax)
+    if turnings and rate_hz is not None and not is_rate_sure:
+        decades = _wrong_decades(_search_around(turnings[0], usable, clock_hz))
+        if decades:
+            corrected_hz = rate_hz * 10.0**decades
+            return replace(propose(columns, corrected_hz, is_vbo=is_vbo), rate_hz=corrected_hz)
     search = None if is_standing else _best_search(usable, turnings, clock_hz)
     motion = search.motion if search else None
     proposals = _assign(usable, search, wheels)
@@ -166,7 +181,13 @@ def propose(
         proposals = proposals.with_notes(
             f"the car stands still throughout ({standstill}); channels are proposed by name only"
         )
-    proposals = _ask_about_world_axes(proposals, usable, clock_hz)
+    if is_car_measured:
+        left_out = [f"'{name}'" for name, *_ in columns if name in in_world]
+        proposals = proposals.with_notes(
+            "left out as derivatives of a position along axes of the world: "
+            f"{abbreviated(left_out, MAX_LISTED)}"
+        )
+    proposals = _ask_about_world_axes(proposals, in_world)
     if search is not None:
         proposals = _ask_about_speed(proposals, search, wheels, usable)
     clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
@@ -373,6 +394,23 @@ def _rate_by_ax(search: Search) -> float | None:
     return float(min(PLAIN_RATES_HZ, key=lambda plain: abs(math.log(plain / rate_hz))))
 
 
+def _wrong_decades(search: Search) -> int:
+    """Power of ten by which the rate is too low, where an acceleration is d(vx)/dt at another rate
+    only; else 0.
+    """
+    ay = search.turning.columns["ay"]
+    motion = search.motion
+    change = slow_of(motion.derivative(motion.vx), motion.rate_hz)
+    for column in search.free:
+        is_of_same_sensor = is_pair(column.name, ay.name)
+        agreement = correlation(column.slow, change)
+        if may_be_ax(column) and is_of_same_sensor and abs(agreement) >= CLEAR_CORRELATION:
+            size = si_factor(column.unit or search.turning.units["ay"], "ax")
+            decades = math.log10(size * float(np.std(column.slow) / np.std(change)))
+            return round(decades) if abs(decades - round(decades)) < MAX_DECADE_ERROR else 0
+    return 0
+
+
 # --- channels --------------------------------------------------------------------------------
 
 
@@ -504,7 +542,7 @@ def _ask_for_second_evidence(
     Pieces are the relation ay ≈ vx·yaw_rate, a relation to another channel, a second measurement,
     the unit of the header and the name. yaw_rate ≈ steer·vx/wheelbase and a lateral velocity
     follow a turn alike. Where speed or yaw rate is left out, so is what was compared with them, if
-    it has a question.
+    it has a question, and a unit that their gain decides.
     """
     is_related = "ay" in turning.columns and not is_scale_wrong(turning)
     sure = {name for name, proposal in channels.items() if not proposal.question}
@@ -520,13 +558,16 @@ def _ask_for_second_evidence(
         evidence += [bool(column.unit), role in column.hints]
         if sum(evidence) < 2:
             checked[name] = replace(proposal.questioned(SINGLE_EVIDENCE), is_weak=True)
-    channels_of_turn = [name for name in channels if channels[name].column in columns]
+    confirmed = {
+        name
+        for name, proposal in channels.items()
+        if proposal.column in columns and (turning.decided or columns[proposal.column][1].unit)
+    }
     if any(checked[name].is_weak for name in ("vx", "yaw_rate") if name in checked):
         checked = {
             name: replace(
                 proposal,
-                is_weak=proposal.is_weak
-                or (bool(proposal.question) and name not in channels_of_turn),
+                is_weak=proposal.is_weak or (bool(proposal.question) and name not in confirmed),
             )
             for name, proposal in checked.items()
         }
@@ -640,31 +681,62 @@ def _possible_sideslip_angles(columns: Sequence[Candidate], motion: Motion) -> I
 # --- doubts ----------------------------------------------------------------------------------
 
 
-def _ask_about_world_axes(
-    proposals: Proposals, columns: Sequence[Candidate], rate_hz: float
-) -> Proposals:
-    """Question velocities where the speed is the derivative of a coordinate of a position."""
+def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
+    """Columns that are derivatives of a coordinate of a position, the first or the second.
+
+    Those of a car that turns which agree more with the motion along or across its path are its own.
+    """
+    steps = [np.gradient(coordinate) for coordinate in _places(columns)]
+    if not steps:
+        return set()
+    along, across = (float(np.std(each)) for each in steps)
+    if across <= MIN_WORLD_CROSSING * along:
+        return set()
+    changes = [np.gradient(each) for each in steps]
+    path = np.hypot(*steps)
+    normal = (steps[0] * changes[1] - steps[1] * changes[0]) / np.maximum(path, 1e-9)
+    of_world = (*steps, *changes)
+    of_car = (path, np.gradient(path), normal)
+
+    def agreement(column: Candidate, signals: Iterable[FloatArray]) -> float:
+        return max(abs(correlation(column.slow, samples)) for samples in signals)
+
+    return {
+        column.name
+        for column in columns
+        if agreement(column, of_world) > max(MIN_WORLD_CORRELATION, agreement(column, of_car))
+    }
+
+
+def _places(columns: Sequence[Candidate]) -> list[FloatArray]:
+    """Coordinates of a position, or longitude and latitude in one scale; empty without either."""
+    x, y, longitude, latitude = (
+        _first_named(columns, role)
+        for role in ("position_x", "position_y", "longitude", "latitude")
+    )
+    if x is not None and y is not None:
+        return [x.slow, y.slow]
+    if longitude is not None and latitude is not None:
+        return [longitude.slow * _cosine(latitude), latitude.slow]
+    return []
+
+
+def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Proposals:
+    """Question velocities where the speed is one along an axis of the world, and accelerations
+    along one.
+    """
     speed = proposals.by_channel.get("vx")
-    positions = [_first_named(columns, role) for role in ("position_x", "position_y")]
-    if speed is None or None in positions:
-        return proposals
-    along, across = (np.gradient(column.slow) for column in positions if column is not None)
-    by_name = {column.name: column for column in columns}
-    slow = by_name[speed.column].slow if speed.column in by_name else along
-    is_turning = float(np.std(across)) > MIN_WORLD_CROSSING * float(np.std(along))
-    of_axis = max(abs(correlation(slow, steps)) for steps in (along, across))
-    of_path = abs(correlation(slow, np.hypot(along, across)))
-    if not (is_turning and of_axis > MIN_WORLD_CORRELATION and of_axis > of_path):
+    if speed is None or speed.column not in in_world:
         return proposals
     question = (
-        "it is the derivative of a position: "
-        "is it a velocity along an axis of the world, not of the car?"
+        "it is the derivative of a position: is it along an axis of the world, not of the car?"
     )
     return proposals.changed(
         {
             proposal.channel: replace(proposal, question=question, is_weak=True)
             for proposal in proposals.channels
             if proposal.channel in ("vx", "vy_ref")
+            or (proposal.channel in ("ax", "ay") and proposal.column in in_world)
         }
     )
 
@@ -740,7 +812,9 @@ def _with_left_right(
     motion: Motion | None,
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
-    """With signs by the first clue that decides, else by a pose, else as most columns count."""
+    """With signs by the first clue that decides, else by a pose, else by a heading as a compass
+    counts, else as most columns count.
+    """
     for text, agreement in clues:
         if abs(agreement) > MIN_SIDE_CORRELATION:
             sign = "+1" if agreement > 0.0 else "-1"
@@ -751,10 +825,33 @@ def _with_left_right(
         _, name, unit = proposals.pose[-1]
         yaw = next(column for column in columns if column.name == name)
         is_mirrored = turning_of(yaw, unit, motion) < 0.0
+    elif compass := _compass(columns, motion):
+        name, agreement = compass
+        is_mirrored = agreement > 0.0
+        proposals = proposals.with_notes(
+            f"left and right are proposed as by '{name}', if it is clockwise as that of a compass"
+        )
     else:
         signs = [proposal.sign for proposal in proposals.channels if proposal.channel in LATERAL]
         is_mirrored = sum(signs) < 0
     return proposals.mirrored() if is_mirrored else proposals
+
+
+def _compass(columns: Sequence[Candidate], motion: Motion | None) -> tuple[str, float] | None:
+    """Name of the first heading from 0 to 360 degrees that turns as the yaw rate does, and their
+    correlation; None where none does.
+    """
+    if motion is None:
+        return None
+    for column in columns:
+        is_yaw = re.search("yaw|psi", column.name.lower())  # which may count the other way round
+        is_angle = column.hints.get("heading") == STRONG and column.unit in ("", "deg")
+        low, high = float(column.values.min()), float(column.values.max())
+        if is_angle and not is_yaw and 0.0 <= low < 180.0 < high <= 360.0:
+            agreement = turning_of(column, "deg", motion)
+            if abs(agreement) > MIN_SIDE_CORRELATION:
+                return column.name, agreement
+    return None
 
 
 def _with_signs_of_majority(proposals: Proposals) -> Proposals:
@@ -796,8 +893,7 @@ def _left_right_clues(
     longitude = _first_named(columns, "longitude")
     if latitude is None or longitude is None:
         return
-    cosine = math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
-    east = longitude.slow * (-1.0 if is_vbo else 1.0) * cosine
+    east = longitude.slow * (-1.0 if is_vbo else 1.0) * _cosine(latitude)
     yaw_rate = slow_of(motion["yaw_rate"], motion.rate_hz)
     speed = slow_of(np.abs(motion.vx), motion.rate_hz)
     steps = np.gradient(east), np.gradient(latitude.slow)
@@ -811,6 +907,11 @@ def _left_right_clues(
             "positive",
             correlation(turned[is_sound], yaw_rate[is_sound]),
         )
+
+
+def _cosine(latitude: Candidate) -> float:
+    """Of a log's mean latitude, by which a degree of longitude is shorter than one of latitude."""
+    return math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
 
 
 def _first_named(columns: Sequence[Candidate], role: str) -> Candidate | None:

@@ -28,6 +28,7 @@ HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
 MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
 _SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")  # of a magnitude
+_LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz]$")
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first
@@ -227,8 +228,9 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     families: dict[str, list[Candidate]] = {}
     for column in columns:
         words = bare(column.name)
-        if words[-1:] in tuple("xyz"):
-            families.setdefault(words[:-1].strip(), []).append(column)
+        without_letter = _LETTER_OF_AXIS.sub("", words)
+        if without_letter != words:
+            families.setdefault(without_letter, []).append(column)
     changed = {}
     for family in families.values():
         roles = {role for column in family for role in column.hints}

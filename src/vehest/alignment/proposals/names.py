@@ -1,5 +1,5 @@
-"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x``
-and ``_y``, ``other``.
+"""Roles that a name suggests: channels, ``az``, ``heading``, ``latitude``, ``longitude``,
+``position_x`` and ``_y``, ``other``.
 
 Names are compared in lower case without marks, umlauts and units in brackets; patterns are English
 and German, as loggers of both languages write them. A strong hint is a name of its own, a weak one
@@ -17,7 +17,7 @@ WEAK = 2.0
 _STRONG = {  # over the name without blanks
     "other": (
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
-        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|"
+        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|jerk|"
         r"ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|"
         r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|"
         r"zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"
@@ -38,6 +38,7 @@ _STRONG = {  # over the name without blanks
     r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
     r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
+    "az": r"acc(el|eleration)?z|zacc|^az$|verta|accvert",
     "handwheel": (
         r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
         r"volant"
@@ -45,11 +46,11 @@ _STRONG = {  # over the name without blanks
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": (
         r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|"
-        r"velocityy|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
+        r"velocityy|(?<!t)yvel|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
     ),
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
     "heading": (
-        r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
+        r"heading|truehead|course|bearing|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
         r"headimu"
     ),
     "latitude": r"latitude|(gps|gnss|pos)lat$|^lat$|breitengrad",
@@ -57,7 +58,7 @@ _STRONG = {  # over the name without blanks
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": (
-        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
+        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|xvel|"
         r"linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|"
         r"vehv|groundspd|vehicles?pd|encoder"
     ),
@@ -100,7 +101,8 @@ _STEERING_RATE = re.compile(
     r"deltadot|ddelta"
 )
 _FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
-_UNTELLING = re.compile(r"\b(body|frame|chassis)\b")
+_UNTELLING = re.compile(r"\b(body|bdy|frame|chassis|device)\b")
+_SET_VALUE = re.compile(r"\b(target|soll|desired|demand(ed)?|set ?point|wunsch)|soll\b")
 _CORNERS = {
     "fl": r"fl|vl|lf|front ?left|vorne? ?links|left ?front",
     "fr": r"fr|vr|rf|front ?right|vorne? ?rechts|right ?front",
@@ -134,6 +136,7 @@ _QUANTITIES = {
     **dict.fromkeys(("m/s²", "g"), "acc"),
     **dict.fromkeys(("rad/s", "deg/s"), "rate"),
 }
+_UNITS_OF_WHEELS = ("m/s", "km/h", "mph", "rpm", "rad/s", "rev/s")
 _NO_QUANTITY = ("heading", "latitude", "longitude", "position_x", "position_y")
 """Roles of angles and positions, which are in none of these units."""
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2|radps|rads|degps|degs|dps)$")
@@ -206,7 +209,7 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
             *([without_unit, without_unit + _QUANTITIES[unit]] if unit in _QUANTITIES else []),
         ]
     )
-    corner = _corner(words)
+    corner = _corner(words) or _corner(f"{words} speed" if unit in _UNITS_OF_WHEELS else "")
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
     if re.search(r"brake|brems", words) and re.search(r"press|druck|^p ?brake|bar$", words):
@@ -226,6 +229,8 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     if unit in _QUANTITIES:
         roles = {role: strength for role, strength in roles.items() if role not in _NO_QUANTITY}
     strong = {role for role, strength in roles.items() if strength == STRONG}
+    if _SET_VALUE.search(words) and not {"steer", "handwheel"} & set(roles):
+        return {"other": STRONG}
     is_in_world = _WORLD_FRAME.search(words) and {"vx", "vy_ref", "ax", "ay"} & set(roles)
     if is_in_world or (_WORLD_AXIS.search(words) and "yaw_rate" not in strong):
         return {"other": STRONG}
@@ -254,7 +259,7 @@ def _corner(words: str) -> str:
         return ""
     for corner, pattern in _CORNERS.items():
         wheel = "wheel|whl|rad|spd|speed|vel|ws[ps]?|drehzahl"
-        joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:{wheel})(?:{pattern})$"
+        joined = rf"^(?:{pattern})(?:wh|rad|spd|speed|vel)|(?:{wheel})(?:{pattern})$"
         is_separate = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(
             words
         )

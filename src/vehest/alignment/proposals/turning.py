@@ -51,6 +51,8 @@ NO_MOTION = (
     *("latitude", "longitude", "position_x", "position_y"),
 )
 """Roles whose columns are no yaw rate, no acceleration and, but for the first, no speed."""
+ACCELERATIONS = {"ax", "ay", "az"}
+"""Roles whose columns are no speed and no yaw rate: gravity is as even as a steady speed."""
 UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
 # correlation beyond which ay was computed of vx·yaw_rate, and not measured
 MIN_COMPUTED_CORRELATION = 0.9995
@@ -237,6 +239,7 @@ def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
         for column in pool
         if column.measures(channel)
         and (channel != "vx" or "vx" in column.hints or _is_forward(column.slow))
+        and (channel in ("ay", *column.hints) or not ACCELERATIONS & set(column.hints))
     ]
     return sorted(
         pool,

@@ -30,7 +30,7 @@ from vehest.data.splits import check_name
 from vehest.sources.base import source_names
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, typical_step
 from vehest.sources.surveys import Log, survey
-from vehest.sources.surveys.clocks import between_pauses
+from vehest.sources.surveys.clocks import STATED_UNITS, between_pauses
 from vehest.sources.unit_spellings import plain_unit
 
 EVIDENCE_HZ = 50.0
@@ -153,7 +153,17 @@ def inspect(
     others = [log for log in logs if log.file != longest.file]
     differences = _differences(longest)
     columns, rate = _evidence(longest, differences)
-    proposals = propose(columns, rate, is_vbo=longest.source == "vbo")
+    is_guessed = longest.clock is not None and not longest.clock.is_stated
+    is_vbo = longest.source == "vbo"
+    proposals = propose(columns, rate, is_vbo=is_vbo, is_rate_sure=not is_guessed)
+    if rate is not None and proposals.rate_hz is not None:
+        ratio = proposals.rate_hz / rate
+        corrected = [_with_corrected_clock(log, ratio) for log in (longest, *others)]
+        if corrected[0] is longest:
+            proposals = propose(columns, rate, is_vbo=is_vbo)
+        longest, *others = corrected
+        logs = corrected
+        proposals = replace(proposals, rate_hz=None)
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
     for log in others:
@@ -234,6 +244,23 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
 def rate_of(stamps: FloatArray) -> float:
     """Rate of time stamps [Hz]."""
     return 1.0 / max(typical_step(stamps), 1e-6)
+
+
+def _with_corrected_clock(log: Log, ratio: float) -> Log:
+    """With the unit of time by which the rate is a ratio of that of the guessed one, which is
+    asked; the same log where no unit is.
+    """
+    clock = log.clock
+    if clock is None or log.seconds is None:
+        return log
+    size = STATED_UNITS[clock.unit] / ratio
+    for unit, factor in STATED_UNITS.items():
+        if math.isclose(size, factor, rel_tol=1e-6):
+            rate_hz = ratio * rate_of(log.seconds)
+            evidence = f"ax equals d(vx)/dt at {rate_hz:.6g} Hz, in {unit}; {clock.evidence}"
+            corrected = replace(clock, unit=unit, evidence=evidence, asked=True)
+            return replace(log, clock=corrected, seconds=log.seconds / ratio)
+    return log
 
 
 def _longest(logs: Sequence[Log]) -> Log:

@@ -72,19 +72,22 @@ def bag_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [regular_file(path)]
     try:
-        files = sorted(
-            file
-            for file in path.iterdir()
-            if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED)
-        )
+        entries = sorted(path.iterdir())
     except OSError as error:
         raise MissingError(
             f"cannot read '{path}' ({error.strerror}); check its permissions"
         ) from None
+    files = [
+        file
+        for file in entries
+        if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED)
+    ]
     if not files:
+        endings = [file.suffix for file in entries if file.suffix] or [".csv"]
+        example = path / f"*{max(endings, key=endings.count)}"
         raise MissingError(
             f"'{path}' holds no bag: neither {METADATA} nor a file ending in "
-            f"{' or '.join(STORAGES)}; of other logs name the files, such as {path / '*.csv'}"
+            f"{' or '.join(STORAGES)}; of other logs name the files, such as {example}"
         )
     return files
 

@@ -27,14 +27,15 @@ COUNTER = re.compile(
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
-STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "cs": 0.01, "min": 60.0, "h": 3600.0}
+STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "0.1*us": 1e-7, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
-    "s": "s sec secs second seconds sekunden 秒",
+    "s": "s sec secs second seconds sekunden 秒 초",
     "ms": "ms msec millis milliseconds ミリ秒",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
     "d": "d day days",
     "0.1*ms": "100us 100µs 100μs 0.1ms",
+    "0.1*us": "100ns 0.1us 0.1µs 0.1μs",
     "cs": "cs 1/100s 10ms 0.01s centiseconds hundredths",
     "min": "min mins minute minutes 分",
     "h": "h hr hrs hour hours stunden",
@@ -72,8 +73,9 @@ def find_clock(
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
     """The column that is the clock of a table.
 
-    It grows evenly, by name or unit before another, or is named so and grows. One that counts rows,
-    by 1 from 0 or 1 without a name or unit of time, is none.
+    It grows evenly, by name or unit before another, or is named so and grows, perhaps once rows of
+    one device after those of another are sorted. One that counts rows, by 1 from 0 or 1 without a
+    name or unit of time, is none.
 
     Parameters
     ----------
@@ -100,6 +102,8 @@ def find_clock(
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
+        if may_be_time and not repair and _is_of_several_devices(columns, name):
+            values, repair = np.sort(raw), {"sort": True}
         step = _step(values, named=named)
         counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         if step is None or counts_rows:
@@ -207,6 +211,20 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     return (ordered, {"sort": True}) if is_out_of_order else (times, {})
 
 
+def _is_of_several_devices(columns: Mapping[str, FloatArray], clock: str) -> bool:
+    """Whether the rows of each device follow those of another: where times go back, other columns
+    have samples.
+    """
+    goes_back = np.diff(columns[clock]) < 0
+    if not 0 < goes_back.sum() < len(columns):
+        return False
+    measured = [
+        {name for name in columns if name != clock and np.isfinite(columns[name][rows]).any()}
+        for rows in stretches(goes_back, len(columns[clock]))
+    ]
+    return all(a and b and a.isdisjoint(b) for a, b in combinations(measured, 2))
+
+
 def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
     """Rows of each run of times, which ends where they restart or pause.
 
@@ -308,7 +326,8 @@ def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> St
         evidence = f"unit in the header, {rate:.6g} Hz"
     elif unit:
         evidence += f", {1.0 / (step * STATED_UNITS[unit]):.6g} Hz in {unit}, as the header says"
-    return Stamps(name, chosen, evidence, asked=chosen not in fitting or unit not in ("", chosen))
+    is_asked = chosen not in fitting or unit not in ("", chosen)
+    return Stamps(name, chosen, evidence, asked=is_asked, is_stated=bool(unit))
 
 
 def _run_starts(

@@ -34,9 +34,10 @@ class Stamps:
     """A column that looks like a clock."""
 
     column: str  # its name
-    unit: str  # of time: ``s``, ``ms``, ``us`` or ``ns``
+    unit: str  # of time, such as ``s``, ``ms``, ``us`` or ``ns``
     evidence: str  # reasons for it, for people
     asked: bool = False  # whether the unit is ambiguous
+    is_stated: bool = False  # whether the header has a unit of time
     repair: Mapping[str, Any] = field(default_factory=dict)  # options that put times in order
 
 

@@ -72,8 +72,13 @@ MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
-# letters of Japanese, which accents in Windows-1252 make only one by one
-WIDE = re.compile(r"[ぁ-ヿ一-鿿]{2}")
+# encoding -> bytes that texts in Windows-1252 hardly have, its letters, and their least share of
+# all letters beyond ASCII: Chinese that is read as Korean has few other ones
+EAST_ASIAN = {
+    "cp932": (rb"[\x80-\x9f]", "[ぁ-ヿ一-鿿]", 0.5),  # Shift-JIS as Windows writes it
+    "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
+    "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
+}
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
@@ -86,6 +91,10 @@ VELOCITY = re.compile(
 DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
+    "parentheses for a minus sign": r"^\s*\(\d+([.,]\d+)?\)\s*$",
+    "brackets around several of them": (
+        r"^\s*[\[(][-+.\d\s]+(e[-+]?\d+)?([\s,;]+[-+.\d]+(e[-+]?\d+)?)+\s*[\])]\s*$"
+    ),
     "another mark of the exponent": r"^\s*[+-]?\d+([.,]\d+)?[dD][+-]?\d+\s*$",
     "a separator of thousands": (
         "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$"
@@ -244,8 +253,9 @@ def _fault(name: str, times: FloatArray) -> str:
 def unit_in_name(name: str) -> str:
     """The unit that a column's name ends in, as it is written there.
 
-    It stands in brackets, ``Speed [km/h]``, or behind the last blank or underscore, ``ay_mps2``,
-    where it is a known unit or abbreviation of two letters or more; ``ms`` of a velocity is m/s.
+    It stands in brackets, ``Speed [km/h]``, unless they hold an index, ``xyz[2]``, or behind the
+    last blank or underscore, ``ay_mps2``, where it is a known unit or abbreviation of two letters
+    or more; ``ms`` of a velocity is m/s.
 
     Returns
     -------
@@ -254,7 +264,8 @@ def unit_in_name(name: str) -> str:
     """
     bracketed = BRACKETED.match(name.strip())
     if bracketed:
-        return bracketed["unit"].strip()
+        unit = bracketed["unit"].strip()
+        return "" if unit.isdigit() else unit
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
     if last == "ms" and VELOCITY.fullmatch(name.strip()):
@@ -338,11 +349,10 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
 
 
 def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
-    """Line of the names among those above the numbers: over the units, else of most names."""
+    """Line of the names among those above the numbers: of most names, over the units if any."""
     block = [k for k in above if k > above[-1] - MAX_HEADER_LINES]
-    for before, k in pairwise(block):
-        if _are_units(rows[k]):
-            return before
+    units_at = next((k for k in block[1:] if _are_units(rows[k])), None)
+    block = [k for k in block if units_at is None or k < units_at]
     n_names = {
         k: len({cell for cell in rows[k] if cell.strip() and not _is_unit(cell)}) for k in block
     }
@@ -386,8 +396,9 @@ def _is_unit(text: str) -> bool:
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """Encoding and text of the beginning of a file.
 
-    UTF-16 by its mark, then UTF-8, then Shift-JIS if it makes Japanese words, then Windows-1252;
-    Latin-1 where none of them fits. `DataError` where control characters say that it is no text.
+    UTF-16 by its mark, then UTF-8, then one of `EAST_ASIAN` if it makes words of its language, then
+    Windows-1252; Latin-1 where none of them fits. `DataError` where control characters say that it
+    is no text.
     """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
@@ -396,14 +407,23 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
     encodings = {"utf8": "utf-8-sig"}
-    if re.search(rb"[\x80-\x9f]", head):
-        encodings |= {"cp932": "cp932", "cp1252": "cp1252"}  # Shift-JIS as Windows writes it
+    encodings |= {name: name for name, (rare, *_) in EAST_ASIAN.items() if re.search(rare, head)}
+    encodings |= {"cp1252": "cp1252"} if re.search(rb"[\x80-\x9f]", head) else {}
     for name, encoding in encodings.items():
         with suppress(UnicodeDecodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
-            if name != "cp932" or WIDE.search(text):
+            if name not in EAST_ASIAN or _has_words(text, *EAST_ASIAN[name][1:]):
                 return name, text
     return "latin-1", head.decode("latin-1")
+
+
+def _has_words(text: str, letter: str, min_share: float) -> bool:
+    """Whether two of some letters stand together, as accents in Windows-1252 hardly make them, and
+    they have a share of all letters beyond ASCII.
+    """
+    n_letters = sum(not character.isascii() and character.isalpha() for character in text)
+    is_language = len(re.findall(letter, text)) >= min_share * n_letters
+    return is_language and bool(re.search(f"{letter}{{2}}", text))
 
 
 def _without_texts(
@@ -464,16 +484,30 @@ def _columns(
                 digits = values.pop(name)
                 minutes = digits // 100 % 100 + 60 * (digits // 10_000)
                 clocks[name] = past_midnight(digits % 100 + 60 * minutes)
+            elif _may_be_dates(column) and (dated := _seconds(column)) is not None:
+                del values[name]
+                clocks[name] = dated
             marks |= column_marks
             skipped += [
                 f"'{printable(text)}' in data row {row} of column '{printable(name)}'"
                 for text, row in odd.items()
             ]
-        elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
+        elif (seconds := _seconds(column)) is not None:
             clocks[name] = seconds
         else:
             skipped.append(f"column '{printable(name)}' holds {_kind_of_text(column)}")
     return values, clocks, marks, skipped
+
+
+def _seconds(column: pa.ChunkedArray) -> FloatArray | None:
+    """Times of a clock, shape (N,) [s]; None where a column holds anything else."""
+    return seconds_of_text(column.cast(pa.string(), safe=False))
+
+
+def _may_be_dates(column: pa.ChunkedArray) -> bool:
+    """Whether numbers may be yyyymmddhhmmss of this century, perhaps with milliseconds."""
+    first = column[0].as_py() if pa.types.is_integer(column.type) else None
+    return first is not None and any(2.0 <= first / 10**zeros < 2.1 for zeros in (13, 16))
 
 
 def _shows_a_clock(numbers: FloatArray) -> bool:

@@ -20,6 +20,7 @@ _NAMES_SIGNAL = re.compile(
 )
 _NAMES_VALUE = re.compile(r"(\w*_)?(value|val|(mess)?wert|reading|data)", re.IGNORECASE)
 _LINE_PROTOCOL = re.compile(r"[^\s,]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d{10,19})?")
+_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?\s*|", re.IGNORECASE)
 _JSON = re.compile(r"(\d+(\.\d+)?: *)?(\{\s*(\"|$)|\[\s*(\{|\[|$)).*")
 _RECEIVER_MESSAGE = re.compile(r"[#$%][A-Z]\w{3,},.*\*[0-9A-Fa-f]{2,8}")
 _NAMES_FRAME = re.compile(
@@ -51,8 +52,8 @@ def require_columns_of_signals(
     ------
     DataError
         It holds JSON, messages of a satellite receiver, raw frames of a bus, InfluxDB's line
-        protocol, columns that are aligned by blanks, rows in one pair of quotes, or a value a row
-        (long format).
+        protocol, columns that are aligned by blanks, a row for each signal, rows in one pair of
+        quotes, or a value a row (long format).
     """
     filled = [line.strip() for line in lines if line.strip()]
     if filled and _JSON.fullmatch(filled[0]):
@@ -81,6 +82,7 @@ def require_columns_of_signals(
             f"for example by: sed -E 's/^ +//; s/ +/;/g' {file.name} > {file.stem}.csv"
         )
     for delimiter, rows in tables.items():
+        _require_rows_of_times(file, [*rows.values()])
         table = [row for row in rows.values() if len(row) > 1]
         if table:
             _require_no_frames(file, table)
@@ -91,6 +93,20 @@ def require_columns_of_signals(
                 f"'{file}' has each row in one pair of quotes; "
                 f"remove them, for example by: sed -i 's/^\"//; s/\"$//' {file.name}"
             )
+
+
+def _require_rows_of_times(file: Path, rows: Sequence[Sequence[str]]) -> None:
+    """Refuse, by a `DataError`, a table with a row for each signal: a name, and all its numbers."""
+    longest = max(map(len, rows), default=0)
+    is_wide = 1 < len(rows) < longest / MIN_ROWS_OF_SIGNAL
+    if is_wide and all(
+        _NUMBER.fullmatch(row[0]) is None and all(map(_NUMBER.fullmatch, row[1:])) for row in rows
+    ):
+        raise DataError(
+            f"'{file}' has a row for each signal; transpose it, for example by pandas: "
+            f"read_csv('{file.name}', header=None, index_col=0).T.to_csv('columns.csv', "
+            "index=False)"
+        )
 
 
 def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
