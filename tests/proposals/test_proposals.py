@@ -1837,3 +1837,21 @@ def test_an_inline_acceleration_of_the_unit_goes_before_that_of_the_receiver(tmp
     noise = 0.05 * np.random.default_rng(1).standard_normal(len(table))
     table["GPS LonAcc"] = (d["ax"] + noise) / G
     assert proposed(tmp_path, table)["ax"].column == "InlineAcc"
+
+
+def test_a_column_that_begins_late_is_compared_from_there_on(tmp_path):
+    asammdf = pytest.importorskip("asammdf", reason="the extra mdf is not installed")
+    d = drive(120.0)
+    late = slice(int(np.searchsorted(d["t"], 50.0)), None)
+    write_mdf(
+        tmp_path / "lap.mf4",
+        {
+            "can": [asammdf.Signal(3.6 * d["vx"][late], d["t"][late], "km/h", "VehSpd")],
+            "imu": [
+                asammdf.Signal(np.degrees(d["r"]), d["t"], "deg/s", "YawRate"),
+                asammdf.Signal(d["ay"], d["t"], "m/s^2", "AccY"),
+            ],
+        },
+    )
+    evidence = " ".join(inspect("my_car", [tmp_path / "lap.mf4"]).in_words())
+    assert abs(float(re.search(r"gain ([\d.]+)", evidence)[1]) - 1.0) < 0.05

@@ -83,9 +83,10 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel_and_one_bus_of
     log(
         tmp_path,
         one('0|8@1+ (1,0) [0|0] "m/s" Car'),
-        [((k // 2) / 100, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)],
+        [(k / 200, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)],
     )
-    assert "say which by bus" in refusal(lambda: read(tmp_path, channels=SPEED))
+    message = "comes on the buses 1, 2; say which by bus: 1"
+    assert message in refusal(lambda: read(tmp_path, channels=SPEED, rate_hz=400))
     assert set(read(tmp_path, channels=SPEED, bus=2)["vx"]) == {11.0}
     assert "never occurs on bus 3" in refusal(lambda: read(tmp_path, channels=SPEED, bus=3))
 
@@ -160,13 +161,60 @@ def blf_with(content, method=0):
             lambda content: content[: content.rindex(b"Rx") + 12],
             "a frame of message .* holds",
         ),
-        (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "is damaged .*zzz"),
+        (
+            ".asc",
+            lambda content: content.replace(b" 120 ", b" IMU "),
+            "names of messages such as 'IMU'",
+        ),
+        (".asc", lambda content: content.replace(b" 04 ", b" zz ", 1), "is damaged .*zz"),
     ],
 )
 def test_a_damaged_log_is_one_line(tmp_path, suffix, change, message):
     written = write_log(drive(3.0), tmp_path, suffix)
     written.log.write_bytes(change(written.log.read_bytes()))
     assert re.search(message, refusal(lambda: read(tmp_path)))
+
+
+def since_last_event(text):
+    """An .asc whose stamps count from the event before."""
+    stamp = re.compile(r" *(\d+\.\d+) ")
+    lines = text.replace("timestamps absolute", "timestamps relative").splitlines()
+    before = 0.0
+    for k, line in enumerate(lines):
+        if match := stamp.match(line):
+            lines[k] = f" {float(match[1]) - before:.6f} {line[match.end() :]}"
+            before = float(match[1])
+    return "\n".join(lines)
+
+
+def with_requests(text):
+    """An .asc in which each frame was requested to be sent, a little before."""
+    return re.sub(r"(?m)^(.*) Rx (.*)$", r"\1 TxRq \2\n\1 Rx \2", text)
+
+
+def on_screen(text):
+    """What candump writes on the screen, of its log."""
+
+    def line(match):
+        time, bus, identifier, data = match.groups()
+        pairs = re.sub("(..)", r"\1 ", data).strip()
+        return f" ({time})  {bus}  {identifier}   [{len(data) // 2}]  {pairs}"
+
+    return re.sub(r"\(([\d.]+)\) (\S+) (\w+)#(\w+).*", line, text)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "written_by_another"),
+    [(".asc", since_last_event), (".asc", with_requests), (".log", on_screen)],
+)
+def test_logs_of_other_writers_hold_the_same_drive(tmp_path, suffix, written_by_another):
+    written = write_log(drive(3.0), tmp_path, suffix)
+    expected = read(tmp_path)
+    text = written.log.read_text()
+    written.log.write_text(written_by_another(text))
+    assert written.log.read_text() != text
+    for name, samples in read(tmp_path).channels.items():
+        np.testing.assert_allclose(samples, expected[name], atol=1e-6)
 
 
 def ramp(first, missing, n=200):

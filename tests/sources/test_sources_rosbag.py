@@ -21,6 +21,7 @@ from vehest.data.limits import Limits, use_limits
 from vehest.sources.base import open_source
 from vehest.sources.limited import read_limited
 from vehest.sources.rosbag.topics import read_bag
+from vehest.sources.surveys import survey
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -123,7 +124,7 @@ def write_bag(folder, topics, storage="sqlite3", layouts=LAYOUTS, name="lap"):
             connection = writer.add_connection(topic, topic_data.type, typestore=types)
             for k, stamp in enumerate(topic_data.times.tolist()):
                 values = {path: samples[k] for path, samples in topic_data.fields.items()}
-                message = _message(types, topic_data.type, values | {"header.stamp": stamp})
+                message = _message(types, topic_data.type, {"header.stamp": stamp} | values)
                 messages.append(
                     (
                         START_NS + round(stamp * 1e9),
@@ -269,6 +270,32 @@ def test_storage_and_packing_make_no_difference(bags, tmp_path, storage, form):
     )
     for name, samples in expected.channels.items():
         np.testing.assert_array_equal(recording[name], samples)
+
+
+@pytest.mark.parametrize(
+    ("stamps_of", "clocks"),
+    [
+        (lambda topic, times: times, {"header"}),
+        (lambda topic, times: times - 1e6, {"header"}),
+        (lambda topic, times: times - 1e6 * (topic == "/imu"), {"header", "received"}),
+        (lambda topic, times: 0.0 * times, {"received"}),
+    ],
+    ids=["of the bag", "of a simulation", "since the start of a sensor", "none"],
+)
+def test_a_survey_takes_stamps_of_headers_where_they_are_the_bags_clock(
+    tmp_path, stamps_of, clocks
+):
+    topics = {
+        name: topic._replace(fields=topic.fields | {"header.stamp": stamps_of(name, topic.times)})
+        for name, topic in drive().items()
+        if name in {"/imu", "/body"}
+    }
+    log = survey(write_bag(tmp_path, topics))
+    assert {column.place["stamps"] for column in log.columns} == clocks
+    first = {column.place["topic"]: column.stamps[0] for column in log.columns}
+    assert first["/body"] - first["/imu"] == pytest.approx(0.0035, abs=1e-6)
+    imu = {column.place["stamps"] for column in log.columns if column.place["topic"] == "/imu"}
+    assert any("headers of topic '/imu'" in text for text in log.skipped) == (imu == {"received"})
 
 
 def test_a_command_is_held_and_a_range_is_cut_out(folder):

@@ -82,6 +82,25 @@ def test_a_row_that_repeats_the_time_before_is_left_out_and_counted(tmp_path):
     assert np.array_equal(recording["ay"], expected["ay"])
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda head, rows: head + rows.replace(b".", b","),
+        lambda head, rows: head.replace(b"[comments]", b"[comments]\r\nsee [data] of run 3") + rows,
+    ],
+    ids=["decimal commas", "a comment that names the section"],
+)
+def test_decimal_commas_and_any_comment_are_read(tmp_path, change):
+    write_log(tmp_path / "lap.vbo")
+    expected = read(tmp_path)
+    content = (tmp_path / "lap.vbo").read_bytes()
+    begin = content.index(b"[data]")
+    (tmp_path / "lap.vbo").write_bytes(change(content[:begin], content[begin:]))
+    assert read(tmp_path).channels.keys() == expected.channels.keys()
+    for name, samples in read(tmp_path).channels.items():
+        assert np.array_equal(samples, expected[name])
+
+
 def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(tmp_path):
     write_rows(tmp_path, lambda lines: [*lines[:400], *lines[650:]])
     assert "1 gap, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
@@ -165,6 +184,7 @@ def test_columns_of_a_bus_are_the_car_s_own(tmp_path):
     ("old", "new", "message"),
     [
         (b"[data]", b"[rows]", r"has no section \[data\]"),
+        (b"[column names]", b"[columns]", r"has no section \[column names\]"),
         (b" Y_Accel ", b" X_Accel ", "has 2 columns called 'X_Accel'"),
         (b"053 104751.450", b"053 109951.450", "is no clock time hhmmss"),
         (b"053 104751.450 ", b"053 ", r"Row #101: Expected 18 columns, got 17"),

@@ -162,15 +162,23 @@ def read_log(file: Path) -> Log:
     DataError
         It has no section of rows, is damaged, or holds more than the limits allow.
     """
-    head, mark, rows = regular_file(file).read_bytes().partition(b"[data]")
-    if not mark or len(head) > LONGEST_HEAD:
+    content = regular_file(file).read_bytes()
+    mark = re.compile(rb"^\[data\]\s*$", re.MULTILINE).search(content, 0, LONGEST_HEAD)
+    if mark is None:
         raise DataError(f"'{file}' has no section [data]; is it a log of a VBOX?")
+    head = content[: mark.start()]
+    rows = content[mark.end() :].replace(b",", b".")  # blanks separate the columns
     lines = "\n".join(head.decode("latin-1").splitlines())
     first, *parts = re.split(r"^\[([^\]\n]+)\]\s*?$", lines, flags=re.MULTILINE)
     sections = {
         title.strip().lower(): text for title, text in zip(parts[::2], parts[1::2], strict=True)
     }
     names = sections.get("column names", "").split()
+    if not names:
+        raise DataError(
+            f"'{file}' has no section [column names]; write one above [data], with the names of "
+            "the columns in one line, such as: sats time lat long velocity"
+        )
     text = re.sub(rb" ?\r?\n ?", b"\n", re.sub(rb"[ \t]+", b" ", rows.strip()))
     last = text.rfind(b"\n") + 1
     cut_off = last > 0 and text.count(b" ", last) < len(names) - 1

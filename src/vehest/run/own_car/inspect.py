@@ -34,6 +34,7 @@ from vehest.sources.surveys.clocks import STATED_UNITS, between_pauses
 from vehest.sources.unit_spellings import plain_unit
 
 EVIDENCE_HZ = 50.0
+MIN_COVERED = 0.5  # share of a log that a column covers, for evidence to need it
 MAX_EVIDENCE_SECONDS = 1200.0  # s
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
 # s without a sample that straight lines bridge: as between fixes of a satellite receiver of 1 Hz
@@ -427,18 +428,23 @@ def _differences(log: Log) -> dict[str, str]:
 
 
 def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
+    """Columns on one clock, and its rate [Hz], None where the log has no times.
+
+    Columns with times of their own: over the time that those have in common that cover most of the
+    log.
+    """
     timed = [(column.values, column.stamps) for column in log.columns if column.stamps is not None]
     if timed:
         sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
         highest_rate = max(rate_of(stamps) for _, stamps in timed)
         runs, _ = between_pauses(sampled, 1.0 / highest_rate)
         longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
-        begin, end = (
-            float(
-                np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))
-            )
-            for edge in (0, -1)
-        )
+        edges = np.clip([stamps[[0, -1]] for _, stamps in timed], longest[0], longest[-1])
+        begin, end = np.median(edges, axis=0).tolist()
+        covered = np.minimum(edges[:, 1], end) - np.maximum(edges[:, 0], begin)
+        covering = edges[covered >= MIN_COVERED * (end - begin)]
+        begin = float(covering[:, 0].max(initial=begin))
+        end = float(covering[:, 1].min(initial=end))
         rate = plain_rate(min(highest_rate, EVIDENCE_HZ), INTERPOLATED_TOLERANCE)
         check_limit(
             "samples",

@@ -140,7 +140,7 @@ class CanSource(SignalSource):
             location = (
                 f"'{file}': message '{described.message.name}', which carries '{described.signal}',"
             )
-            require_clock(times, location, "where two buses carry it, say which by bus: …")
+            require_clock(times, location, "cut the log there, or leave repeated frames out")
             origin = f"message '{described.message.name}'"
             signals[name] = Signal(
                 origin, times, np.array(values[name]), described.message.units[described.signal]
@@ -181,9 +181,11 @@ def decoded(
     Raises
     ------
     DataError
-        A frame is shorter than the DBC says.
+        A frame is shorter than the DBC says, or without ``bus`` a message comes on several buses.
     """
     channels_of = channels_by_message(by_channel)
+    if bus is None:
+        require_one_bus(frames, database.messages)
     for frame in frames:
         message = database.messages.get((frame.arbitration_id, frame.is_extended_id))
         if message is None or not is_on(frame, bus):
@@ -196,6 +198,26 @@ def decoded(
                 "the DBC another car's?"
             ) from None
         yield frame, channel_values(values, channels_of[message.name], by_channel)
+
+
+def require_one_bus(frames: Frames, messages: Mapping[tuple[int, bool], Message]) -> None:
+    """Refuse a log in which frames of one message come on several buses.
+
+    Raises
+    ------
+    DataError
+        Such a message, with its buses as logs count them.
+    """
+    arrays = frames.arrays
+    for (identifier, is_extended), message in messages.items():
+        is_message = (arrays["identifier"] == identifier) & (arrays["extended"] == is_extended)
+        buses = [frames.buses[number] for number in np.unique(arrays["bus"][is_message])]
+        if len(buses) > 1:
+            names = [str(bus + 1 if isinstance(bus, int) else bus) for bus in buses]
+            raise DataError(
+                f"'{frames.file}': message '{message.name}' comes on the buses "
+                f"{', '.join(names)}; say which by bus: {names[0]}"
+            )
 
 
 def channels_by_message(by_channel: Mapping[str, ChannelSignal]) -> dict[str, list[str]]:

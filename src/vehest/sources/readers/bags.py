@@ -130,7 +130,8 @@ def survey_topics(
             if not 0 < len(fields) <= most_fields:
                 skipped.append(
                     f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own "
-                    "of plain numbers"
+                    "of plain numbers; to read it, give its layout under messages "
+                    "(docs/sources/rosbag.md)"
                 )
                 continue
             try:

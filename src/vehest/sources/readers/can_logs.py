@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Collection, Sequence
+from io import TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,18 @@ from can.io.asc import ASCReader
 from can.io.blf import BLFReader
 from can.io.canutils import CanutilsLogReader
 
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
 LATEST = 1e11  # s
+EVENT = re.compile(r"\s*(\d+\.\d+)(?=\s)")
+REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")  # to send, sent as Tx later
+NAMED = re.compile(r"\s*\d+\.\d+\s+\d+\s+(?![0-9A-Fa-f]+x?\s)(\w+)\s+[RT]x\s")
+ON_SCREEN = re.compile(
+    r"\s*(?P<time>\([\d.]+\))\s+(?P<bus>\S+)\s+([RT]X\s+\S\s*\S\s+)?(?P<identifier>[\dA-F]{3,8})\s+"
+    r"\[(?P<length>\d+)\]\s*(?P<data>([\dA-F]{2}(\s|$))*|remote request)"
+)
 
 
 def read_frames(
@@ -104,5 +114,61 @@ def _opened(file: Path) -> Any:
     """A reader; texts are opened here, since their comments are of any encoding."""
     if file.suffix.lower() == ".blf":
         return BLFReader(file)
-    text = open(file, encoding="utf-8", errors="replace")  # noqa: SIM115 (the reader closes it)
-    return ASCReader(text) if file.suffix.lower() == ".asc" else CanutilsLogReader(text)
+    if file.suffix.lower() == ".asc":
+        return ASCReader(_VectorText(file))
+    return CanutilsLogReader(_CandumpText(file))
+
+
+class _LogText(TextIOWrapper):
+    """Lines of a log, as python-can understands them."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(open(file, "rb"), encoding="utf-8", errors="replace")  # noqa: SIM115
+        self.file = file
+
+
+class _VectorText(_LogText):
+    """Lines of an .asc, with stamps that count from the start of the measurement.
+
+    Where the file writes the time since the event before, as ``timestamps relative`` means, they
+    are summed; some loggers write these words above stamps that never decrease, which stay.
+    """
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file)
+        self.is_relative = _counts_from_last_event(file)
+        self.elapsed = 0.0
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = super().__next__()
+        if self.is_relative and (event := EVENT.match(line)):
+            self.elapsed += float(event[1])
+            line = f"{self.elapsed:.9f}{line[event.end() :]}"
+        if named := NAMED.match(line):
+            raise DataError(
+                f"'{self.file}' has names of messages such as '{printable(named[1])}' in place of "
+                "identifiers; export it with numeric identifiers"
+            )
+        return "" if REQUEST.match(line) else line
+
+
+def _counts_from_last_event(file: Path) -> bool:
+    """Whether stamps of an .asc count from the event before."""
+    with _LogText(file) as lines:
+        head = "".join(line for _, line in zip(range(10), lines, strict=False))
+        if not re.search(r"timestamps\s+relative", head, re.IGNORECASE):
+            return False
+        stamps = (float(event[1]) for line in lines if (event := EVENT.match(line)))
+        return any(later < earlier for earlier, later in pairwise(stamps))
+
+
+class _CandumpText(_LogText):
+    """Lines of candump, also of what it writes on the screen, as those of its log."""
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = super().__next__()
+        if (frame := ON_SCREEN.match(line)) is None:
+            return line
+        fd = "#0" if len(frame["length"]) > 1 else ""  # two digits are those of CAN FD
+        data = frame["data"].replace(" ", "").replace("remoterequest", "R").strip()
+        return f"{frame['time']} {frame['bus']} {frame['identifier']}#{fd}{data}\n"

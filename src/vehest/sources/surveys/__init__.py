@@ -6,6 +6,7 @@ Nothing is made a channel here; ``vehest.alignment.proposals`` finds which colum
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from vehest.data.files import missing_file
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
+from vehest.sources.limited import Arrays
 from vehest.sources.mdf import read_measurement
 from vehest.sources.not_measured import codes_of_not_measured
 from vehest.sources.rosbag.topics import read_bag
@@ -34,6 +36,7 @@ CAN = (".blf", ".asc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
 MOST_FIELDS = 60  # of a message
+MAX_LATENESS = 5.0  # s, from a header's stamp to the message's reception
 UNITS = {  # of ROS's own types, REP 103
     "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
     "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
@@ -158,16 +161,24 @@ def _survey_bag(path: Path) -> Log:
     """Numbers in messages of ROS's own types, each field with the times of its messages."""
     arrays, about = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
     columns = []
+    clocks = _clocks_of_topics(arrays, [name for name, *_ in about["topics"]])
     times = {
-        name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9
-        for name, *_ in about["topics"]
+        name: arrays[f"{name}@{'stamped' if clock == 'header' else clock}"].astype(np.float64)
+        * 1e-9
+        for name, clock in clocks.items()
     }
+    skipped = list(about["skipped"])
+    skipped += [
+        f"headers of topic '{printable(name)}', whose stamps are no clock or another one than the "
+        "bag's; the times of reception are taken"
+        for name, clock in clocks.items()
+        if clock == "received" and f"{name}@stamped" in arrays
+    ]
     start = min((stamps[0] for stamps in times.values() if len(stamps) > 1), default=0.0)
     for topic, kind, fields in about["topics"]:
-        clock = "header" if f"{topic}@stamped" in arrays else "received"
         for field in fields if len(times[topic]) > 1 else ():
             unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
-            place = {"topic": topic, "type": kind, "stamps": clock, "field": field}
+            place = {"topic": topic, "type": kind, "stamps": clocks[topic], "field": field}
             columns.append(
                 RawColumn(
                     f"{topic} {field}",
@@ -177,7 +188,29 @@ def _survey_bag(path: Path) -> Log:
                     times[topic] - start,
                 )
             )
-    return Log(path, "rosbag", tuple(columns), skipped=tuple(about["skipped"]))
+    return Log(path, "rosbag", tuple(columns), skipped=tuple(skipped))
+
+
+def _clocks_of_topics(
+    arrays: Arrays, topics: Sequence[str]
+) -> dict[str, Literal["header", "received"]]:
+    """Whose stamps are the times of each topic's messages.
+
+    Those of headers, where they are a clock and within `MAX_LATENESS` of the reception, or where
+    all topics' are away from it by the same time, as of a simulation.
+    """
+    lateness = {}
+    for name in topics:
+        stamped = arrays.get(f"{name}@stamped")
+        if stamped is not None and not clock_fault(stamped * 1e-9, may_repeat=True):
+            lateness[name] = float(np.median(arrays[f"{name}@received"] - stamped)) * 1e-9
+    is_common = len(lateness) == len(topics) and np.ptp([*lateness.values()]) < MAX_LATENESS
+    return {
+        name: "header"
+        if name in lateness and (is_common or abs(lateness[name]) < MAX_LATENESS)
+        else "received"
+        for name in topics
+    }
 
 
 def _survey_mdf(file: Path) -> Log:
