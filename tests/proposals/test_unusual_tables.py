@@ -581,6 +581,27 @@ def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_f
     assert recording.rate_hz == pytest.approx(50.0, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "// Update Rate: 100.0Hz",
+        '"Sample Rate","100.000","Hz",,"End Time","199.980","s"',
+        "Abtastrate;100 Hz",
+        "# dt=0.01",
+        "Sample interval [ms]: 10",
+    ],
+)
+def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tmp_path, line):
+    d = drive()
+    table = pd.DataFrame(
+        {"Ticks": 1e4 * d["t"] * 0.5, "Gyr_Z": d["r"], "Acc_Y": d["ay"], "Acc_X": d["ax"]}
+    )
+    examined = inspect("my_car", [text_file(tmp_path, line, *lines_of(table))])
+    assert (examined.log.clock.unit, examined.log.clock.asked) == ("0.1*ms", True)
+    without_times = lines_of(table.drop(columns="Ticks"))
+    assert inspect("my_car", [text_file(tmp_path, line, *without_times)]).rate_hz == 100.0
+
+
 def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):
     d = drive(100.0)
     fixes = pd.DataFrame({"time": 10**18 + 10**9 * np.arange(100), "speed": d["vx"][::50]})

@@ -41,6 +41,7 @@ from vehest.sources.surveys.clocks import (
     MAX_APART,
     NAMED,
     SPELLINGS,
+    STATED_UNITS,
     find_clock,
     plain_name,
     times_apart,
@@ -83,6 +84,14 @@ CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+RATE = re.compile(
+    r"(sampl\w*|updat\w*|logging|log|output|abtast|mess)[ _-]?(rate|freq\w*)(\W*hz)?\W+"
+    r"(?P<hertz>\d[\d.,]*)\W*(hz\b|$)|"
+    r"((sampl\w*|updat\w*|logging)[ _-]?(period|interval|time)|\bdt|abtast(zeit|intervall))"
+    r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec\w*)?)\b|$)",
+    re.IGNORECASE,
+)
+"""What a line above the names says of the rate of the rows."""
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
 VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
@@ -124,6 +133,7 @@ class Shape:
     # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no
     # such row
     score: float = 0.0
+    rate_hz: float | None = None  # that a line above the names states
 
 
 def survey_table(file: Path) -> Log:
@@ -142,6 +152,7 @@ def survey_table(file: Path) -> Log:
     options: dict[str, Any] = {}
     skipped: list[str] = []
     repeated: tuple[int, ...] = ()
+    rate_hz: float | None = None
     if is_parquet(file):
         with parquet_file(file) as table:
             units = {
@@ -167,6 +178,7 @@ def survey_table(file: Path) -> Log:
         marks |= odd_marks
         skipped += unread
         units = dict(shape.units)
+        rate_hz = shape.rate_hz
         usual = asdict(TextLayout(delimiter="", decimal=""))  # which are always stated
         options = {
             name: option for name, option in asdict(shape.layout).items() if option != usual[name]
@@ -230,6 +242,7 @@ def survey_table(file: Path) -> Log:
         runs,
         (*skipped, *faults),
         repeated,
+        rate_hz,
     )
 
 
@@ -310,7 +323,18 @@ def shape_of(file: Path) -> Shape:
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
-    return best
+    return replace(best, rate_hz=_stated_rate(lines[: best.layout.skip_rows]))
+
+
+def _stated_rate(lines: Sequence[str]) -> float | None:
+    """The rate of the rows that one of the lines above the names states [Hz]."""
+    for stated in filter(None, map(RATE.search, lines)):
+        with suppress(ValueError, ZeroDivisionError):
+            number = float((stated["hertz"] or stated["step"]).strip(".,").replace(",", "."))
+            unit = stated["before"] or stated["behind"] or "s"
+            seconds = STATED_UNITS[SPELLINGS[unit.lower()]]
+            return number if stated["hertz"] else 1.0 / (number * seconds)
+    return None
 
 
 def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
