@@ -602,6 +602,23 @@ def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tm
     assert inspect("my_car", [text_file(tmp_path, line, *without_times)]).rate_hz == 100.0
 
 
+@pytest.mark.parametrize(
+    ("whole", "part", "scale"),
+    [("Time", "Millisecond", 1000), ("sec", "usec", 10**6), ("stamp.sec", "stamp.nanosec", 10**9)],
+)
+def test_parts_of_seconds_beside_whole_ones_are_the_clock(tmp_path, whole, part, scale):
+    table = usual(drive())
+    ticks = np.round(table.pop("Time [s]") * scale).astype(int)
+    seconds = ticks // scale
+    if whole == "Time":
+        seconds = [f"10:{59 - (120 - s) // 60:02}:{s % 60:02}" for s in seconds]
+    table = table.assign(**{whole: seconds, part: ticks % scale})
+    file = write(tmp_path / "lap.csv", table)
+    recording = read_back(file)[1]
+    assert recording.rate_hz == 50.0
+    assert_yaw_rate_is(recording, table)
+
+
 def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):
     d = drive(100.0)
     fixes = pd.DataFrame({"time": 10**18 + 10**9 * np.arange(100), "speed": d["vx"][::50]})
