@@ -1314,11 +1314,12 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
         ("cp932", "速度[km/h]", "角速度[deg/s]"),
         ("gb18030", "车速(km/h)", "横摆角速度(°/s)"),
         ("cp949", "차속(km/h)", "요레이트(deg/s)"),
+        ("cp1251", "Скорость [км/ч]", "Угловая скорость [град/с]"),
         ("cp1252", "„v“", "‰r"),
         ("latin-1", "vitesse générée", "dérivé de Hélène [°/s]"),
     ],
 )
-def test_names_in_east_asian_encodings_are_read_and_windows_1252_is_not_taken_for_them(
+def test_names_in_encodings_of_other_scripts_are_read_and_windows_1252_is_not_taken_for_them(
     tmp_path, encoding, speed, rate
 ):
     table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})

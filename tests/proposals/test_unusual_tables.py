@@ -4,6 +4,7 @@ the way out.
 
 import datetime
 import json
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -471,6 +472,55 @@ def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, mes
     file = text_file(tmp_path, *lines)
     (reason,) = (reason for reason in survey_table(file).skipped if "'Gyro'" in reason)
     assert reason.startswith(f"column 'Gyro' holds numbers with {message_part}")
+
+
+def test_a_decimal_mark_that_other_columns_do_not_have_is_named(tmp_path):
+    rows = (f"{t:.2f};{3 * t:.3f};{-t:.4f}".replace(".", ",", 2) for t in np.arange(50) / 50.0)
+    (reason,) = survey_table(text_file(tmp_path, "t [s];v;r", *rows)).skipped
+    assert reason.startswith("column 'r' holds numbers with the other decimal mark, such as '-0.0")
+
+
+def test_a_line_of_names_without_that_of_the_index_is_named_with_the_remedy(tmp_path):
+    file = text_file(tmp_path, "time,v,r", *(f"{k},{0.02 * k:.2f},{k % 7},0.1" for k in range(50)))
+    with pytest.raises(DataError, match=r"begin it with a name of the first column, .* 'row,'"):
+        survey_table(file)
+
+
+def test_units_that_vehest_does_not_know_are_no_names(tmp_path):
+    file = text_file(
+        tmp_path, "Tempo;Gier;Quer;T", "uu/a;vv/a;ww/a;s", *["1;2;3;0.5", "2;3;4;0.6"] * 9
+    )
+    assert [column.name for column in survey_table(file).columns] == [
+        "Tempo",
+        "Gier",
+        "Quer",
+        "T",
+    ]
+
+
+@pytest.mark.parametrize("name", ["lap.feather", "lap.arrow"])
+def test_tables_of_arrow_and_archives_of_tables_are_refused_with_the_way_out(tmp_path, name):
+    table = pa.table({"t": [0.0, 0.1]})
+    new_file = pa.ipc.new_file if name == "lap.feather" else pa.ipc.new_stream
+    with new_file(str(tmp_path / name), table.schema) as writer:
+        writer.write_table(table)
+    remedy = {"lap.feather": "pandas: read_feather", "lap.arrow": "pyarrow: ipc.open_stream"}
+    with pytest.raises(DataError, match=remedy[name]):
+        survey(tmp_path / name)
+    with ZipFile(tmp_path / "lap.zip", "w") as archive:
+        archive.write(tmp_path / name)
+    with pytest.raises(DataError, match="without a bag of ROS 2; unpack it"):
+        survey(tmp_path / "lap.zip")
+
+
+def test_nested_columns_of_parquet_are_named_with_the_way_out(tmp_path):
+    table = {"t": [0.0, 0.1], "imu": [{"ax": 1.0}] * 2, "gyro": [[1.0, 2.0]] * 2}
+    pq.write_table(pa.table(table), tmp_path / "lap.parquet")
+    skipped = survey_table(tmp_path / "lap.parquet").skipped
+    assert [reason.split("; ")[1][:33] for reason in skipped[:2]] == [
+        "make a column of each of its fiel",
+        "make a column of each of its elem",
+    ]
 
 
 def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path):

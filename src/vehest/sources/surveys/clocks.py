@@ -29,7 +29,7 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
 STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "0.1*us": 1e-7, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
-    "s": "s sec secs second seconds sekunden 秒 초",
+    "s": "s sec secs second seconds sekunden с сек 秒 초",
     "ms": "ms msec millis milliseconds ミリ秒",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
