@@ -664,7 +664,8 @@ def test_parts_of_seconds_beside_whole_ones_are_the_clock(tmp_path, whole, part,
         seconds = [f"10:{59 - (120 - s) // 60:02}:{s % 60:02}" for s in seconds]
     table = table.assign(**{whole: seconds, part: ticks % scale})
     file = write(tmp_path / "lap.csv", table)
-    recording = read_back(file)[1]
+    log_draft, recording = read_back(file)
+    assert log_draft.dataset["time"]["column"] == part
     assert recording.rate_hz == 50.0
     assert_yaw_rate_is(recording, table)
 
