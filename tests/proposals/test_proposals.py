@@ -468,6 +468,8 @@ ROLES = {
     "VelDown": "other", "Pos Lat (deg)": "latitude", "GNSS_Lon": "longitude",
     "Y Body Velocity": "vy_ref", "X-BdyVel": "vx", "poseDevice.acceleration.y": "ay",
     "LFspeed": "wheel_speed_fl", "VxTarget": "other", "v_soll": "other", "Acc_Z": "az",
+    "cmd_vel.linear.x": "other", "Trailer_YawRate": "other", "Hitch_Angle": "other",
+    "ABS_WhlSpdFrntLe": "wheel_speed_fl", "ABS_WhlSpdReRi": "wheel_speed_rr",
 }  # fmt: skip
 
 
@@ -1272,6 +1274,23 @@ def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
     } == {(1, "")}
 
 
+def test_a_drive_mostly_in_reverse_keeps_the_sign_of_its_speed_with_a_note(tmp_path):
+    d = drive()
+    d["vx"] = -0.2 * d["vx"] * np.where(d["t"] < 90.0, 1.0, -0.6)
+    d["ay"] = d["vx"] * d["r"]
+    d["ax"] = np.gradient(d["vx"], d["t"])
+    found = drafted(tmp_path, usual(d).drop(columns=["Steer", "Beta"]))
+    assert {entry.get("sign", 1) for entry in found.dataset["channels"].values()} == {1}
+    assert any("negative most of the time" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("name", ["EKF_beta", "beta_est"])
+def test_a_reference_that_is_named_as_an_estimate_is_asked(tmp_path, name):
+    table = usual(drive()).rename(columns={"Beta": name})
+    reference = proposed(tmp_path, table)["sideslip_ref"]
+    assert (reference.column, reference.question[:27]) == (name, "it is named as an estimate:")
+
+
 def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(tmp_path):
     d = drive()
     table = pd.DataFrame(
@@ -1295,11 +1314,12 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
         ("cp932", "速度[km/h]", "角速度[deg/s]"),
         ("gb18030", "车速(km/h)", "横摆角速度(°/s)"),
         ("cp949", "차속(km/h)", "요레이트(deg/s)"),
+        ("cp1251", "Скорость [км/ч]", "Угловая скорость [град/с]"),
         ("cp1252", "„v“", "‰r"),
         ("latin-1", "vitesse générée", "dérivé de Hélène [°/s]"),
     ],
 )
-def test_names_in_east_asian_encodings_are_read_and_windows_1252_is_not_taken_for_them(
+def test_names_in_encodings_of_other_scripts_are_read_and_windows_1252_is_not_taken_for_them(
     tmp_path, encoding, speed, rate
 ):
     table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})

@@ -4,6 +4,7 @@ the way out.
 
 import datetime
 import json
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -473,6 +474,55 @@ def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, mes
     assert reason.startswith(f"column 'Gyro' holds numbers with {message_part}")
 
 
+def test_a_decimal_mark_that_other_columns_do_not_have_is_named(tmp_path):
+    rows = (f"{t:.2f};{3 * t:.3f};{-t:.4f}".replace(".", ",", 2) for t in np.arange(50) / 50.0)
+    (reason,) = survey_table(text_file(tmp_path, "t [s];v;r", *rows)).skipped
+    assert reason.startswith("column 'r' holds numbers with the other decimal mark, such as '-0.0")
+
+
+def test_a_line_of_names_without_that_of_the_index_is_named_with_the_remedy(tmp_path):
+    file = text_file(tmp_path, "time,v,r", *(f"{k},{0.02 * k:.2f},{k % 7},0.1" for k in range(50)))
+    with pytest.raises(DataError, match=r"begin it with a name of the first column, .* 'row,'"):
+        survey_table(file)
+
+
+def test_units_that_vehest_does_not_know_are_no_names(tmp_path):
+    file = text_file(
+        tmp_path, "Tempo;Gier;Quer;T", "uu/a;vv/a;ww/a;s", *["1;2;3;0.5", "2;3;4;0.6"] * 9
+    )
+    assert [column.name for column in survey_table(file).columns] == [
+        "Tempo",
+        "Gier",
+        "Quer",
+        "T",
+    ]
+
+
+@pytest.mark.parametrize("name", ["lap.feather", "lap.arrow"])
+def test_tables_of_arrow_and_archives_of_tables_are_refused_with_the_way_out(tmp_path, name):
+    table = pa.table({"t": [0.0, 0.1]})
+    new_file = pa.ipc.new_file if name == "lap.feather" else pa.ipc.new_stream
+    with new_file(str(tmp_path / name), table.schema) as writer:
+        writer.write_table(table)
+    remedy = {"lap.feather": "pandas: read_feather", "lap.arrow": "pyarrow: ipc.open_stream"}
+    with pytest.raises(DataError, match=remedy[name]):
+        survey(tmp_path / name)
+    with ZipFile(tmp_path / "lap.zip", "w") as archive:
+        archive.write(tmp_path / name)
+    with pytest.raises(DataError, match="without a bag of ROS 2; unpack it"):
+        survey(tmp_path / "lap.zip")
+
+
+def test_nested_columns_of_parquet_are_named_with_the_way_out(tmp_path):
+    table = {"t": [0.0, 0.1], "imu": [{"ax": 1.0}] * 2, "gyro": [[1.0, 2.0]] * 2}
+    pq.write_table(pa.table(table), tmp_path / "lap.parquet")
+    skipped = survey_table(tmp_path / "lap.parquet").skipped
+    assert [reason.split("; ")[1][:33] for reason in skipped[:2]] == [
+        "make a column of each of its fiel",
+        "make a column of each of its elem",
+    ]
+
+
 def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path):
     table = usual(drive())
     file = tmp_path / "lap.txt"
@@ -579,6 +629,45 @@ def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_f
     assert log_draft.examined.log.clock.asked
     assert log_draft.dataset["time"] == {"column": name, "unit": unit}
     assert recording.rate_hz == pytest.approx(50.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "// Update Rate: 100.0Hz",
+        '"Sample Rate","100.000","Hz",,"End Time","199.980","s"',
+        "Abtastrate;100 Hz",
+        "# dt=0.01",
+        "Sample interval [ms]: 10",
+    ],
+)
+def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tmp_path, line):
+    d = drive()
+    table = pd.DataFrame(
+        {"Ticks": 1e4 * d["t"] * 0.5, "Gyr_Z": d["r"], "Acc_Y": d["ay"], "Acc_X": d["ax"]}
+    )
+    examined = inspect("my_car", [text_file(tmp_path, line, *lines_of(table))])
+    assert (examined.log.clock.unit, examined.log.clock.asked) == ("0.1*ms", True)
+    without_times = lines_of(table.drop(columns="Ticks"))
+    assert inspect("my_car", [text_file(tmp_path, line, *without_times)]).rate_hz == 100.0
+
+
+@pytest.mark.parametrize(
+    ("whole", "part", "scale"),
+    [("Time", "Millisecond", 1000), ("sec", "usec", 10**6), ("stamp.sec", "stamp.nanosec", 10**9)],
+)
+def test_parts_of_seconds_beside_whole_ones_are_the_clock(tmp_path, whole, part, scale):
+    table = usual(drive())
+    ticks = np.round(table.pop("Time [s]") * scale).astype(int)
+    seconds = ticks // scale
+    if whole == "Time":
+        seconds = [f"10:{59 - (120 - s) // 60:02}:{s % 60:02}" for s in seconds]
+    table = table.assign(**{whole: seconds, part: ticks % scale})
+    file = write(tmp_path / "lap.csv", table)
+    log_draft, recording = read_back(file)
+    assert log_draft.dataset["time"]["column"] == part
+    assert recording.rate_hz == 50.0
+    assert_yaw_rate_is(recording, table)
 
 
 def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_looks_like(tmp_path):

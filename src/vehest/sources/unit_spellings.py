@@ -11,22 +11,26 @@ from vehest.sources.columns import Column
 # unit as vehest spells it, or a unit of no channel -> its spellings, without blanks, dots, stars,
 # brackets and case, sec as s; ambiguous ones are left out
 _SPELLINGS_OF = {
-    "m/s": "m/s mps meter/s meters/s ms-1 ms^-1",
-    "km/h": "km/h kmh kph km/hr km/hour km/std kmph kmh-1 kmh^-1 unit_kilometerperhour",
+    "m/s": "m/s mps meter/s meters/s ms-1 ms^-1 м/с 米/s",
+    "km/h": (
+        "km/h kmh kph km/hr km/hour km/std kmph kmh-1 kmh^-1 unit_kilometerperhour "
+        "км/ч 千米/小时 公里/小时"
+    ),
     "mph": "mph mi/h mi/hr mile/h miles/h miles/hour",
     "knots": "kt kts knt knot knots knoten noeuds nœuds nodi",
     "ft/s": "ft/s fps feet/s foot/s fts-1 fts^-1",
     "m/s²": (
-        "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2 unit_meterperssquar"
+        "m/s² m/s^2 m/s2 m/s/s mps2 mps^2 meter/s^2 meters/s^2 ms-2 ms^-2 unit_meterperssquar "
+        "м/с² м/с^2 м/с2 米/s² 米/s^2 米/s2"
     ),
     "ft/s²": "ft/s² ft/s^2 ft/s2 ft/s/s fps2 fps² feet/s² feet/s^2 feet/s2 fts-2 fts^-2",
     "g": "g gs g's gn g0",
-    "rad": "rad radian radians",
-    "deg": "deg ° º degree degrees gradi grados degré degrés 度 unit_degreofarc",
-    "rad/s": "rad/s radian/s radians/s rads-1 rads^-1",
+    "rad": "rad radian radians рад 弧度",
+    "deg": "deg ° º degree degrees gradi grados degré degrés 度 град unit_degreofarc",
+    "rad/s": "rad/s radian/s radians/s rads-1 rads^-1 рад/с 弧度/s",
     "deg/s": (
         "deg/s °/s º/s degree/s degrees/s degs-1 degs^-1 °s-1 dps gradi/s grados/s "
-        "degré/s degrés/s 度/s unit_degreofarcpers"
+        "degré/s degrés/s 度/s град/с °/с unit_degreofarcpers"
     ),
     "rpm": "rpm 1/min u/min r/min rev/min tr/min giri/min upm min-1 min^-1",
     "rev/s": "rev/s revs/s tr/s giri/s",

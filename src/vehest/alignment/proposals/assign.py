@@ -190,6 +190,12 @@ def propose(
     proposals = _ask_about_world_axes(proposals, in_world)
     if search is not None:
         proposals = _ask_about_speed(proposals, search, wheels, usable)
+        if search.turning.is_reversing:
+            name = search.turning.columns["vx"].name
+            proposals = proposals.with_notes(
+                f"'{name}' is negative most of the time, as of a car that reverses; if the car "
+                "drove ahead, set 'sign: -1' of vx and turn the signs of ax and ay round, too"
+            )
     clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
     proposals = _with_left_right(proposals, usable, motion, clues)
     proposals = possible(

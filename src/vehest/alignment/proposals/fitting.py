@@ -22,7 +22,7 @@ from vehest.alignment.proposals.columns import (
     si_factor,
     slow_of,
 )
-from vehest.alignment.proposals.names import STRONG, is_pair
+from vehest.alignment.proposals.names import STRONG, is_estimate, is_pair
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import CLOSE_MISMATCH, FAR_MISMATCH, Search
 from vehest.alignment.signs import MIN_SCALE_CORRELATION, relations_of
@@ -363,6 +363,8 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
         question = f"sign: {UNCLEAR}" if column.unit else f"sign and unit: {UNCLEAR}"
     if not question and column.hint(best.channel) < 0.0:
         question = "its values contradict its name"
+    if not question and is_estimate(column.name):
+        question = "it is named as an estimate: a reference has to be measured"
     is_wrong_scale = best.strength >= MIN_SCALE_CORRELATION and best.mismatch > FAR_MISMATCH
     if is_wrong_scale:
         question = f"{best.text} instead of 1: another unit or factor"

@@ -102,12 +102,16 @@ _STEERING_RATE = re.compile(
 )
 _FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
 _UNTELLING = re.compile(r"\b(body|bdy|frame|chassis|device)\b")
-_SET_VALUE = re.compile(r"\b(target|soll|desired|demand(ed)?|set ?point|wunsch)|soll\b")
+_SET_VALUE = re.compile(r"\b(target|soll|desired|demand(ed)?|set ?point|wunsch|cmd|command)|soll\b")
+_TRAILER = re.compile(
+    r"trailer|anhaenger|auflieger|\b(hitch|drawbar|deichsel|dolly|articulation)\b"
+)
+_ESTIMATE = re.compile(r"\b([eu]?kf|kalman|est|estimate[ds]?|estimation|observer|beobachter)\b")
 _CORNERS = {
-    "fl": r"fl|vl|lf|front ?left|vorne? ?links|left ?front",
-    "fr": r"fr|vr|rf|front ?right|vorne? ?rechts|right ?front",
-    "rl": r"rl|hl|lr|rear ?left|hinten ?links|left ?rear",
-    "rr": r"rr|hr|rear ?right|hinten ?rechts|right ?rear",
+    "fl": r"fl|vl|lf|fro?nt ?le(?:ft)?|vorne? ?links|left ?front",
+    "fr": r"fr|vr|rf|fro?nt ?ri(?:ght)?|vorne? ?rechts|right ?front",
+    "rl": r"rl|hl|lr|re(?:ar)? ?le(?:ft)?|hinten ?links|left ?rear",
+    "rr": r"rr|hr|re(?:ar)? ?ri(?:ght)?|hinten ?rechts|right ?rear",
 }
 _NO_SPEED_OF_A_WHEEL = re.compile(
     r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|"
@@ -229,7 +233,8 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     if unit in _QUANTITIES:
         roles = {role: strength for role, strength in roles.items() if role not in _NO_QUANTITY}
     strong = {role for role, strength in roles.items() if strength == STRONG}
-    if _SET_VALUE.search(words) and not {"steer", "handwheel"} & set(roles):
+    is_set_value = _SET_VALUE.search(words) and not {"steer", "handwheel"} & set(roles)
+    if is_set_value or _TRAILER.search(words):
         return {"other": STRONG}
     is_in_world = _WORLD_FRAME.search(words) and {"vx", "vy_ref", "ax", "ay"} & set(roles)
     if is_in_world or (_WORLD_AXIS.search(words) and "yaw_rate" not in strong):
@@ -294,6 +299,11 @@ def is_reference(name: str) -> bool:
 def is_of_bus(name: str) -> bool:
     """Whether a name suggests a signal on the car's own bus."""
     return bool(_BUS.search(bare(name)) or _BUS.search(bare(name).replace(" ", "")))
+
+
+def is_estimate(name: str) -> bool:
+    """Whether a name suggests that a filter estimated a channel and no sensor measured it."""
+    return bool(_ESTIMATE.search(bare(name)))
 
 
 def is_filtered(name: str) -> bool:

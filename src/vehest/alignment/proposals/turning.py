@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vehest.alignment.checks import MAX_REVERSE_SPEED
 from vehest.alignment.motion import Motion, rms
 from vehest.alignment.proposals.columns import (
     RARE_UNITS,
@@ -87,9 +88,19 @@ class Turning:
     score: float = 0.0  # of all evidence
 
     @property
+    def is_reversing(self) -> bool:
+        """Whether the speed is negative most of the time, and both ways no faster than a car
+        reverses: nothing but its sign says which way is ahead.
+        """
+        speed = self.columns["vx"].slow
+        is_slow = largest(speed) * si_factor(self.units["vx"], "vx") < MAX_REVERSE_SPEED
+        return is_slow and float(np.median(speed)) < 0.0 and not _is_forward(speed)
+
+    @property
     def signs(self) -> dict[str, int]:
         """Channel -> sign by which the car drives ahead and ay is +vx·yaw_rate."""
-        ahead = -1 if float(np.median(self.columns["vx"].slow)) < 0.0 else 1
+        is_backward = float(np.median(self.columns["vx"].slow)) < 0.0
+        ahead = -1 if is_backward and not self.is_reversing else 1
         return {"vx": ahead, "yaw_rate": 1, "ay": -ahead if self.correlation < 0.0 else ahead}
 
     def motion(self, rate_hz: float) -> Motion:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vehest.alignment.proposals.assign import possible, propose
+from vehest.alignment.proposals.assign import MAX_DECADE_ERROR, possible, propose
 from vehest.alignment.proposals.columns import correlation
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
@@ -149,7 +149,7 @@ def inspect(
     if name in source_names():
         raise ConfigurationError(f"'{name}' is a built-in source; use another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        logs = [survey(file) for file in files]
+        logs = [_at_stated_rate(survey(file)) for file in files]
     longest = _longest(logs)
     others = [log for log in logs if log.file != longest.file]
     differences = _differences(longest)
@@ -159,7 +159,8 @@ def inspect(
     proposals = propose(columns, rate, is_vbo=is_vbo, is_rate_sure=not is_guessed)
     if rate is not None and proposals.rate_hz is not None:
         ratio = proposals.rate_hz / rate
-        corrected = [_with_corrected_clock(log, ratio) for log in (longest, *others)]
+        reason = "ax equals d(vx)/dt at"
+        corrected = [_with_corrected_clock(log, ratio, reason) for log in (longest, *others)]
         if corrected[0] is longest:
             proposals = propose(columns, rate, is_vbo=is_vbo)
         longest, *others = corrected
@@ -223,7 +224,7 @@ def inspect(
         (longest, *others),
         proposals.with_notes(*computed, *foreign, *_notes(longest, logs), *shadowed),
         _place(files, longest.source),
-        proposals.rate_hz,
+        proposals.rate_hz or (longest.rate_hz if longest.clock is None else None),
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
 
@@ -247,7 +248,20 @@ def rate_of(stamps: FloatArray) -> float:
     return 1.0 / max(typical_step(stamps), 1e-6)
 
 
-def _with_corrected_clock(log: Log, ratio: float) -> Log:
+def _at_stated_rate(log: Log) -> Log:
+    """With the unit of time by which rows have the rate that the file states; the same log where
+    the header has the unit, or no unit makes that rate.
+    """
+    if log.rate_hz is None or log.clock is None or log.seconds is None or log.clock.is_stated:
+        return log
+    ratio = log.rate_hz / rate_of(log.seconds)
+    decades = round(math.log10(ratio))
+    is_decade = decades and abs(math.log10(ratio) - decades) < MAX_DECADE_ERROR
+    reason = "a line above the names states"
+    return _with_corrected_clock(log, 10.0**decades, reason) if is_decade else log
+
+
+def _with_corrected_clock(log: Log, ratio: float, reason: str) -> Log:
     """With the unit of time by which the rate is a ratio of that of the guessed one, which is
     asked; the same log where no unit is.
     """
@@ -258,7 +272,7 @@ def _with_corrected_clock(log: Log, ratio: float) -> Log:
     for unit, factor in STATED_UNITS.items():
         if math.isclose(size, factor, rel_tol=1e-6):
             rate_hz = ratio * rate_of(log.seconds)
-            evidence = f"ax equals d(vx)/dt at {rate_hz:.6g} Hz, in {unit}; {clock.evidence}"
+            evidence = f"{reason} {rate_hz:.6g} Hz, in {unit}; {clock.evidence}"
             corrected = replace(clock, unit=unit, evidence=evidence, asked=True)
             return replace(log, clock=corrected, seconds=log.seconds / ratio)
     return log
@@ -455,7 +469,7 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
         return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
     if log.seconds is None:
-        return np.stack([column.values[run] for column in log.columns]), None
+        return np.stack([column.values[run] for column in log.columns]), log.rate_hz
     stamps = log.seconds[run]
     rows = [bridged(column.values[run], stamps, MAX_BRIDGED_SECONDS) for column in log.columns]
     rate = plain_rate(rate_of(stamps), INTERPOLATED_TOLERANCE)

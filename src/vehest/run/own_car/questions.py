@@ -159,11 +159,13 @@ def questions_of(examined: Examined) -> Iterator[Question]:
     rate = examined.rate_hz
     if rate is not None:
         text = f"'{examined.log.file.name}' has no time column: what is its sampling rate [Hz]?"
-        evidence = (
+        evidence: tuple[str, ...] = (
             (f"ax, in the unit of ay, equals d(vx)/dt at about {rate:g} Hz",)
             if "ax" in proposals.by_channel
             else ()
         )
+        if examined.log.rate_hz is not None:
+            evidence = ("stated in a line above the names",)
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
         text = f"is '{clock.column}' the time in {clock.unit}?"

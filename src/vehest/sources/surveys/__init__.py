@@ -6,6 +6,7 @@ Nothing is made a channel here; ``vehest.alignment.proposals`` finds which colum
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +33,7 @@ __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
 MDF = (".mf4", ".mdf", ".dat")
 BAGS = (".db3", ".mcap", ".zip")
+ARROW = (".feather", ".arrow", ".ipc")
 CAN = (".blf", ".asc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
@@ -141,6 +143,16 @@ def _survey(path: Path) -> Log:
             f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst "
             f"{path.stem}'"
         )
+    if ending in ARROW:
+        is_stream = read_head(path, 6) != b"ARROW1"
+        by = "pyarrow: ipc.open_stream" if is_stream else "pandas: read_feather"
+        read = ".read_pandas()" if is_stream else ""
+        raise DataError(
+            f"'{path}' is of Arrow (Feather); save it as Parquet, for example by {by}"
+            f"('{path.name}'){read}.to_parquet('{path.stem}.parquet')"
+        )
+    if ending == ".zip" and _is_without_bag(path):
+        raise DataError(f"'{path}' is an archive without a bag of ROS 2; unpack it")
     if path.is_dir() or ending in BAGS:
         return _survey_bag(path)
     if path.stat().st_size == 0:
@@ -155,6 +167,14 @@ def _survey(path: Path) -> Log:
             f"usable {path}'"
         )
     return survey_table(path)
+
+
+def _is_without_bag(path: Path) -> bool:
+    """Whether an archive holds no bag's description."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return not any(Path(name).name == "metadata.yaml" for name in archive.namelist())
 
 
 def _survey_bag(path: Path) -> Log:

@@ -29,7 +29,7 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
 # the last where a header says so
 STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "0.1*us": 1e-7, "cs": 0.01, "min": 60.0, "h": 3600.0}
 SPELLINGS_OF = {
-    "s": "s sec secs second seconds sekunden 秒 초",
+    "s": "s sec secs second seconds sekunden с сек 秒 초",
     "ms": "ms msec millis milliseconds ミリ秒",
     "us": "us µs μs usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds",
@@ -43,6 +43,15 @@ SPELLINGS_OF = {
 SPELLINGS = {
     spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
+PARTS_OF_SECONDS = {  # names of columns that hold them, beside columns of whole seconds
+    name: unit
+    for unit, names in {
+        "ms": "ms msec millis millisec millisecond milliseconds millisekunden",
+        "us": "us usec micros microsec microsecond microseconds",
+        "ns": "ns nsec nanos nanosec nanosecond nanoseconds",
+    }.items()
+    for name in names.split()
+}
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
 MIN_LOG_SECONDS = 5.0
@@ -50,12 +59,12 @@ LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
 FARTHEST_ROW = 100  # rows by which one may stand out of order
-MODULI = (  # of counters, also as fractions of a second; of a minute, an hour, a day, a GPS week
+MODULI = (  # of counters, also as fractions of a second; of a second, a minute … a GPS week
     *(2.0**bits * factor for bits in (*range(8, 17), 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
     *(
         period * factor
-        for period in (60.0, 3600.0, 86_400.0, 604_800.0)
-        for factor in (1, 1e3, 1e6)
+        for period in (1.0, 60.0, 3600.0, 86_400.0, 604_800.0)
+        for factor in (1, 1e3, 1e6, 1e9)
     ),
 )
 MAX_WRAP_STEPS = 3.0  # steps that a counter that wraps may go ahead there
@@ -98,7 +107,9 @@ def find_clock(
     candidates = []
     for name, raw in columns.items():
         written = units.get(name, "").replace(" ", "").strip("#[]()").lower()
-        unit = SPELLINGS.get(written, "")
+        unit = SPELLINGS.get(written, "") or PARTS_OF_SECONDS.get(
+            plain_name(name).split(" ")[-1], ""
+        )
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})

@@ -66,6 +66,7 @@ class Log:
     ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
     repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
+    rate_hz: float | None = None  # of the rows, where a line above the names states it
 
     @cached_property
     def by_name(self) -> dict[str, RawColumn]:

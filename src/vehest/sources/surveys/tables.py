@@ -41,6 +41,7 @@ from vehest.sources.surveys.clocks import (
     MAX_APART,
     NAMED,
     SPELLINGS,
+    STATED_UNITS,
     find_clock,
     plain_name,
     times_apart,
@@ -74,7 +75,8 @@ DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 # encoding -> bytes that texts in Windows-1252 hardly have, its letters, and their least share of
 # all letters beyond ASCII: Chinese that is read as Korean has few other ones
-EAST_ASIAN = {
+ENCODINGS = {
+    "cp1251": (rb"[\xc0-\xff]{4}", "[А-яЁё]", 0.95),  # Cyrillic
     "cp932": (rb"[\x80-\x9f]", "[ぁ-ヿ一-鿿]", 0.5),  # Shift-JIS as Windows writes it
     "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
     "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
@@ -83,6 +85,14 @@ CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+RATE = re.compile(
+    r"(sampl\w*|updat\w*|logging|log|output|abtast|mess)[ _-]?(rate|freq\w*)(\W*hz)?\W+"
+    r"(?P<hertz>\d[\d.,]*)\W*(hz\b|$)|"
+    r"((sampl\w*|updat\w*|logging)[ _-]?(period|interval|time)|\bdt|abtast(zeit|intervall))"
+    r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec\w*)?)\b|$)",
+    re.IGNORECASE,
+)
+"""What a line above the names says of the rate of the rows."""
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
 VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
@@ -99,6 +109,7 @@ DISGUISED = {
     "a separator of thousands": (
         "^\\s*[+-]?\\d{1,3}([,.'\u00a0\u202f\u2009 ]\\d{3})+([.,]\\d+)?\\s*$"
     ),
+    "the other decimal mark": r"^\s*[+-]?\d+[.,]\d+\s*$",
 }
 """Kinds of texts that are numbers for people: the pattern of each."""
 ABBREVIATED = {
@@ -124,6 +135,8 @@ class Shape:
     # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no
     # such row
     score: float = 0.0
+    rate_hz: float | None = None  # that a line above the names states
+    fault: str = ""  # what to do where there are no names
 
 
 def survey_table(file: Path) -> Log:
@@ -142,6 +155,7 @@ def survey_table(file: Path) -> Log:
     options: dict[str, Any] = {}
     skipped: list[str] = []
     repeated: tuple[int, ...] = ()
+    rate_hz: float | None = None
     if is_parquet(file):
         with parquet_file(file) as table:
             units = {
@@ -156,7 +170,7 @@ def survey_table(file: Path) -> Log:
             ]
             others = [field for field in table.schema_arrow if field.name not in names]
             require_columns_of_numbers(file, names, [field.name for field in others])
-            skipped = [f"column '{printable(field.name)}' holds {field.type}" for field in others]
+            skipped = [_unread_column(field) for field in others]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
     else:
@@ -167,6 +181,7 @@ def survey_table(file: Path) -> Log:
         marks |= odd_marks
         skipped += unread
         units = dict(shape.units)
+        rate_hz = shape.rate_hz
         usual = asdict(TextLayout(delimiter="", decimal=""))  # which are always stated
         options = {
             name: option for name, option in asdict(shape.layout).items() if option != usual[name]
@@ -230,7 +245,18 @@ def survey_table(file: Path) -> Log:
         runs,
         (*skipped, *faults),
         repeated,
+        rate_hz,
     )
+
+
+def _unread_column(field: pa.Field) -> str:
+    """What a column of Parquet that is not read holds, and the way out where it is nested."""
+    text = f"column '{printable(field.name)}' holds {str(field.type)[:60]}"
+    if pa.types.is_struct(field.type):
+        return f"{text}; make a column of each of its fields (in pyarrow: Table.flatten())"
+    if pa.types.is_nested(field.type):
+        return f"{text}; make a column of each of its elements (in pandas: .str[0], .str[1] …)"
+    return text
 
 
 def _fault(name: str, times: FloatArray) -> str:
@@ -308,9 +334,20 @@ def shape_of(file: Path) -> Shape:
             why = f"it holds {kind}"
         raise DataError(f"'{file}' holds no rows of two numbers or more; {why}")
     if not best.names:
-        raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
+        raise DataError(f"'{file}' has no line of names above its first numbers; {best.fault}")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
-    return best
+    return replace(best, rate_hz=_stated_rate(lines[: best.layout.skip_rows]))
+
+
+def _stated_rate(lines: Sequence[str]) -> float | None:
+    """The rate of the rows that one of the lines above the names states [Hz]."""
+    for stated in filter(None, map(RATE.search, lines)):
+        with suppress(ValueError, ZeroDivisionError):
+            number = float((stated["hertz"] or stated["step"]).strip(".,").replace(",", "."))
+            unit = stated["before"] or stated["behind"] or "s"
+            seconds = STATED_UNITS[SPELLINGS[unit.lower()]]
+            return number if stated["hertz"] else 1.0 / (number * seconds)
+    return None
 
 
 def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
@@ -336,7 +373,14 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
         k for k, row in rows.items() if k < first and len(names_of(row, first_row)) == n_columns
     ]
     if not above:
-        return Shape(TextLayout(), score=score)
+        is_short = len(rows.get(first - 1, ())) == n_columns - 1
+        fault = (
+            "the line there has one name less than the rows have cells: begin it with a name of "
+            f"the first column, such as 'row{delimiter}'"
+            if is_short
+            else "write one there"
+        )
+        return Shape(TextLayout(), score=score, fault=fault)
     at = _names_at(rows, above)
     units_at = next((k for k in above if k > at and _are_units(rows[k])), None)
     names = tuple(names_of(rows[at], first_row))
@@ -356,7 +400,7 @@ def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
     n_names = {
         k: len({cell for cell in rows[k] if cell.strip() and not _is_unit(cell)}) for k in block
     }
-    return max(block, key=lambda k: (n_names[k] > 0.7 * max(n_names.values()), k))
+    return max(block, key=lambda k: (n_names[k] > 0.9 * max(n_names.values()), k))
 
 
 def _share(row: Sequence[str], decimal: str) -> float:
@@ -396,7 +440,7 @@ def _is_unit(text: str) -> bool:
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """Encoding and text of the beginning of a file.
 
-    UTF-16 by its mark, then UTF-8, then one of `EAST_ASIAN` if it makes words of its language, then
+    UTF-16 by its mark, then UTF-8, then one of `ENCODINGS` if it makes words of its language, then
     Windows-1252; Latin-1 where none of them fits. `DataError` where control characters say that it
     is no text.
     """
@@ -407,12 +451,12 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
     encodings = {"utf8": "utf-8-sig"}
-    encodings |= {name: name for name, (rare, *_) in EAST_ASIAN.items() if re.search(rare, head)}
+    encodings |= {name: name for name, (rare, *_) in ENCODINGS.items() if re.search(rare, head)}
     encodings |= {"cp1252": "cp1252"} if re.search(rb"[\x80-\x9f]", head) else {}
     for name, encoding in encodings.items():
         with suppress(UnicodeDecodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
-            if name not in EAST_ASIAN or _has_words(text, *EAST_ASIAN[name][1:]):
+            if name not in ENCODINGS or _has_words(text, *ENCODINGS[name][1:]):
                 return name, text
     return "latin-1", head.decode("latin-1")
 
@@ -524,7 +568,7 @@ def _kind_of_text(column: pa.ChunkedArray) -> str:
         example = texts.filter(compute.match_substring_regex(texts, pattern))
         if len(example) > MIN_SHARE_OF_KIND * len(texts):
             text = printable(example[0].as_py().strip())
-            return f"numbers with {kind}, such as '{text}'; export it without"
+            return f"numbers with {kind}, such as '{text}'; export plain numbers"
     return "text"
 
 
@@ -565,7 +609,9 @@ def _numbers(
     """
     if not pa.types.is_string(column.type):
         return (numbers_of(column), set(), {}) if is_numeric(column.type) else None
-    plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
+    plain = compute.utf8_trim_whitespace(column)
+    if decimal == ",":  # a point is then no part of a number
+        plain = compute.replace_substring(compute.replace_substring(plain, ".", "?"), ",", ".")
     is_number = compute.match_substring_regex(plain, f"^({NUMBER.pattern})$", ignore_case=True)
     is_other = compute.fill_null(compute.invert(is_number), False)
     other_texts = compute.unique(column.filter(is_other)).to_pylist()
