@@ -509,7 +509,7 @@ def test_tables_of_arrow_and_archives_of_tables_are_refused_with_the_way_out(tmp
         survey(tmp_path / name)
     with ZipFile(tmp_path / "lap.zip", "w") as archive:
         archive.write(tmp_path / name)
-    with pytest.raises(DataError, match="without a bag of ROS 2; unpack it"):
+    with pytest.raises(DataError, match=r"holds no bags .*; unpack logs of other kinds"):
         survey(tmp_path / "lap.zip")
 
 
@@ -533,13 +533,11 @@ def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path)
         survey_table(file)
 
 
-@pytest.mark.parametrize("form", ["decimal", "dictionary"])
-def test_decimals_and_dictionaries_of_parquet_are_numbers(tmp_path, form):
+def test_decimals_of_parquet_are_numbers(tmp_path):
     table = usual(drive())
     stored = pa.Table.from_pandas(table, preserve_index=False)
     at = stored.column_names.index("Gyro")
-    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4))
-    gyro = gyro.cast(pa.decimal128(12, 4)) if form == "decimal" else gyro.dictionary_encode()
+    gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
     file = tmp_path / "lap.parquet"
     pq.write_table(stored.set_column(at, "Gyro", gyro), file)
     assert_yaw_rate_is(read_back(file)[1], table)
@@ -650,6 +648,14 @@ def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tm
     assert (examined.log.clock.unit, examined.log.clock.asked) == ("0.1*ms", True)
     without_times = lines_of(table.drop(columns="Ticks"))
     assert inspect("my_car", [text_file(tmp_path, line, *without_times)]).rate_hz == 100.0
+
+
+@pytest.mark.parametrize(
+    "line", ["Update Rate: 0 Hz", "dt: 5 section", "Sample rate: 1,000 Hz", "Log rate: 1e9 Hz"]
+)
+def test_a_line_that_states_no_rate_of_a_logger_changes_nothing(tmp_path, line):
+    file = text_file(tmp_path, line, *lines_of(usual(drive())))
+    assert survey_table(file).rate_hz is None
 
 
 @pytest.mark.parametrize(

@@ -152,9 +152,7 @@ def read_numbers(
 
 
 def is_numeric(kind: pa.DataType) -> bool:
-    """Whether a column holds numbers, each in its row or in a dictionary."""
-    if pa.types.is_dictionary(kind):
-        return is_numeric(kind.value_type)
+    """Whether a column holds numbers."""
     return bool(
         pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind)
     )
@@ -172,8 +170,6 @@ def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
     """
     chunks = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
-        if pa.types.is_dictionary(chunk.type):
-            chunk = chunk.dictionary_decode()
         counted = chunk.cast(pa.int64()) if has_time_unit(chunk.type) else chunk
         numbers = (
             counted if counted.type == pa.float64() else counted.cast(pa.float64(), safe=False)

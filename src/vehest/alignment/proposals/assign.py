@@ -86,7 +86,7 @@ MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the
 MIN_SIDE_CORRELATION = 0.5  # of wheels or a course, from which they decide left and right
 PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
 NOMINAL_RATE_HZ = 50.0  # of a log without times
-MAX_DECADE_ERROR = 0.1
+MAX_DECADE_ERROR = 0.1  # of the decimal logarithm of a ratio of two rates
 MIN_COURSE_SAMPLES = 50
 MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
 MAX_COURSE_STEP = 1.0  # rad
@@ -194,7 +194,7 @@ def propose(
             name = search.turning.columns["vx"].name
             proposals = proposals.with_notes(
                 f"'{name}' is negative most of the time, as of a car that reverses; if the car "
-                "drove ahead, set 'sign: -1' of vx and turn the signs of ax and ay round, too"
+                "drove ahead, set 'sign: -1' of vx and reverse those of ax and ay, too"
             )
     clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
     proposals = _with_left_right(proposals, usable, motion, clues)
@@ -688,9 +688,10 @@ def _possible_sideslip_angles(columns: Sequence[Candidate], motion: Motion) -> I
 
 
 def _along_world_axes(columns: Sequence[Candidate]) -> set[str]:
-    """Columns that are derivatives of a coordinate of a position, the first or the second.
+    """Columns that are first or second derivatives of a coordinate of a position.
 
-    Those of a car that turns which agree more with the motion along or across its path are its own.
+    A column that agrees better with the speed or the acceleration along the path, or with that
+    across it, is the car's own. None is found where the path is straight.
     """
     steps = [np.gradient(coordinate) for coordinate in _places(columns)]
     if not steps:
@@ -728,8 +729,8 @@ def _places(columns: Sequence[Candidate]) -> list[FloatArray]:
 
 
 def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Proposals:
-    """Question velocities where the speed is one along an axis of the world, and accelerations
-    along one.
+    """Where the speed is one along an axis of the world, question it, the lateral velocity, and
+    accelerations along such an axis.
     """
     speed = proposals.by_channel.get("vx")
     if speed is None or speed.column not in in_world:
@@ -818,8 +819,8 @@ def _with_left_right(
     motion: Motion | None,
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
-    """With signs by the first clue that decides, else by a pose, else by a heading as a compass
-    counts, else as most columns count.
+    """With signs by the first clue that decides, else by a pose, else by a heading that may be
+    a compass's, else as most columns count.
     """
     for text, agreement in clues:
         if abs(agreement) > MIN_SIDE_CORRELATION:
@@ -916,7 +917,7 @@ def _left_right_clues(
 
 
 def _cosine(latitude: Candidate) -> float:
-    """Of a log's mean latitude, by which a degree of longitude is shorter than one of latitude."""
+    """Cosine of a log's mean latitude: a degree of longitude over one of latitude."""
     return math.cos(math.radians(min(abs(float(latitude.slow.mean())), 89.0)))
 
 

@@ -17,10 +17,10 @@ WEAK = 2.0
 _STRONG = {  # over the name without blanks
     "other": (
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
-        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|jerk|"
-        r"ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|"
-        r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|"
-        r"zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"
+        r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|"
+        r"jerk|ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|"
+        r"wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|"
+        r"counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"
         r"yawangular|gierbeschl|angularacc|crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|"
         r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$"
     ),
@@ -50,17 +50,17 @@ _STRONG = {  # over the name without blanks
     ),
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
     "heading": (
-        r"heading|truehead|course|bearing|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|"
-        r"headimu"
+        r"heading|truehead|course|bearing|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|"
+        r"kurswinkel|headimu"
     ),
     "latitude": r"latitude|(gps|gnss|pos)lat$|^lat$|breitengrad",
     "longitude": r"longitude|(gps|gnss|pos)long?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": (
-        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|xvel|"
-        r"linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|"
-        r"vehv|groundspd|vehicles?pd|encoder"
+        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
+        r"xvel|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|"
+        r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder"
     ),
     "roll_rate": (
         r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$"

@@ -110,7 +110,7 @@ def _unpacked_bag(path: Path, most_bytes: int) -> Iterator[Path]:
             if len(bags) != 1:
                 raise DataError(
                     f"'{path}' holds {len(bags) or 'no'} bags (folders with a {METADATA}); one is "
-                    "needed"
+                    "needed; unpack logs of other kinds"
                 )
             bag = bags[0]
         if bag.is_dir():

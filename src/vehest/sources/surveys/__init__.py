@@ -6,7 +6,6 @@ Nothing is made a channel here; ``vehest.alignment.proposals`` finds which colum
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -151,8 +150,6 @@ def _survey(path: Path) -> Log:
             f"'{path}' is of Arrow (Feather); save it as Parquet, for example by {by}"
             f"('{path.name}'){read}.to_parquet('{path.stem}.parquet')"
         )
-    if ending == ".zip" and _is_without_bag(path):
-        raise DataError(f"'{path}' is an archive without a bag of ROS 2; unpack it")
     if path.is_dir() or ending in BAGS:
         return _survey_bag(path)
     if path.stat().st_size == 0:
@@ -167,14 +164,6 @@ def _survey(path: Path) -> Log:
             f"usable {path}'"
         )
     return survey_table(path)
-
-
-def _is_without_bag(path: Path) -> bool:
-    """Whether an archive holds no bag's description."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return not any(Path(name).name == "metadata.yaml" for name in archive.namelist())
 
 
 def _survey_bag(path: Path) -> Log:

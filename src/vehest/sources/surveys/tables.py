@@ -39,7 +39,9 @@ from vehest.sources.clock_times import past_midnight, seconds_of_text
 from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import (
     MAX_APART,
+    MIN_RATE_HZ,
     NAMED,
+    RATES,
     SPELLINGS,
     STATED_UNITS,
     find_clock,
@@ -85,11 +87,11 @@ CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
-RATE = re.compile(
-    r"(sampl\w*|updat\w*|logging|log|output|abtast|mess)[ _-]?(rate|freq\w*)(\W*hz)?\W+"
-    r"(?P<hertz>\d[\d.,]*)\W*(hz\b|$)|"
-    r"((sampl\w*|updat\w*|logging)[ _-]?(period|interval|time)|\bdt|abtast(zeit|intervall))"
-    r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec\w*)?)\b|$)",
+STATED_RATE = re.compile(
+    r"(sampl\w{,6}|updat\w{,6}|logging|log|output|abtast|mess)[ _-]?(rate|freq\w{,8})(\W*hz)?\W+"
+    r"(?P<hertz>(?!\d+,\d{3}\b)\d[\d.,]*)\W*(hz\b|$)|"
+    r"((sampl\w{,6}|updat\w{,6}|logging)[ _-]?(period|interval|time)|\bdt|abtast(zeit|intervall))"
+    r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec(onds?)?)?)\b|$)",
     re.IGNORECASE,
 )
 """What a line above the names says of the rate of the rows."""
@@ -340,13 +342,15 @@ def shape_of(file: Path) -> Shape:
 
 
 def _stated_rate(lines: Sequence[str]) -> float | None:
-    """The rate of the rows that one of the lines above the names states [Hz]."""
-    for stated in filter(None, map(RATE.search, lines)):
+    """Rate of the rows that a line above the names states [Hz], if it is one of a logger."""
+    for stated in filter(None, map(STATED_RATE.search, lines)):
         with suppress(ValueError, ZeroDivisionError):
             number = float((stated["hertz"] or stated["step"]).strip(".,").replace(",", "."))
-            unit = stated["before"] or stated["behind"] or "s"
-            seconds = STATED_UNITS[SPELLINGS[unit.lower()]]
-            return number if stated["hertz"] else 1.0 / (number * seconds)
+            unit = (stated["before"] or stated["behind"] or "s").lower()
+            step = number * STATED_UNITS[SPELLINGS.get(unit[:2], "s")]
+            rate_hz = number if stated["hertz"] else 1.0 / step
+            if MIN_RATE_HZ <= rate_hz <= RATES[1]:
+                return rate_hz
     return None
 
 
