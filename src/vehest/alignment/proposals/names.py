@@ -19,8 +19,9 @@ _STRONG = {  # over the name without blanks
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
         r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|"
         r"jerk|ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|"
-        r"wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|"
-        r"counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|yawa(ng)?acc|"
+        r"wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|"
+        r"flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|"
+        r"yawa(ng)?acc|"
         r"yawangular|gierbeschl|angularacc|crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|"
         r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$"
     ),
