@@ -13,7 +13,7 @@ from unseen_car import (
     drive_figures,
     factor_without,
 )
-from unseen_car_planted import at_the_limit, in_town, share_interval
+from unseen_car_planted import at_the_limit, draw_crossfall, in_town, share_interval
 
 DEVELOPMENT = [car for car in CARS if car.development]
 TEST = next(car for car in CARS if not car.development)
@@ -79,14 +79,25 @@ def test_intervals_of_shares_are_those_of_clopper_and_pearson():
 
 
 def test_drawn_cars_are_as_the_page_describes_them():
-    town = in_town(0)
+    town = in_town(0, crossfall=0.0)
     assert -0.5 <= town.imu_to_rear_axle <= town.car.wheelbase
     assert 90.0 < town.drive.duration < 150.0
     moving = town.drive["vx"] > 3.0
     turn = np.abs(town.drive["yaw_rate"] * town.drive["vx"])[moving]
     assert 1.0 < np.quantile(turn, 0.99) < 3.0
-    limit = at_the_limit(0)
+    limit = at_the_limit(0, crossfall=0.0)
     assert 0.0 <= limit.imu_to_rear_axle <= 0.75 * limit.car.wheelbase
     assert np.quantile(np.abs(limit.drive["ay"]), 0.99) > 0.6 * 9.81 * limit.car.friction
-    again = at_the_limit(0)
+    again = at_the_limit(0, crossfall=0.0)
     np.testing.assert_array_equal(again.drive["vy_ref"], limit.drive["vy_ref"])
+
+
+def test_crossfall_of_drawn_roads_shows_as_gravity_in_ay():
+    drive = in_town(0, crossfall=3.0).drive
+    level = in_town(0, crossfall=0.0).drive
+    road = np.array([draw_crossfall(0, 3.0)(time) for time in drive.time])
+    assert 2.0 < np.degrees(np.std(road)) < 3.5
+    moving = drive["vx"] > 3.0
+    pull, level_pull = ((log["ay"] - log["vx"] * log["yaw_rate"])[moving] for log in (drive, level))
+    slope, _ = np.polyfit(9.81 * np.sin(road[moving]), pull - level_pull, 1)
+    assert 1.0 < slope < 1.1  # the body rolls too
