@@ -3,6 +3,7 @@ not see through.
 """
 
 import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
 from vehest.data.units import factor_to_si
-from vehest.run.own_car.dataset import draft
+from vehest.run.own_car.dataset import draft, is_certain
 from vehest.run.own_car.inspect import busiest_rows, inspect
 from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
@@ -1208,10 +1209,13 @@ def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(t
         ("wheel_speed_fl_ms", "m/s"),
         ("gps_v_ms", "m/s"),
         ("valve_ms", "ms"),
+        ("AccX_g", "g"),
+        ("lat_acc_g", "g"),
+        ("mass_g", ""),
         ("speed_age_ms", "ms"),
     ],
 )
-def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
+def test_ms_and_g_behind_the_name_of_a_velocity_or_an_acceleration_are_its_unit(name, unit):
     assert unit_in_name(name) == unit
 
 
@@ -1245,6 +1249,16 @@ def test_rows_of_several_rasters_by_their_times_or_one_after_the_other_are_read(
         ("yaw", "deg/s", "yaw_rate"),
         ("r_radps", "rad/s", "yaw_rate"),
         ("Roll", "rad/s", "roll_rate"),
+        ("Vitesse de lacet", "deg/s", "yaw_rate"),
+        ("Velocidad de guiñada", "", "yaw_rate"),
+        ("Accélération longitudinale", "m/s²", "ax"),
+        ("Accelerazione laterale", "g", "ay"),
+        ("Velocidad lateral", "m/s", "vy_ref"),
+        ("Vitesse véhicule", "km/h", "vx"),
+        ("Vitesse roue avant gauche", "km/h", "wheel_speed_fl"),
+        ("vx_clean", "m/s", "vx"),
+        ("Lean Angle", "deg", "other"),
+        ("Bank", "", "other"),
     ],
 )
 def test_the_unit_says_of_what_a_name_is(name, unit, role):
@@ -1282,6 +1296,37 @@ def test_a_drive_mostly_in_reverse_keeps_the_sign_of_its_speed_with_a_note(tmp_p
     found = drafted(tmp_path, usual(d).drop(columns=["Steer", "Beta"]))
     assert {entry.get("sign", 1) for entry in found.dataset["channels"].values()} == {1}
     assert any("negative most of the time" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("with_ax", [False, True])
+def test_a_drive_in_reverse_with_a_speed_without_sign_is_noted_with_a_remedy(tmp_path, with_ax):
+    d = drive()
+    d["vx"] = -0.2 * d["vx"]
+    d["ay"] = d["vx"] * d["r"]
+    d["ax"] = np.gradient(d["vx"], d["t"])
+    table = usual(d).drop(columns=["Steer", "Beta"]).assign(Speed=-3.6 * d["vx"])
+    log_draft = drafted(tmp_path, table if with_ax else table.drop(columns="LongAcc"))
+    (note,) = (note for note in log_draft.notes if "'Speed' has no sign" in note)
+    assert "set 'sign: -1' of vx, reverse that of ay, and remove a 'sign: -1' of ax" in note
+    channels = log_draft.dataset["channels"]
+    channels["vx"]["sign"] = -1
+    channels["ay"]["sign"] *= -1
+    channels.get("ax", {}).pop("sign", None)
+    recording = read_back(log_draft)
+    expected = {"vx": d["vx"], "yaw_rate": d["r"], "ay": d["ay"]} | (
+        {"ax": d["ax"]} if with_ax else {}
+    )
+    for name, samples in expected.items():
+        np.testing.assert_allclose(recording[name], samples, atol=1e-3)
+
+
+def test_no_reverse_is_suspected_of_a_slow_car_whose_ax_says_ahead(tmp_path):
+    d = drive()
+    d["vx"] = 0.2 * d["vx"]
+    d["ay"] = -d["vx"] * d["r"]  # to the right
+    d["ax"] = np.gradient(d["vx"], d["t"])
+    found = drafted(tmp_path, usual(d).drop(columns=["Steer", "Beta"]))
+    assert not any("has no sign" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("name", ["EKF_beta", "beta_est"])
@@ -1604,6 +1649,69 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
     table.columns = [name.replace("AngularVelocityX", "Gyro X (rad/s)") for name in table.columns]
     table.columns = [name.replace("AngularVelocity", "Gyro ") for name in table.columns]
     assert "roll_rate" not in proposed(tmp_path, table)  # about X, which is no forward axis here
+
+
+def test_a_unit_behind_the_letter_of_an_axis_does_not_hide_it(tmp_path):
+    d = drive()
+    noise = 0.01 * np.random.default_rng(2).standard_normal(len(d["t"]))
+    table = usual(d).drop(columns=["LatAcc", "LongAcc", "Beta"])
+    table = table.assign(AccX_g=-d["ay"] / G, AccY_g=d["ax"] / G, AccZ_g=1.0 + noise)
+    by_channel = proposed(tmp_path, table)
+    assert (by_channel["ay"].column, by_channel["ay"].sign) == ("AccX_g", -1)
+    assert (by_channel["ax"].column, by_channel["ax"].sign) == ("AccY_g", 1)
+    assert "AccZ_g" not in {proposal.column for proposal in by_channel.values()}
+
+
+@pytest.mark.parametrize("name", ["Lean Angle [deg]", "Neigung", "phi [deg]"])
+def test_an_angle_of_lean_is_no_second_lateral_acceleration(tmp_path, name):
+    d = drive()
+    table = usual(d).drop(columns="Steer").assign(**{name: np.degrees(np.arctan(d["ay"] / G))})
+    by_channel = proposed(tmp_path, table)
+    assert by_channel["ay"].column == "LatAcc"
+    assert not any("another point" in text for text in by_channel["ay"].evidence)
+    assert name not in {proposal.column for proposal in by_channel.values()}
+    repeated = proposed(tmp_path, usual(d).assign(AccLat2=d["ay"]))["ay"]
+    assert any("'AccLat2': correlation" in text for text in repeated.evidence)
+
+
+def test_a_steering_wheel_in_turns_is_read_and_one_of_unknown_scale_left_out(tmp_path):
+    d = drive()
+    turns = d["handwheel"] / (2.0 * np.pi)
+    table = usual(d).drop(columns="Steer").assign(**{"SteeringWheel [turns]": turns})
+    found = drafted(tmp_path, table)
+    np.testing.assert_allclose(read_back(found)["handwheel"], d["handwheel"], atol=1e-4)
+    table = usual(d).drop(columns="Steer").assign(**{"SteeringWheel [steps]": 4096.0 * turns})
+    channels, open_questions = left_out(tmp_path, table)
+    assert not {"steer", "handwheel"} & set(channels)
+    assert open_questions["SteeringWheel [steps]"].proposed == "-"
+    (note,) = (text for text in proposals_of(tmp_path, table).notes if "'steps'" in text)
+    assert note.endswith("answer its question with CHANNEL UNIT SIGN FACTOR")
+
+
+def test_a_negative_steering_ratio_is_named_and_makes_no_steer(tmp_path):
+    table = usual(drive()).drop(columns="Beta").rename(columns={"Steer": "SWA [deg]"})
+    examined = replace(examine(tmp_path, table), vehicle={"wheelbase": 2.7, "steering_ratio": None})
+    reversed_angle = replace(examined.proposals.by_channel["handwheel"], sign=-1)
+    proposals = examined.proposals.changed({"handwheel": reversed_angle})
+    found = draft(replace(examined, proposals=proposals))
+    assert "steer" not in found.channels
+    assert any("negative: 'sign: -1' of 'SWA [deg]' is wrong" in note for note in found.notes)
+    assert is_certain(15.0, 1.0)
+    assert not is_certain(-15.0, 1.0)
+
+
+def test_offsets_of_a_steering_wheel_and_of_a_speedometer_are_remarks(tmp_path):
+    d = drive()
+    table = usual(d).drop(columns="Beta").rename(columns={"Steer": "SteeringWheelAngle [deg]"})
+    table["GPS Speed [km/h]"] = 3.6 * d["vx"]
+    assert not drafted(tmp_path, table).remarks
+    table["SteeringWheelAngle [deg]"] += 4.0
+    table["Speed"] *= 1.06
+    offset, speed = sorted(drafted(tmp_path, table).remarks)
+    assert offset.startswith("handwheel: median of 4")
+    assert "offset_correction removes it (handwheel: 0.0699 rad)" in offset
+    assert speed.startswith("vx: 6 % above vx_ref")
+    assert speed.endswith("multiply the channel's factor by 0.9434")
 
 
 def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):

@@ -17,7 +17,7 @@ from planted_logs import G, drive, usual, write
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
-from vehest.run.own_car.questions import ask
+from vehest.run.own_car.questions import ask, questions_of
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.not_measured import codes_of_not_measured, marks_not_measured
@@ -566,6 +566,7 @@ def test_minutes_and_seconds_are_times():
         (("ft/s", "0.01 °/s", "cm/s²"), (0.3048, np.radians(0.01), 0.01)),
         (("kn", "gradi/s", "ft/s^2"), (1852.0 / 3600.0, np.radians(1.0), 0.3048)),
         (("0.005 m/s", "0.0625 deg/s", "5e-4*g"), (0.005, np.radians(0.0625), 5e-4 * G)),
+        (("1/100 km/h", "1/100°/s", "1/1000 g"), (0.01 / 3.6, np.radians(0.01), 1e-3 * G)),
     ],
 )
 def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
@@ -637,6 +638,10 @@ def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_f
         "Abtastrate;100 Hz",
         "# dt=0.01",
         "Sample interval [ms]: 10",
+        "Sampling rate 0.1 kHz",
+        "# Sampling frequency [kHz]: 0.1",
+        "# fs = 100 Hz",
+        "Fréquence d'échantillonnage : 100 Hz",
     ],
 )
 def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tmp_path, line):
@@ -651,11 +656,83 @@ def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tm
 
 
 @pytest.mark.parametrize(
-    "line", ["Update Rate: 0 Hz", "dt: 5 section", "Sample rate: 1,000 Hz", "Log rate: 1e9 Hz"]
+    "line",
+    [
+        "Update Rate: 0 Hz",
+        "dt: 5 section",
+        "Sample rate: 1,000 Hz",
+        "Log rate: 1e9 Hz",
+        "Sampling rate 9 kHz",
+        "fs: 16 g",
+        "Gyro FS = 250",
+    ],
 )
 def test_a_line_that_states_no_rate_of_a_logger_changes_nothing(tmp_path, line):
     file = text_file(tmp_path, line, *lines_of(usual(drive())))
     assert survey_table(file).rate_hz is None
+
+
+@pytest.mark.parametrize(
+    ("name", "resolution", "mean_hz"),
+    [("Time", 0.024, 50.0), ("Time [ms]", 24.0, 50.0), ("", 0.02, 50.0)],
+)
+def test_times_that_are_no_clock_give_the_rate_with_a_note(tmp_path, name, resolution, mean_hz):
+    table = usual(drive())
+    scale = 1e3 if "ms" in name else 1.0
+    times = np.round(scale * table["Time [s]"] / resolution) * resolution
+    table = table.rename(columns={"Time [s]": name}).assign(**{name: times})
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    assert (examined.log.clock, examined.rate_hz) == (None, mean_hz)
+    (question,) = (question for question in questions_of(examined) if question.key == "rate")
+    assert question.evidence == ("by the times of a column that is not read, on average",)
+    expected = "as the time: it repeats 1000 times" if name else "and grows as times do; name it"
+    assert any(expected in reason for reason in examined.log.skipped)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.arange(600.0),  # numbers of rows
+        np.zeros(600),
+        np.repeat(np.arange(20.0), 30),  # whole seconds
+        np.where(np.arange(600) < 300, 0.0, 90.0) + np.round(np.arange(600) / 60.0) * 0.024,
+        np.full(600, np.nan),
+        np.repeat(np.arange(300.0), 2) * 1e300,
+    ],
+)
+def test_a_column_that_is_no_clock_gives_no_rate_unless_it_grows_with_the_rows(tmp_path, times):
+    table = usual(drive(12.0)).drop(columns="Time [s]")
+    table.insert(0, "", times)
+    assert survey_table(write(tmp_path / "lap.csv", table)).rate_hz is None
+    table = table.rename(columns={"": "time"})
+    if (np.diff(times) == 0.0).mean() > 0.2:
+        assert survey_table(write(tmp_path / "lap.csv", table)).rate_hz is None
+
+
+def test_times_that_are_no_numbers_for_a_program_are_refused(tmp_path):
+    table = usual(drive()).rename(columns={"Time [s]": "Time [ms]"})
+    table["Time [ms]"] = [f"{1e3 * seconds:,.1f}" for seconds in table["Time [ms]"]]
+    with pytest.raises(DataError, match=r"column 'Time \[ms\]' holds numbers with a separator of"):
+        survey_table(write(tmp_path / "lap.csv", table))
+
+
+def test_recordings_of_a_full_minute_are_no_counter_that_wraps(tmp_path):
+    table = usual(drive())
+    table["Time [s]"] %= 60.0
+    log = survey_table(write(tmp_path / "lap.csv", table))
+    assert [run.stop - run.start for run in log.runs] == [3000, 3000]
+
+
+def test_units_may_stand_above_the_names_and_descriptions_below(tmp_path):
+    lines = lines_of(usual(drive()))
+    units = "s,km/h,deg/s,g,g,deg,deg"
+    words = "elapsed time,speed over ground,rotation about z,lateral,longitudinal,angle,slip angle"
+    for head in ([units, lines[0]], [units, lines[0], words]):
+        log = survey_table(text_file(tmp_path, *head, *lines[1:]))
+        assert log.by_name["Gyro"].unit == "deg/s"
+        assert log.by_name["LatAcc"].unit == "g"
+    letters = ["t,v,r,a,ax,d,b", words]  # of which v, a are known units
+    assert "r" in survey_table(text_file(tmp_path, letters[0], *lines[1:])).by_name
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,10 @@ JUMP_SECONDS = 1.0
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
-MAX_STEERING_OFFSET = np.deg2rad(3.0)
+# rad; that of the steering wheel is more than the crown of a road asks for
+MAX_STEERING_OFFSETS = {"steer": np.deg2rad(3.0), "handwheel": np.deg2rad(2.5)}
+MAX_SPEED_DIFFERENCE = 0.04  # share of the reference's; speedometers read up to 10 % too much
+MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit may be wrong
 DROPOUT_SPEED = 3.0  # m/s
 DROPOUT_SHARE = 0.1  # of the other wheels' median
 DROPOUT_SECONDS = 0.1
@@ -313,12 +316,15 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
             first = int(begins[longest] + np.argmax(moving[begins[longest] : ends[longest]]))
             seconds = moving_samples[longest] / recording.rate_hz
             time = recording.time[first]
+            n_others = int((moving_samples >= STUCK_SECONDS * recording.rate_hz).sum()) - 1
+            others = f", and in {number_of(n_others, 'other segment')}" if n_others else ""
             yield Finding(
                 "warning",
                 "stuck",
                 name,
                 f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s from t = {time:.12g} "
-                "s while the car moves; check the sensor, or exclude this range",
+                f"s while the car moves{others}; check the sensor, or exclude "
+                f"{'these ranges' if others else 'this range'}",
             )
 
 
@@ -444,32 +450,52 @@ def _between_jumps(samples: FloatArray, rate_hz: float) -> Iterator[tuple[int, i
 
 
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Straight ahead the steering angle must be about zero: its median where a moving car hardly
-    turns.
+    """Straight ahead a steering angle must be about zero: its median where a moving car hardly
+    turns, less what is proportional to yaw_rate/vx.
     """
-    if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
-        return
-    straight = (
-        (recording["vx"] > STRAIGHT_SPEED)
-        & (np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE)
-        & np.isfinite(recording["steer"])
-    )
-    seconds = straight.sum() / recording.rate_hz
-    angles = recording["steer"][straight]
-    if seconds >= STRAIGHT_SECONDS and abs(np.median(angles)) >= max(
-        MAX_STEERING_OFFSET, 2.0 * float(angles.std())
-    ):
+    for name, max_offset in MAX_STEERING_OFFSETS.items():
+        if not {"vx", "yaw_rate", name} <= set(recording.channels):
+            continue
+        straight = (
+            (recording["vx"] > STRAIGHT_SPEED)
+            & (np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE)
+            & np.isfinite(recording[name])
+        )
+        seconds = straight.sum() / recording.rate_hz
+        if seconds < STRAIGHT_SECONDS:
+            continue
+        angles = recording[name][straight]
+        curvature = recording["yaw_rate"][straight] / recording["vx"][straight]
+        change = curvature - curvature.mean()
+        gain = float(change @ angles) / max(float(change @ change), 1e-300)
+        angles = angles - gain * curvature
         offset = float(np.median(angles))
+        uncertainty = float(angles.std()) / np.sqrt(len(true_runs(straight)))
+        if abs(offset) >= max(max_offset, 2.0 * uncertainty):
+            message = (
+                f"median of {np.rad2deg(offset):.3g} deg while driving straight ahead "
+                f"(|yaw_rate| < {STRAIGHT_YAW_RATE:g} rad/s, {seconds:.3g} s)"
+            )
+            remedy = f"the transform offset_correction removes it ({name}: {offset:.3g} rad)"
+            yield Finding("warning", "offset", name, f"{message}; {remedy}")
+
+
+def _speed_difference(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """Straight ahead, where wheels slip least, the car's speed must be the reference's."""
+    if not {"vx", "vx_ref", "yaw_rate"} <= set(recording.channels):
+        return
+    is_straight = np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE
+    driven = is_straight & (recording["vx_ref"] > STRAIGHT_SPEED) & np.isfinite(recording["vx"])
+    if driven.sum() < STRAIGHT_SECONDS * recording.rate_hz:
+        return
+    ratio = float(np.median(recording["vx"][driven] / recording["vx_ref"][driven]))
+    if MAX_SPEED_DIFFERENCE < abs(ratio - 1.0) < MAX_READING_ERROR:
         message = (
-            f"median of {np.rad2deg(offset):.3g} deg while driving straight ahead "
-            f"(|yaw_rate| < {STRAIGHT_YAW_RATE:g} rad/s, {seconds:.3g} s)"
+            f"{100.0 * abs(ratio - 1.0):.2g} % {'above' if ratio > 1.0 else 'below'} vx_ref "
+            "(median straight ahead), as of a speedometer, worn tyres or a wrong wheel radius; if "
+            f"vx_ref is right, multiply the channel's factor by {1.0 / ratio:.4g}"
         )
-        yield Finding(
-            "warning",
-            "offset",
-            "steer",
-            f"{message}; the transform offset_correction removes it (steer: {offset:.3g} rad)",
-        )
+        yield Finding("warning", "unit", "vx", message)
 
 
 def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -577,6 +603,7 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _saturated,
     _spikes,
     _steering_offset,
+    _speed_difference,
     _wheel_dropout,
     _reverse,
     _unsigned_speed,

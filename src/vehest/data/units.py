@@ -29,7 +29,13 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
         "cm/s²": 0.01,
         "mm/s²": 0.001,
     },
-    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 0.001, "mdeg": math.pi / 180e3},
+    "rad": {
+        "rad": 1.0,
+        "deg": math.pi / 180.0,
+        "rev": 2.0 * math.pi,
+        "mrad": 0.001,
+        "mdeg": math.pi / 180e3,
+    },
     "rad/s": {
         "rad/s": 1.0,
         "deg/s": math.pi / 180.0,

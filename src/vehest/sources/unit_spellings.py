@@ -36,6 +36,7 @@ _SPELLINGS_OF = {
     "rev/s": "rev/s revs/s tr/s giri/s",
     "cm/s": "cm/s cms-1 cms^-1",
     "mm/s": "mm/s mms-1 mms^-1",
+    "rev": "rev revs revolution revolutions turn turns umdrehung umdrehungen tours",
     "mrad": "mrad milliradian milliradians",
     "mdeg": "mdeg m° millideg millidegree millidegrees",
     "mrad/s": "mrad/s mrads-1 mrads^-1 milliradian/s milliradians/s",
@@ -71,6 +72,7 @@ _CASES = {
 _STEPPED = re.compile(
     r"(?:((?=.*?[1-9])\d*[.,]?\d+(?:e[-+]?\d)?)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL
 )
+_FRACTION = re.compile(r"^1/(10{1,4})[\s·*×]*(?=[^\W\d]|[°º])")  # of a unit, as in 1/1000 g
 _SECOND = re.compile(r"sec(on(d[saeoi]?)?)?|sek(unden?)?|秒")
 
 
@@ -90,6 +92,7 @@ def plain_unit(text: str) -> str | None:
         ``another unit`` for one that no channel has; a step of raw counts stays before it:
         ``0.01*deg/s``. None for an unknown spelling or none.
     """
+    text = _FRACTION.sub(lambda match: f"{1.0 / float(match[1]):g} ", text.strip())
     step, rest = _STEPPED.fullmatch(text.strip("()[] ")).groups()  # type: ignore[union-attr]
     bare = re.sub(r"[\s·*×.Â()\[\]]", "", rest)  # Â: UTF-8 that was read as Latin-1
     plain = _CASES.get(bare) or _SPELLINGS.get(_SECOND.sub("s", bare.lower()))

@@ -48,6 +48,7 @@ from vehest.alignment.proposals.scales import find_wrong_scale, is_scale_wrong
 from vehest.alignment.proposals.turning import (
     CLOSE_MISMATCH,
     FAR_MISMATCH,
+    RANGES,
     RARITY,
     UNIT_PENALTIES,
     Search,
@@ -195,6 +196,13 @@ def propose(
             proposals = proposals.with_notes(
                 f"'{name}' is negative most of the time, as of a car that reverses; if the car "
                 "drove ahead, set 'sign: -1' of vx and reverse those of ax and ay, too"
+            )
+        if search.turning.may_be_unsigned and not _is_driven_ahead(search):
+            speed, rate, ay = (search.turning.columns[name].name for name in RANGES)
+            proposals = proposals.with_notes(
+                f"'{ay}' counts against '{rate}', or '{speed}' has no sign and the car drove in "
+                "reverse for the most part; if it did, set 'sign: -1' of vx, reverse that of ay, "
+                "and remove a 'sign: -1' of ax"
             )
     clues = () if motion is None else _left_right_clues(usable, wheels, motion, is_vbo)
     proposals = _with_left_right(proposals, usable, motion, clues)
@@ -360,6 +368,16 @@ def _agreements_with_ax(search: Search, unit: str = "") -> list[tuple[Agreement,
         (longitudinal(search.motion, column, [column.unit or unit] if unit else ()), column)
         for column in columns
     ]
+
+
+def _is_driven_ahead(search: Search) -> bool:
+    """Whether an acceleration of the sensor of ay, that counts as ay's axes do in a car that drives
+    ahead, agrees with d(vx)/dt.
+    """
+    return any(
+        agreement.strength >= CLEAR_CORRELATION and agreement.sign > 0
+        for agreement, _ in _agreements_with_ax(search)
+    )
 
 
 def _with_speed_by_ax(named: Turning, columns: Sequence[Candidate], rate_hz: float) -> Turning:

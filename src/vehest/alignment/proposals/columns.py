@@ -28,7 +28,7 @@ HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
 MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
 _SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")  # of a magnitude
-_LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz]$")
+_LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz](?= \w+$|$)")  # perhaps before a unit
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 UNITS = {  # where the header is silent, the likeliest first

@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import (
+    HINT_OF_LETTER,
     RARE_UNITS,
     Candidate,
     correlation,
@@ -275,7 +276,7 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
                 evidence,
                 question,
                 offset=offset,
-                is_weak=not hint,
+                is_weak=not hint or "handwheel" in column.hints,
             ),
         )
     _, channel, unit, length, largest_angle, is_repeatable = min(possible)
@@ -324,7 +325,10 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     best with ay - vx·yaw_rate; None where no car could slide like that.
     """
     motion = search.motion
-    is_named_otherwise = STRONG in column.hints.values()
+    is_of_other_axes = HINT_OF_LETTER in column.hints.values() and not set(REFERENCES) & set(
+        column.hints
+    )
+    is_named_otherwise = is_of_other_axes or STRONG in column.hints.values()
     agreements = [
         agreement(motion, column, channel, unit, f"d({channel})/dt")
         for channel in REFERENCES

@@ -21,21 +21,22 @@ _STRONG = {  # over the name without blanks
         r"jerk|ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|"
         r"wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|"
         r"flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|"
-        r"yawa(ng)?acc|"
+        r"yawa(ng)?acc|^lean|lean(ang|winkel)|^bank|bank(ang|winkel)|bank$|schraegl|"
         r"yawangular|gierbeschl|angularacc|crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|"
         r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$"
     ),
     "yaw_rate": (
         r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
-        r"rateyaw|yawspeed|omegaz|angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
+        r"lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
         r"^rimu$|psistrich|vgier"
     ),
     "ay": (
         r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
         r"linearaccelerationy|yacc|glat|^gy$|quera(?!bw)|accquer|accel?lat|laterala|"
-        r"beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right"
+        r"ac+[eé]l\w*lat|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right"
     ),
-    "ax": r"longac|inlineac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
+    "ax": r"longac|ac+[eé]l\w*long|inlineac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
+    r"longitudinalac|"
     r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
     r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
@@ -47,9 +48,12 @@ _STRONG = {  # over the name without blanks
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": (
         r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|"
-        r"velocityy|(?<!t)yvel|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
+        r"(vitesse|velocidad|velocità)lat|velocityy|(?<!t)yvel|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
     ),
-    "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
+    "sideslip_ref": (
+        r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$|"
+        r"d[eé]riv[ea]$"
+    ),
     "heading": (
         r"heading|truehead|course|bearing|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|"
         r"kurswinkel|headimu"
@@ -59,7 +63,7 @@ _STRONG = {  # over the name without blanks
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": (
-        r"speed|velocity|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
+        r"speed|velocity|vitesse|velocidad|velocità|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
         r"xvel|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|"
         r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder"
     ),
@@ -109,10 +113,10 @@ _TRAILER = re.compile(
 )
 _ESTIMATE = re.compile(r"\b([eu]?kf|kalman|est|estimate[ds]?|estimation|observer|beobachter)\b")
 _CORNERS = {
-    "fl": r"fl|vl|lf|fro?nt ?le(?:ft)?|vorne? ?links|left ?front",
-    "fr": r"fr|vr|rf|fro?nt ?ri(?:ght)?|vorne? ?rechts|right ?front",
-    "rl": r"rl|hl|lr|re(?:ar)? ?le(?:ft)?|hinten ?links|left ?rear",
-    "rr": r"rr|hr|re(?:ar)? ?ri(?:ght)?|hinten ?rechts|right ?rear",
+    "fl": r"fl|vl|lf|fro?nt ?le(?:ft)?|vorne? ?links|left ?front|avant ?gauche",
+    "fr": r"fr|vr|rf|fro?nt ?ri(?:ght)?|vorne? ?rechts|right ?front|avant ?droite?",
+    "rl": r"rl|hl|lr|re(?:ar)? ?le(?:ft)?|hinten ?links|left ?rear|arri[eè]re ?gauche",
+    "rr": r"rr|hr|re(?:ar)? ?ri(?:ght)?|hinten ?rechts|right ?rear|arri[eè]re ?droite?",
 }
 _NO_SPEED_OF_A_WHEEL = re.compile(
     r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|"
@@ -120,7 +124,7 @@ _NO_SPEED_OF_A_WHEEL = re.compile(
 )
 _AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
 _WHEEL_SPEED = re.compile(
-    r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws[ps]?\b|vel"
+    r"wh(ee)?l|rad|roue|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws[ps]?\b|vel"
 )
 _EXPLAINED = {
     "yaw_rate": ("heading", "vx", "vy_ref", "position_x", "position_y"),

@@ -97,6 +97,15 @@ class Turning:
         return is_slow and float(np.median(speed)) < 0.0 and not _is_forward(speed)
 
     @property
+    def may_be_unsigned(self) -> bool:
+        """Whether a speed of one sign, no faster than a car reverses, and ay against vx·yaw_rate
+        are as those of a car that reverses with a speed without sign.
+        """
+        speed = self.columns["vx"].slow
+        is_slow = largest(speed) * si_factor(self.units["vx"], "vx") < MAX_REVERSE_SPEED
+        return is_slow and self.correlation < 0.0 and _is_forward(speed)
+
+    @property
     def signs(self) -> dict[str, int]:
         """Channel -> sign by which the car drives ahead and ay is +vx·yaw_rate."""
         is_backward = float(np.median(self.columns["vx"].slow)) < 0.0
@@ -479,6 +488,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
         agreement = abs(correlation(column.slow, ay.column.slow))
         if agreement > MIN_AY_REPEAT_CORRELATION and column.hint("ay") >= 0.0:
             search.free.remove(column)
+            if not _unit(column, ay, "ay", agreement):  # an angle of lean
+                continue
             yield ay.proposal(
                 "ay",
                 f"'{column.name}': correlation {agreement:.3f}, measured at another point or "
@@ -537,9 +548,9 @@ def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
 
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
-    min_correlation = (
-        MIN_NAMED_REPEAT_CORRELATION[channel] if channel in column.hints else MIN_REPEAT_CORRELATION
-    )
+    min_correlation = MIN_REPEAT_CORRELATION
+    if channel in column.hints:
+        min_correlation = MIN_NAMED_REPEAT_CORRELATION.get(channel, MIN_REPEAT_CORRELATION)
     if (
         abs(agreeing) < min_correlation
         or column.hint(channel) < 0.0

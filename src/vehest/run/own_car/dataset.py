@@ -147,10 +147,19 @@ def draft(examined: Examined) -> Draft:
     notes += _cuts(dataset, recordings)
     used_ratio = vehicle["steering_ratio"] or (ratio[0] if ratio and is_certain(*ratio) else None)
     if ratio and used_ratio is None:
+        handwheel = proposals.by_channel["handwheel"]
+        reason = (
+            f"less certain than {100 * MAX_RATIO_UNCERTAINTY:g} %; state your car's by "
+            "--steering-ratio to add it"
+        )
+        if ratio[0] < 0.0:
+            reason = (
+                f"negative: 'sign: {handwheel.sign}' of '{handwheel.column}' is wrong, or the car "
+                "reverses with a speed without sign; reverse the sign, or leave out the reverse"
+            )
         notes.append(
             "'steer' is left out: the steering ratio estimated from slow corners is "
-            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, less certain than {100 * MAX_RATIO_UNCERTAINTY:g} "
-            "%; state your car's by --steering-ratio to add it"
+            f"{ratio[0]:.3g} ± {ratio[1]:.2g}, {reason}"
         )
     crawl_speed = max(map(_crawl_speed, recordings))
     if crawl_speed:
@@ -179,8 +188,8 @@ def draft(examined: Examined) -> Draft:
 
 
 def is_certain(ratio: float, uncertainty: float) -> bool:
-    """Whether an estimated steering ratio is certain enough to be used."""
-    return uncertainty <= MAX_RATIO_UNCERTAINTY * abs(ratio)
+    """Whether an estimated steering ratio is certain enough to be used, and positive."""
+    return uncertainty <= MAX_RATIO_UNCERTAINTY * ratio
 
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:

@@ -204,12 +204,16 @@ def inspect(
         f"'{column}' is left out: it is the difference of '{of}' from row to row, not a measurement"
         for column, of in differences.items()
     ]
-    assigned_units = {proposal.column: proposal.unit for proposal in proposals.channels}
+    by_column = {proposal.column: proposal for proposal in proposals.channels}
     foreign = [
-        f"the unit '{column.unit}' of '{column.name}' is unknown; according to magnitude and "
-        f"motion it is {assigned_units[column.name]}"
+        f"the unit '{column.unit}' of '{column.name}' is unknown; "
+        + (
+            "answer its question with CHANNEL UNIT SIGN FACTOR"
+            if by_column[column.name].question
+            else f"according to magnitude and motion it is {by_column[column.name].unit}"
+        )
         for column in longest.columns
-        if column.name in assigned_units
+        if column.name in by_column
         and column.unit.strip("-[]() 1")
         and plain_unit(column.unit) is None
     ]
@@ -257,7 +261,7 @@ def _at_stated_rate(log: Log) -> Log:
     ratio = log.rate_hz / rate_of(log.seconds)
     decades = round(math.log10(ratio))
     is_decade = decades and abs(math.log10(ratio) - decades) < MAX_DECADE_ERROR
-    reason = "a line above the names states"
+    reason = f"{log.rate_source} states"
     return _with_corrected_clock(log, 10.0**decades, reason) if is_decade else log
 
 

@@ -158,14 +158,15 @@ def questions_of(examined: Examined) -> Iterator[Question]:
     clock = examined.log.clock
     rate = examined.rate_hz
     if rate is not None:
-        text = f"'{examined.log.file.name}' has no time column: what is its sampling rate [Hz]?"
+        name = examined.log.file.name
+        text = f"'{name}' has no column of even times: what is its sampling rate [Hz]?"
         evidence: tuple[str, ...] = (
             (f"ax, in the unit of ay, equals d(vx)/dt at about {rate:g} Hz",)
             if "ax" in proposals.by_channel
             else ()
         )
         if examined.log.rate_hz is not None:
-            evidence = ("stated in a line above the names",)
+            evidence = (f"by {examined.log.rate_source}",)
         yield Question("rate", text, f"{rate:g}", evidence=evidence)
     if clock is not None and clock.asked:
         text = f"is '{clock.column}' the time in {clock.unit}?"

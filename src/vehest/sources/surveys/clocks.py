@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import HIGHEST_RATE
-from vehest.sources.clocks import RATE_TOLERANCE, span_fault
+from vehest.sources.clocks import (
+    INTERPOLATED_TOLERANCE,
+    RATE_TOLERANCE,
+    plain_rate,
+    span_fault,
+)
 from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
@@ -59,13 +64,14 @@ LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
 FARTHEST_ROW = 100  # rows by which one may stand out of order
+TIME_FACTORS = (1, 1e3, 1e6, 1e9)
+PERIODS = {  # of a minute … a GPS week
+    period * factor for period in (60.0, 3600.0, 86_400.0, 604_800.0) for factor in TIME_FACTORS
+}
 MODULI = (  # of counters, also as fractions of a second; of a second, a minute … a GPS week
     *(2.0**bits * factor for bits in (*range(8, 17), 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
-    *(
-        period * factor
-        for period in (1.0, 60.0, 3600.0, 86_400.0, 604_800.0)
-        for factor in (1, 1e3, 1e6, 1e9)
-    ),
+    *TIME_FACTORS,
+    *sorted(PERIODS),
 )
 MAX_WRAP_STEPS = 3.0  # steps that a counter that wraps may go ahead there
 REGULAR = 0.8  # share of the steps within half a median step
@@ -106,10 +112,7 @@ def find_clock(
     """
     candidates = []
     for name, raw in columns.items():
-        written = units.get(name, "").replace(" ", "").strip("#[]()").lower()
-        unit = SPELLINGS.get(written, "") or PARTS_OF_SECONDS.get(
-            plain_name(name).split(" ")[-1], ""
-        )
+        unit = _unit_of_time(name, units.get(name, ""))
         named = bool(NAMED.match(plain_name(name)))
         may_be_time = named or unit or (np.diff(raw) < 0).mean() <= MOST_RESTARTS
         values, repair = in_order(raw) if may_be_time else (raw, {})
@@ -121,7 +124,7 @@ def find_clock(
             continue
         stamps = _stamps(name, step, unit, named, float(np.ptp(values)))
         if stamps is not None:
-            is_unknown = bool(written.strip("-")) and not unit
+            is_unknown = bool(units.get(name, "").strip("-#[]() ")) and not unit
             stamps = replace(stamps, repair=repair, asked=stamps.asked or is_unknown)
             candidates.append((2 * bool(unit) + named, stamps, values, step))
     n_rows = len(next(iter(columns.values())))
@@ -182,6 +185,45 @@ def times_apart(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> 
     return [name for name in times if name in apart]
 
 
+def may_be_times(values: FloatArray) -> bool:
+    """Whether a column without a name grows evenly, and not as the numbers of rows do."""
+    return _step(values, named=False) is not None and bool((np.diff(values) != 1.0).any())
+
+
+def mean_rate(name: str, times: FloatArray, written: str) -> float | None:
+    """Mean rate of the rows, by times that are no clock: they repeat too often, or have no name.
+
+    Parameters
+    ----------
+    name : str
+        The column.
+    times : FloatArray
+        Its numbers, shape (N,).
+    written : str
+        Its unit as the file writes it; empty where it has none.
+
+    Returns
+    -------
+    float or None
+        In Hz; None where it goes backwards, repeats most of the time, or pauses.
+    """
+    steps = np.diff(times)
+    if len(steps) < MIN_TIMES or not (steps >= 0.0).all() or (steps > 0.0).mean() < 0.5:
+        return None
+    step = float(steps.mean())
+    unit = _unit_of_time(name, written)
+    stamps = _stamps(name, step, unit, named=True, length=float(np.ptp(times)))
+    if stamps is None or stamps.asked or steps.max() > FEWEST_STEPS * step:
+        return None
+    return plain_rate(1.0 / (step * STATED_UNITS[stamps.unit]), INTERPOLATED_TOLERANCE)
+
+
+def _unit_of_time(name: str, written: str) -> str:
+    """The unit of time that a header states, in `STATED_UNITS`, or that ends a name; else empty."""
+    spelling = written.replace(" ", "").strip("#[]()").lower()
+    return SPELLINGS.get(spelling, "") or PARTS_OF_SECONDS.get(plain_name(name).split(" ")[-1], "")
+
+
 def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     """Times that go on where a counter wrapped or rows stood out of order.
 
@@ -208,7 +250,10 @@ def in_order(times: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
     if step > 0.0:
         modulus = min(MODULI, key=lambda modulus: abs(steps.min() + modulus - step))
         ahead = steps[steps < 0] + modulus
-        if np.ptp(times) < modulus and 0.0 < ahead.min() <= ahead.max() < MAX_WRAP_STEPS * step:
+        # recordings of a full minute begin at nil, the first one too
+        may_restart = modulus in PERIODS and times[0] < step
+        is_wrap = np.ptp(times) < modulus and not may_restart
+        if is_wrap and 0.0 < ahead.min() <= ahead.max() < MAX_WRAP_STEPS * step:
             return unwrapped(times, modulus), {"wraps_at": modulus}
     rows = np.argsort(times, kind="stable")
     ordered = times[rows]

@@ -66,7 +66,8 @@ class Log:
     ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
     repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
-    rate_hz: float | None = None  # of the rows, where a line above the names states it
+    rate_hz: float | None = None  # of the rows, where the file states it beside their times
+    rate_source: str = ""  # that states it, for people
 
     @cached_property
     def by_name(self) -> dict[str, RawColumn]:

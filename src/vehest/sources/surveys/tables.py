@@ -45,6 +45,8 @@ from vehest.sources.surveys.clocks import (
     SPELLINGS,
     STATED_UNITS,
     find_clock,
+    may_be_times,
+    mean_rate,
     plain_name,
     times_apart,
 )
@@ -71,6 +73,7 @@ LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # of its numbers
 MIN_SHARE_OF_KIND = 0.1  # of texts that name a kind of number
+MIN_UNITS_ABOVE = 0.7  # share of known units in a row above the names
 MAX_HEADER_LINES = 4  # of names, units, sources and the like
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
@@ -88,8 +91,9 @@ MOST_CONTROLS = 0.01
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 STATED_RATE = re.compile(
-    r"(sampl\w{,6}|updat\w{,6}|logging|log|output|abtast|mess)[ _-]?(rate|freq\w{,8})(\W*hz)?\W+"
-    r"(?P<hertz>(?!\d+,\d{3}\b)\d[\d.,]*)\W*(hz\b|$)|"
+    r"((sampl\w{,6}|updat\w{,6}|logging|log|output|abtast|mess)[ _-]?(rate|freq\w{,8})|^\W*f_?s\b|"
+    r"\b(échantillonnage|muestreo|campionamento))(\W*(?P<kilo_before>k)?hz)?\W+"
+    r"(?P<hertz>(?!\d+,\d{3}\b)\d[\d.,]*)\W*((?P<kilo_behind>k)?hz\b|$)|"
     r"((sampl\w{,6}|updat\w{,6}|logging)[ _-]?(period|interval|time)|\bdt|abtast(zeit|intervall))"
     r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec(onds?)?)?)\b|$)",
     re.IGNORECASE,
@@ -100,6 +104,8 @@ VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
 )
 """Names that end in ms for metres a second, as those of delays and ages do not."""
+ACCELERATION = re.compile(rf"(.*[_\s])?(a[xyz]|\w*(acc|beschl)[a-z]*){PLACE}[_\s]g", re.IGNORECASE)
+"""Names that end in g for that of gravity."""
 DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
@@ -114,6 +120,7 @@ DISGUISED = {
     "the other decimal mark": r"^\s*[+-]?\d+[.,]\d+\s*$",
 }
 """Kinds of texts that are numbers for people: the pattern of each."""
+UNREAD_TIMES = re.compile(r"column '(t|time|zeit|timestamp)\b[^']*' holds numbers", re.IGNORECASE)
 ABBREVIATED = {
     "radps": "rad/s",
     "degps": "deg/s",
@@ -189,6 +196,7 @@ def survey_table(file: Path) -> Log:
             name: option for name, option in asdict(shape.layout).items() if option != usual[name]
         }
         options |= {"missing": sorted(marks)} if marks else {}
+    unnamed_times = values.pop("", None)
     if not values:
         raise DataError(
             f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}"
@@ -224,6 +232,16 @@ def survey_table(file: Path) -> Log:
         for name, times in (clocks | named).items()
         if stamps is None or name != stamps.column
     ]
+    rate_source = "a line above the names"
+    if stamps is None and rate_hz is None:
+        unread_times = [text for text in skipped if UNREAD_TIMES.match(text)]
+        if unread_times:
+            raise DataError(f"'{file}': {unread_times[0]}")
+        if unnamed_times is not None:
+            named |= {"": unnamed_times}
+        for name, times in named.items():
+            rate_hz = rate_hz or mean_rate(name, times, written.get(name, ""))
+            rate_source = "the times of a column that is not read, on average"
     if stamps is not None and stamps.repair.get("sort"):
         rows = np.argsort(times_and_values[stamps.column], kind="stable")
         values = {name: samples[rows] for name, samples in values.items()}
@@ -248,12 +266,15 @@ def survey_table(file: Path) -> Log:
         (*skipped, *faults),
         repeated,
         rate_hz,
+        rate_source,
     )
 
 
 def _unread_column(field: pa.Field) -> str:
     """What a column of Parquet that is not read holds, and the way out where it is nested."""
     text = f"column '{printable(field.name)}' holds {str(field.type)[:60]}"
+    if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
+        return f"{text}; if these are numbers, write them as such (in pandas: .astype(float))"
     if pa.types.is_struct(field.type):
         return f"{text}; make a column of each of its fields (in pyarrow: Table.flatten())"
     if pa.types.is_nested(field.type):
@@ -283,7 +304,7 @@ def unit_in_name(name: str) -> str:
 
     It stands in brackets, ``Speed [km/h]``, unless they hold an index, ``xyz[2]``, or behind the
     last blank or underscore, ``ay_mps2``, where it is a known unit or abbreviation of two letters
-    or more; ``ms`` of a velocity is m/s.
+    or more; ``ms`` of a velocity is m/s, ``g`` of an acceleration that of gravity.
 
     Returns
     -------
@@ -298,6 +319,8 @@ def unit_in_name(name: str) -> str:
     last = words[-1].lower() if len(words) > 1 else ""
     if last == "ms" and VELOCITY.fullmatch(name.strip()):
         return "m/s"
+    if last == "g" and ACCELERATION.fullmatch(name.strip()):
+        return "g"
     return ABBREVIATED.get(last) or (last if _is_unit(last) and len(last) > 1 else "")
 
 
@@ -348,7 +371,8 @@ def _stated_rate(lines: Sequence[str]) -> float | None:
             number = float((stated["hertz"] or stated["step"]).strip(".,").replace(",", "."))
             unit = (stated["before"] or stated["behind"] or "s").lower()
             step = number * STATED_UNITS[SPELLINGS.get(unit[:2], "s")]
-            rate_hz = number if stated["hertz"] else 1.0 / step
+            factor = 1e3 if stated["kilo_before"] or stated["kilo_behind"] else 1.0
+            rate_hz = factor * number if stated["hertz"] else 1.0 / step
             if MIN_RATE_HZ <= rate_hz <= RATES[1]:
                 return rate_hz
     return None
@@ -387,6 +411,8 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
         return Shape(TextLayout(), score=score, fault=fault)
     at = _names_at(rows, above)
     units_at = next((k for k in above if k > at and _are_units(rows[k])), None)
+    if units_at is None and at - 1 in above and _are_units(rows[at - 1], MIN_UNITS_ABOVE):
+        units_at = at - 1
     names = tuple(names_of(rows[at], first_row))
     cells = [] if units_at is None else rows[units_at]
     units = dict(zip(names, map(str.strip, cells), strict=False))
@@ -401,6 +427,8 @@ def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
     block = [k for k in above if k > above[-1] - MAX_HEADER_LINES]
     units_at = next((k for k in block[1:] if _are_units(rows[k])), None)
     block = [k for k in block if units_at is None or k < units_at]
+    if units_at is None and len(block) > 2 and _are_units(rows[block[0]], MIN_UNITS_ABOVE):
+        return block[1]  # over a row of descriptions
     n_names = {
         k: len({cell for cell in rows[k] if cell.strip() and not _is_unit(cell)}) for k in block
     }
@@ -424,14 +452,14 @@ def _is_number(cell: str, decimal: str) -> bool:
     )
 
 
-def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a row below the names holds units: some that are known, or brackets, and no longer
+def _are_units(cells: Sequence[str], min_share: float = 0.3) -> bool:
+    """Whether a row beside the names holds units: some that are known, or brackets, and no longer
     words.
     """
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     if not filled:
         return any(cell.strip() for cell in cells)
-    return sum(map(_is_unit, filled)) >= max(1, 0.3 * len(filled)) and all(
+    return sum(map(_is_unit, filled)) >= max(1, min_share * len(filled)) and all(
         len(cell) <= 12 for cell in filled
     )
 
@@ -508,7 +536,8 @@ def _columns(
     Returns
     -------
     values : dict
-        Name -> numbers, NaN where a sample is missing, shape (N,).
+        Name -> numbers, NaN where a sample is missing, shape (N,); under an empty name those of the
+        first column without one that may be times.
     clocks : dict
         Name -> times of a clock, shape (N,) [s].
     marks : set of str
@@ -526,6 +555,10 @@ def _columns(
             skipped += [f"column '{printable(name)}' is empty"] if name else []
         elif not name:
             skipped.append(f"column {place} has no name")
+            numbers = _numbers(column, shape.layout.decimal)
+            if numbers is not None and may_be_times(numbers[0]):
+                skipped[-1] += " and grows as times do; name it 'time'"
+                values.setdefault("", numbers[0])
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
             values[name], column_marks, odd = numbers
             if NAMED.match(plain_name(name)) and _shows_a_clock(values[name]):
