@@ -205,7 +205,11 @@ def on_screen(text):
 
 @pytest.mark.parametrize(
     ("suffix", "written_by_another"),
-    [(".asc", since_last_event), (".asc", with_requests), (".log", on_screen)],
+    [
+        (".asc", since_last_event),
+        (".asc", with_requests),
+        (".log", on_screen),
+    ],
 )
 def test_logs_of_other_writers_hold_the_same_drive(tmp_path, suffix, written_by_another):
     written = write_log(drive(3.0), tmp_path, suffix)
@@ -331,3 +335,32 @@ channels: {{vx: {{column: Speed, unit: m/s}}}}
     assert missing == [("drive_run_0", "vx")]
     impossible = [row["recording"] for row in rows if row["check"] == "impossible"]
     assert impossible == ["drive_run_1"]
+
+
+MAGNITUDE = """VERSION ""
+
+BO_ 291 ESP_02: 8 Car
+ SG_ ESP_Gierrate : 0|14@1+ (0.01,0) [0|163] "deg/s" Car
+ SG_ ESP_VZ_Gierrate : 14|1@1+ (1,0) [0|1] "" Car
+
+BO_ 292 ESP_03: 8 Car
+ SG_ ESP_VZ_Other : 14|1@1+ (1,0) [0|1] "" Car
+"""
+
+
+def test_a_signal_of_the_same_message_is_the_sign_of_a_magnitude(tmp_path):
+    rate = np.arange(-100, 100)  # 0.01 deg/s
+    frames = [
+        (k / 100, 0, struct.pack("<H6x", abs(raw) | (raw < 0) << 14))
+        for k, raw in enumerate(rate.tolist())
+    ]
+    log(tmp_path, MAGNITUDE, frames)
+    declared = {"column": "ESP_Gierrate", "unit": "deg/s", "sign_column": "ESP_VZ_Gierrate"}
+    recording = read(tmp_path, channels={"yaw_rate": declared})
+    np.testing.assert_allclose(recording["yaw_rate"], np.radians(0.01 * rate), atol=1e-12)
+    for column, message in (
+        ("ESP_VZ_Other", "is in message 'ESP_03', 'ESP_Gierrate' in 'ESP_02'; only a sign in the"),
+        ("ESP_VZ_Gierate", "did you mean 'ESP_VZ_Gierrate'"),
+    ):
+        channels = {"yaw_rate": {**declared, "sign_column": column}}
+        assert message in refusal(lambda channels=channels: read(tmp_path, channels=channels))

@@ -26,7 +26,13 @@ from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, SampledColumn
+from vehest.sources.columns import (
+    ChannelMap,
+    ChannelNames,
+    Positive,
+    SampledColumn,
+    names_read,
+)
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
@@ -103,11 +109,9 @@ class VboSource(FileSource):
         if max_gap is None:
             return super().runs_in(file)
         log = self._log(file)
-        require_columns(
-            file, list(log.columns), [column.column for column in self.columns.values()]
-        )
+        require_columns(file, list(log.columns), names_read(self.columns))
         columns = (
-            column.measured(log.columns[column.column])
+            column.measured(log.columns)
             for name, column in self.columns.items()
             if name not in self.gappy
         )
@@ -127,7 +131,7 @@ class VboSource(FileSource):
         log = self._log(file)
         rows = self._runs_of(file)[run]
         number = {} if run is None else {"run": run}
-        used_columns = [column.column for column in self.columns.values()]
+        used_columns = names_read(self.columns)
         require_columns(file, list(log.columns), used_columns)
         if any(map(SLIP_AT_A_POINT.fullmatch, used_columns)) and SLIP_CHECK not in (
             self.dataset.get("accept") or []
@@ -141,7 +145,7 @@ class VboSource(FileSource):
             require_unit(
                 log.units.get(column.column, ""), column, unit, location, "declare a factor"
             )
-            samples = column.measured(log.columns[column.column][rows])
+            samples = column.measured(log.columns)[rows]
             if self.options.max_gap is not None and name not in self.gappy:
                 samples = bridged(samples, log.seconds[rows], self.options.max_gap)
             channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)
