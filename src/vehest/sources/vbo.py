@@ -46,6 +46,11 @@ UNITS = {
     "Longacc": "g",
     "Latacc": "g",
 }
+SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
+# measured by them; 0 where there is none
+OF_SATELLITES = re.compile(
+    r"lat|long|velocity|heading|height|vert-vel|Longacc|Latacc|True_Head|Slip_\w+|L(at|ng)\._Vel\."
+)
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 # slower or straighter, slip angles at two wheels do not reveal where they hold
@@ -193,6 +198,7 @@ def read_log(file: Path) -> Log:
         text=text[:last] if cut_off else text,
     )
     seconds = _seconds(columns.pop("time"), file)
+    columns = _without_lost_fixes(columns)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
         columns = {name: samples[:-1] for name, samples in columns.items()}
@@ -227,6 +233,21 @@ def read_log(file: Path) -> Log:
         offsets,
         provenance,
     )
+
+
+def _without_lost_fixes(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """With NaN for the zeros that the logger writes where it has no satellites; unchanged where it
+    never has any.
+    """
+    has_fix = np.nan_to_num(columns.get("sats", np.empty(0))).astype(int) & SATELLITES > 0
+    if not has_fix.any():
+        return columns
+    return {
+        name: np.where(~has_fix & (samples == 0.0), np.nan, samples)
+        if OF_SATELLITES.fullmatch(name)
+        else samples
+        for name, samples in columns.items()
+    }
 
 
 def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
