@@ -276,9 +276,9 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
     return f"{header}\n" + "".join(f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows)
 
 
-def test_a_trace_of_pcan_is_refused_with_the_conversion(tmp_path):
+def test_a_trace_of_pcan_is_named_as_a_log_of_a_bus(tmp_path):
     (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"by 'can_logconvert lap.trc lap.asc'"):
+    with pytest.raises(DataError, match=r"is a log of a CAN bus.*declare them"):
         inspect("my_car", [tmp_path / "lap.trc"])
 
 

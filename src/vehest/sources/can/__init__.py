@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import MISSING
 from vehest.sources.base import require_files
 from vehest.sources.can.database import Database, Message, read_database
 from vehest.sources.can.logs import Frames, read_frames
@@ -23,6 +24,8 @@ from vehest.sources.clocks import require_clock
 from vehest.sources.columns import ColumnName
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
+EXTENDED = 1 << 31  # of an identifier's number in a DBC
+GROUP_OF_J1939 = 0x03FFFF00  # bits of an identifier without priority and source address
 
 
 @dataclass(frozen=True)
@@ -157,9 +160,8 @@ class CanSource(SignalSource):
         database, by_channel = self.signals_of_channels()
         bus = self.options.bus
         stamps, values = ({name: array("d") for name in by_channel} for _ in range(2))
-        for frame, samples in decoded(
-            read_frames(file, database.messages), database, by_channel, bus
-        ):
+        frames = read_frames(file, database.messages)
+        for frame, samples in decoded(frames, database, by_channel, bus):
             for name, value in samples.items():
                 stamps[name].append(frame.timestamp)
                 values[name].append(value)
@@ -167,7 +169,9 @@ class CanSource(SignalSource):
         rates = {}
         for name, described in by_channel.items():
             if len(stamps[name]) < 2:
-                raise DataError(never_occurs(file, name, described, len(stamps[name]), bus))
+                others = "" if stamps[name] else other_sources(file, described.message)
+                text = never_occurs(file, name, described, len(stamps[name]), bus)
+                raise DataError(text + others)
             times = np.array(stamps[name])
             location = (
                 f"'{file}': message '{described.message.name}', which carries '{described.signal}',"
@@ -178,7 +182,9 @@ class CanSource(SignalSource):
                 origin, times, np.array(values[name]), described.message.units[described.signal]
             )
             rates[described.message.name] = round(signals[name].rate_hz, 3)
-        return signals, {"dbc": self.dbc.name, "messages": rates}
+        cut_end = f"not read: last line '{frames.cut_line}', which has no end"
+        left_out = {MISSING: {"": [cut_end]}} if frames.cut_line else {}
+        return signals, {"dbc": self.dbc.name, "messages": rates, **left_out}
 
 
 def decoded(
@@ -318,6 +324,25 @@ def never_occurs(
         f"'{file}': signal '{signal.signal}' for channel '{channel}' {often}{on}: message "
         f"'{message.name}' carries it, with the {kind} {message.described.frame_id:#x}; leave the "
         "channel out, or correct dbc, bus or the map of channels"
+    )
+
+
+def other_sources(file: Path, message: Message) -> str:
+    """Further error text where frames of a J1939 message come from other source addresses than the
+    DBC says.
+    """
+    if not message.described.is_extended_frame:
+        return ""
+    arrays = read_frames(file).arrays
+    identifiers = np.unique(arrays["identifier"][arrays["extended"] == 1])
+    group = GROUP_OF_J1939 & message.described.frame_id
+    senders = [int(sender) for sender in identifiers if sender & GROUP_OF_J1939 == group]
+    if not senders:
+        return ""
+    return (
+        f". The log has {', '.join(map(hex, senders[:8]))}, the same parameter group of J1939 from "
+        f"another source address; for it write BO_ {senders[0] | EXTENDED} in the DBC, instead of "
+        f"{message.described.frame_id | EXTENDED}"
     )
 
 
