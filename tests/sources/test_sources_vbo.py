@@ -157,8 +157,10 @@ def test_zeros_of_rows_without_satellites_are_missing_samples_and_no_standstill(
     assert "max_gap" in refusal(lambda: read(tmp_path))
 
 
-def test_satellites_that_are_never_counted_say_nothing(tmp_path):
-    write_rows(tmp_path, lambda lines: [line.replace(b"053 ", b"000 ", 1) for line in lines])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("sats", [b"000", b"nan", b"-01", b"1e30"])
+def test_satellites_that_are_never_counted_say_nothing(tmp_path, sats):
+    write_rows(tmp_path, lambda lines: [line.replace(b"053", sats, 1) for line in lines])
     np.testing.assert_allclose(read(tmp_path)["vx"], drive()["vx"], atol=1e-4)
 
 

@@ -46,6 +46,7 @@ UNITS = {
     "Longacc": "g",
     "Latacc": "g",
 }
+MAX_SATS = 255.0
 SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
 # measured by them; 0 where there is none
 OF_SATELLITES = re.compile(
@@ -239,7 +240,8 @@ def _without_lost_fixes(columns: dict[str, FloatArray]) -> dict[str, FloatArray]
     """With NaN for the zeros that the logger writes where it has no satellites; unchanged where it
     never has any.
     """
-    has_fix = np.nan_to_num(columns.get("sats", np.empty(0))).astype(int) & SATELLITES > 0
+    sats = np.nan_to_num(np.clip(columns.get("sats", np.empty(0)), 0.0, MAX_SATS))
+    has_fix = sats.astype(int) & SATELLITES > 0
     if not has_fix.any():
         return columns
     return {
