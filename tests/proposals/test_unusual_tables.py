@@ -276,9 +276,9 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
     return f"{header}\n" + "".join(f"{0.1 * k:.1f},2,{name},{value}\n" for k, name, value in rows)
 
 
-def test_a_trace_of_pcan_is_refused_with_the_conversion(tmp_path):
+def test_a_trace_of_pcan_is_named_as_a_log_of_a_bus(tmp_path):
     (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"by 'can_logconvert lap.trc lap.asc'"):
+    with pytest.raises(DataError, match=r"is a log of a CAN bus.*declare them"):
         inspect("my_car", [tmp_path / "lap.trc"])
 
 
@@ -828,12 +828,45 @@ def test_a_measurement_of_raw_frames_is_refused_with_the_way_to_decode_them(tmp_
         survey(file)
 
 
-def test_a_magnitude_beside_a_column_of_its_sign_is_left_out(tmp_path):
+def signed_elsewhere(table, name, values):
+    """A table with a column of magnitudes and one of signs, 1 where negative."""
+    return table.assign(
+        **{f"ESP_{name}": np.abs(values), f"ESP_VZ_{name}": (values < 0).astype(int)}
+    )
+
+
+@pytest.mark.parametrize("kind", ["table", "mdf"])
+def test_a_column_of_the_sign_beside_a_magnitude_gives_the_signed_value(tmp_path, kind):
+    table = usual(drive())
+    yaw_rate = table["Gyro"].to_numpy()
+    signed = signed_elsewhere(table.drop(columns="Gyro"), "Gierrate", yaw_rate)
+    file = tmp_path / "lap.csv"
+    if kind == "table":
+        write(file, signed)
+    else:
+        asammdf = pytest.importorskip("asammdf")
+        stamps = signed.iloc[:, 0].to_numpy()
+        units = {"ESP_Gierrate": "deg/s"}
+        signals = [
+            asammdf.Signal(signed[name].to_numpy(), stamps, units.get(name, ""), name)
+            for name in signed.columns[1:]
+        ]
+        file = write_mdf(tmp_path / "lap.mf4", {"ESP": signals})
+    log_draft, recording = read_back(file)
+    entry = log_draft.dataset["channels"]["yaw_rate"]
+    assert (entry["column"], entry["sign_column"]) == ("ESP_Gierrate", "ESP_VZ_Gierrate")
+    assert "'ESP_Gierrate' is negative where 'ESP_VZ_Gierrate' is 1" in log_draft.notes
+    np.testing.assert_allclose(recording["yaw_rate"], np.radians(yaw_rate), atol=1e-5)
+
+
+def test_a_sign_of_other_values_than_0_and_1_is_left_out_with_its_magnitude(tmp_path):
     table = usual(drive())
     steering = 16.0 * np.degrees(drive()["r"])
-    signed = table.assign(LWI_Lenkradwinkel=np.abs(steering), LWI_VZ_Lenkradwinkel=steering < 0.0)
-    signed["LWI_VZ_Lenkradwinkel"] = signed["LWI_VZ_Lenkradwinkel"].astype(int)
+    signed = table.assign(
+        LWI_Lenkradwinkel=np.abs(steering), LWI_VZ_Lenkradwinkel=np.sign(steering)
+    )
     proposals = inspect("my_car", [write(tmp_path / "lap.csv", signed)]).proposals
-    assert "LWI_Lenkradwinkel" not in {channel.column for channel in proposals.channels}
+    columns = {channel.column for channel in proposals.channels}
+    assert not {"LWI_Lenkradwinkel", "LWI_VZ_Lenkradwinkel"} & columns
     (note,) = [note for note in proposals.notes if "'LWI_VZ_Lenkradwinkel' holds its sign" in note]
     assert note.startswith("'LWI_Lenkradwinkel' is left out: it is never negative")

@@ -5,6 +5,7 @@ cannot be used.
 import re
 import struct
 import zlib
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -158,7 +159,7 @@ def blf_with(content, method=0):
         (".blf", lambda _: blf_with(bytes(100 * 2**20), 2), "Could not find next object"),
         (
             ".asc",
-            lambda content: content[: content.rindex(b"Rx") + 12],
+            lambda content: content[: content.rindex(b"Rx") + 12] + b"\n",
             "a frame of message .* holds",
         ),
         (
@@ -203,9 +204,24 @@ def on_screen(text):
     return re.sub(r"\(([\d.]+)\) (\S+) (\w+)#(\w+).*", line, text)
 
 
+def with_dates(text):
+    """What `candump -tA` writes on the screen."""
+
+    def date(match):
+        moment = datetime.fromtimestamp(float(match[1]), UTC)
+        return f"({moment:%Y-%m-%d %H:%M:%S.%f})"
+
+    return re.sub(r"\(([\d.]+)\)", date, on_screen(text))
+
+
 @pytest.mark.parametrize(
     ("suffix", "written_by_another"),
-    [(".asc", since_last_event), (".asc", with_requests), (".log", on_screen)],
+    [
+        (".asc", since_last_event),
+        (".asc", with_requests),
+        (".log", on_screen),
+        (".log", with_dates),
+    ],
 )
 def test_logs_of_other_writers_hold_the_same_drive(tmp_path, suffix, written_by_another):
     written = write_log(drive(3.0), tmp_path, suffix)
@@ -331,3 +347,88 @@ channels: {{vx: {{column: Speed, unit: m/s}}}}
     assert missing == [("drive_run_0", "vx")]
     impossible = [row["recording"] for row in rows if row["check"] == "impossible"]
     assert impossible == ["drive_run_1"]
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".log"])
+@pytest.mark.parametrize("n_bytes", [2, 12, 30])
+def test_a_last_line_that_is_cut_short_is_left_out_and_named(tmp_path, suffix, n_bytes):
+    written = write_log(drive(3.0), tmp_path, suffix)
+    expected = read(tmp_path)
+    lines = [line for line in written.log.read_text().splitlines() if "#" in line or "Rx" in line]
+    text = written.log.read_text()
+    written.log.write_text(text[: text.index(lines[-1]) + len(lines[-1]) - n_bytes])
+    recording = read(tmp_path)
+    assert len(recording) >= len(expected) - 1
+    (left_out,) = recording.provenance[MISSING][""]
+    assert left_out.startswith("not read: last line '")
+
+
+def pcan(text):
+    """A candump log as a trace of PCAN's version 1.1."""
+    rows = []
+    for k, line in enumerate(text.splitlines(), start=1):
+        stamp, _, frame = line.split()[:3]
+        identifier, data = frame.split("#")
+        pairs = re.sub("(..)", r"\1 ", data).strip()
+        milliseconds = 1000.0 * (float(stamp.strip("()")) - 1.7e9)
+        digits = 4 if len(identifier) == 3 else 8
+        rows.append(
+            f"{k:6})  {milliseconds:10.1f}  Rx     {identifier:0>{digits}}  {len(data) // 2}  "
+            f"{pairs}"
+        )
+    return "\n".join([";$FILEVERSION=1.1", ";$STARTTIME=43008.925", ";---+--   ----", *rows, ""])
+
+
+def test_a_trace_of_pcan_holds_the_same_drive(tmp_path):
+    written = write_log(drive(3.0), tmp_path, ".log")
+    expected = read(tmp_path)
+    (tmp_path / "drive.trc").write_text(pcan(written.log.read_text()))
+    recording = read(tmp_path, files="drive.trc", bus=1)
+    assert abs(len(recording) - len(expected)) <= 1
+    for name in FOUR:
+        n = min(len(recording), len(expected)) - 1
+        step = np.abs(np.diff(expected[name])).max()
+        np.testing.assert_allclose(recording[name][:n], expected[name][:n], atol=1.1 * step)
+
+
+MAGNITUDE = """VERSION ""
+
+BO_ 291 ESP_02: 8 Car
+ SG_ ESP_Gierrate : 0|14@1+ (0.01,0) [0|163] "deg/s" Car
+ SG_ ESP_VZ_Gierrate : 14|1@1+ (1,0) [0|1] "" Car
+
+BO_ 292 ESP_03: 8 Car
+ SG_ ESP_VZ_Other : 14|1@1+ (1,0) [0|1] "" Car
+"""
+
+
+def test_a_signal_of_the_same_message_is_the_sign_of_a_magnitude(tmp_path):
+    rate = np.arange(-100, 100)  # 0.01 deg/s
+    frames = [
+        (k / 100, 0, struct.pack("<H6x", abs(raw) | (raw < 0) << 14))
+        for k, raw in enumerate(rate.tolist())
+    ]
+    log(tmp_path, MAGNITUDE, frames)
+    declared = {"column": "ESP_Gierrate", "unit": "deg/s", "sign_column": "ESP_VZ_Gierrate"}
+    recording = read(tmp_path, channels={"yaw_rate": declared})
+    np.testing.assert_allclose(recording["yaw_rate"], np.radians(0.01 * rate), atol=1e-12)
+    for column, message in (
+        ("ESP_VZ_Other", "is in message 'ESP_03', 'ESP_Gierrate' in 'ESP_02'; only a sign in the"),
+        ("ESP_VZ_Gierate", "did you mean 'ESP_VZ_Gierrate'"),
+    ):
+        channels = {"yaw_rate": {**declared, "sign_column": column}}
+        assert message in refusal(lambda channels=channels: read(tmp_path, channels=channels))
+
+
+def test_a_message_of_j1939_from_another_source_address_is_named_with_the_remedy(tmp_path):
+    dbc = J1939.format(maximum="250.996", protocol="")
+    channels = {"vx": {"column": "Speed", "unit": "km/h"}}
+    with can.Logger(tmp_path / "drive.asc") as writer:
+        for k in range(100):
+            identifier = (2566834174 & 0x1FFFFF00) | 0x0B
+            writer(can.Message(k / 100, identifier, True, data=struct.pack("<H6x", k), channel=0))
+    (tmp_path / "car.dbc").write_text(dbc)
+    message = refusal(lambda: read(tmp_path, channels=channels))
+    number = re.search(r"write BO_ (\d+) in the DBC, instead of 2566834174", message)[1]
+    (tmp_path / "car.dbc").write_text(dbc.replace("2566834174", number))
+    assert len(read(tmp_path, channels=channels)) == 100

@@ -140,6 +140,30 @@ def test_missing_samples_end_a_recording_where_max_gap_says_so(tmp_path):
     np.testing.assert_allclose(speed, drive()["vx"][at], atol=1e-4)
 
 
+def test_zeros_of_rows_without_satellites_are_missing_samples_and_no_standstill(tmp_path):
+    def without_fix(lines):
+        for k in [*range(200, 203), *range(400, 500)]:
+            cells = lines[k].split(b" ")
+            cells[0], cells[4] = b"064", b"000.0000"  # a trigger, and no satellite
+            lines[k] = b" ".join(cells)
+        return lines
+
+    write_rows(tmp_path, without_fix)
+    first, second = open_source(dataset(tmp_path, max_gap=0.5)).recordings()
+    assert (len(first), len(second)) == (400, 500)
+    speed = np.concatenate([first["vx"], second["vx"]])
+    at = np.delete(np.arange(1000), np.s_[400:500])
+    np.testing.assert_allclose(speed, drive()["vx"][at], atol=1e-4)
+    assert "max_gap" in refusal(lambda: read(tmp_path))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("sats", [b"000", b"nan", b"-01", b"1e30"])
+def test_satellites_that_are_never_counted_say_nothing(tmp_path, sats):
+    write_rows(tmp_path, lambda lines: [line.replace(b"053", sats, 1) for line in lines])
+    np.testing.assert_allclose(read(tmp_path)["vx"], drive()["vx"], atol=1e-4)
+
+
 def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
     units = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -61,21 +62,36 @@ class Column:
 
 @dataclass(frozen=True)
 class SampledColumn(Column):
-    """Declaration of a column in which some numbers mean that nothing was measured."""
+    """Declaration of a column in which some numbers mean that nothing was measured, or of which
+    another one holds the sign.
+    """
 
     invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
+    sign_column: ColumnName | None = None  # 0 where values are positive, 1 where negative
 
-    def measured(self, values: FloatArray) -> FloatArray:
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of the file that it needs."""
+        return [self.column] if self.sign_column is None else [self.column, self.sign_column]
+
+    def measured(self, columns: Mapping[str, FloatArray]) -> FloatArray:
         """Values in the file's unit, NaN where nothing was measured.
 
         Parameters
         ----------
-        values : FloatArray
-            Samples in the file's unit, shape (T,); those within 1e-6, relatively, of a number of
-            ``invalid`` were not measured.
+        columns : mapping
+            Each of `column_names` -> samples in the file's unit, shape (T,); those within 1e-6,
+            relatively, of a number of ``invalid`` were not measured.
         """
+        values = columns[self.column]
         is_code = [np.isclose(values, code, rtol=1e-6, atol=0.0) for code in self.invalid]
-        return np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
+        values = np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
+        return values if self.sign_column is None else signed(values, columns[self.sign_column])
+
+
+def signed(magnitudes: FloatArray, signs: FloatArray) -> FloatArray:
+    """Magnitudes, negative where another column is 1, NaN where that is neither 0 nor 1."""
+    return magnitudes * np.select([signs == 0.0, signs == 1.0], [1.0, -1.0], np.nan)
 
 
 def measured_columns(
@@ -86,15 +102,24 @@ def measured_columns(
     Parameters
     ----------
     columns : mapping
-        Channel -> its declaration; only those of `SampledColumn` with ``invalid`` numbers count.
+        Channel -> its declaration; only those of `SampledColumn` count.
     values : mapping
         Name of a column -> samples in the file's unit, shape (T,); left unchanged.
     """
     measured = {**values}
     for column in columns.values():
-        if isinstance(column, SampledColumn) and column.column in measured:
-            measured[column.column] = column.measured(measured[column.column])
+        if isinstance(column, SampledColumn) and values.keys() >= {*column.column_names}:
+            measured[column.column] = column.measured(values)
     return measured
+
+
+def names_read(columns: Mapping[str, Column]) -> list[str]:
+    """Columns of a table that channels need, each once."""
+    names = [
+        column.column_names if isinstance(column, SampledColumn) else [column.column]
+        for column in columns.values()
+    ]
+    return list(dict.fromkeys(chain.from_iterable(names)))
 
 
 def columns_from_config(

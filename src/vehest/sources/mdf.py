@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.clocks import clock_fault
@@ -47,13 +49,23 @@ class MdfSource(SignalSource):
         measurement.
         """
         requests = {
-            name: (declared.column, declared.group) for name, declared in self.channels.items()
+            f"{name}.{column}": (column, declared.group)
+            for name, declared in self.channels.items()
+            for column in declared.column_names
         }
-        signals, _, about = read_measurement(file, requests)
-        signals = {
-            name: replace(signal, values=self.channels[name].measured(signal.values))
-            for name, signal in signals.items()
-        }
+        read, _, about = read_measurement(file, requests)
+        signals = {}
+        for name, declared in self.channels.items():
+            parts = {column: read[f"{name}.{column}"] for column in declared.column_names}
+            signal = parts[declared.column]
+            if not all(np.array_equal(part.stamps, signal.stamps) for part in parts.values()):
+                raise DataError(
+                    f"'{file}': signal '{declared.sign_column}', the sign of channel '{name}', is "
+                    f"not in {signal.origin}, as '{declared.column}' is; write the signed value "
+                    "to one signal"
+                )
+            values = {column: part.values for column, part in parts.items()}
+            signals[name] = replace(signal, values=declared.measured(values))
         rates = {
             signal.origin.removeprefix("group "): round(signal.rate_hz, 3)
             for signal in signals.values()

@@ -242,7 +242,8 @@ class SignalSource(FileSource):
                     "set file_units: ignore",
                 )
         stamps, ticks, rate_hz = self._clock(signals, file, run)
-        missing = {
+        left_out = provenance.get(MISSING, {}) if run == [*self._runs_of(file)][-1] else {}
+        missing = left_out | {
             name: lines
             for name, signal in self._spanning(signals).items()
             if (lines := signal.missing(ticks[0], ticks[-1], self._max_gap(name, signal)))
@@ -259,7 +260,7 @@ class SignalSource(FileSource):
             f"'{file}'",
             clock,
             channels,
-            {"file": file.name, **number, **provenance, **({MISSING: missing} if missing else {})},
+            {"file": file.name, **number, **provenance, MISSING: missing},
         )
 
     @abstractmethod

@@ -30,6 +30,7 @@ from vehest.sources.columns import (
     column_from_config,
     columns_from_config,
     measured_columns,
+    names_read,
 )
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import sample_and_hold_from_config
@@ -160,7 +161,7 @@ class TabularSource(FileSource):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
-        selected = list(dict.fromkeys(column.column for column in columns.values()))
+        selected = names_read(columns)
         number = 0
         try:
             layout = self._layout_of(file)
@@ -207,7 +208,10 @@ class TabularSource(FileSource):
     def columns_read(self, names: Sequence[str]) -> list[str]:
         """Columns read of a table with columns of these names: of channels, poses, times, runs."""
         poses = self.pose.columns if self.pose else {}
-        columns = [column.column for column in (*self.columns_of(names).values(), *poses.values())]
+        columns = [
+            *names_read(self.columns_of(names)),
+            *(column.column for column in poses.values()),
+        ]
         updated = self.held and self.held.updated
         others = (self.time and self.time.column, self.options.runs, updated)
         return list(dict.fromkeys([*columns, *(str(name) for name in others if name is not None)]))

@@ -26,7 +26,13 @@ from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, SampledColumn
+from vehest.sources.columns import (
+    ChannelMap,
+    ChannelNames,
+    Positive,
+    SampledColumn,
+    names_read,
+)
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
@@ -40,6 +46,12 @@ UNITS = {
     "Longacc": "g",
     "Latacc": "g",
 }
+MAX_SATS = 255.0
+SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
+# measured by them; 0 where there is none
+OF_SATELLITES = re.compile(
+    r"lat|long|velocity|heading|height|vert-vel|Longacc|Latacc|True_Head|Slip_\w+|L(at|ng)\._Vel\."
+)
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 # slower or straighter, slip angles at two wheels do not reveal where they hold
@@ -103,11 +115,9 @@ class VboSource(FileSource):
         if max_gap is None:
             return super().runs_in(file)
         log = self._log(file)
-        require_columns(
-            file, list(log.columns), [column.column for column in self.columns.values()]
-        )
+        require_columns(file, list(log.columns), names_read(self.columns))
         columns = (
-            column.measured(log.columns[column.column])
+            column.measured(log.columns)
             for name, column in self.columns.items()
             if name not in self.gappy
         )
@@ -127,7 +137,7 @@ class VboSource(FileSource):
         log = self._log(file)
         rows = self._runs_of(file)[run]
         number = {} if run is None else {"run": run}
-        used_columns = [column.column for column in self.columns.values()]
+        used_columns = names_read(self.columns)
         require_columns(file, list(log.columns), used_columns)
         if any(map(SLIP_AT_A_POINT.fullmatch, used_columns)) and SLIP_CHECK not in (
             self.dataset.get("accept") or []
@@ -141,7 +151,7 @@ class VboSource(FileSource):
             require_unit(
                 log.units.get(column.column, ""), column, unit, location, "declare a factor"
             )
-            samples = column.measured(log.columns[column.column][rows])
+            samples = column.measured(log.columns)[rows]
             if self.options.max_gap is not None and name not in self.gappy:
                 samples = bridged(samples, log.seconds[rows], self.options.max_gap)
             channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)
@@ -189,6 +199,7 @@ def read_log(file: Path) -> Log:
         text=text[:last] if cut_off else text,
     )
     seconds = _seconds(columns.pop("time"), file)
+    columns = _without_lost_fixes(columns)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:
         columns = {name: samples[:-1] for name, samples in columns.items()}
@@ -223,6 +234,22 @@ def read_log(file: Path) -> Log:
         offsets,
         provenance,
     )
+
+
+def _without_lost_fixes(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """With NaN for the zeros that the logger writes where it has no satellites; unchanged where it
+    never has any.
+    """
+    sats = np.nan_to_num(np.clip(columns.get("sats", np.empty(0)), 0.0, MAX_SATS))
+    has_fix = sats.astype(int) & SATELLITES > 0
+    if not has_fix.any():
+        return columns
+    return {
+        name: np.where(~has_fix & (samples == 0.0), np.nan, samples)
+        if OF_SATELLITES.fullmatch(name)
+        else samples
+        for name, samples in columns.items()
+    }
 
 
 def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:

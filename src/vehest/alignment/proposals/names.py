@@ -23,7 +23,7 @@ _STRONG = {  # over the name without blanks
         r"flag|counter|zaehler|time|zeit|stamp|safety|^z$|posz$|positionz$|posez$|zpos$|offset$|"
         r"yawa(ng)?acc|^lean|lean(ang|winkel)|^bank|bank(ang|winkel)|bank$|schraegl|"
         r"yawangular|gierbeschl|angularacc|crosstrack|err$|fehler|abweichung|deviation|^ey$|^dlat$|"
-        r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$"
+        r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$|crc|checksum|pruefsumme|bz$|^alive"
     ),
     "yaw_rate": (
         r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"

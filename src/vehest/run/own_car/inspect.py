@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.proposals.assign import MAX_DECADE_ERROR, possible, propose
-from vehest.alignment.proposals.columns import correlation
+from vehest.alignment.proposals.columns import correlation, magnitudes_beside_signs
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.configuration.composition import compose_config
@@ -29,6 +29,7 @@ from vehest.data.recording import Kind
 from vehest.data.splits import check_name
 from vehest.sources.base import source_names
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, typical_step
+from vehest.sources.columns import signed
 from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import STATED_UNITS, between_pauses
 from vehest.sources.unit_spellings import plain_unit
@@ -149,7 +150,7 @@ def inspect(
     if name in source_names():
         raise ConfigurationError(f"'{name}' is a built-in source; use another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        logs = [_at_stated_rate(survey(file)) for file in files]
+        logs = [_with_signs(_at_stated_rate(survey(file))) for file in files]
     longest = _longest(logs)
     others = [log for log in logs if log.file != longest.file]
     differences = _differences(longest)
@@ -265,6 +266,36 @@ def _at_stated_rate(log: Log) -> Log:
     return _with_corrected_clock(log, 10.0**decades, reason) if is_decade else log
 
 
+def _with_signs(log: Log) -> Log:
+    """With signed values in place of magnitudes beside which a column of 0 and 1 holds the sign;
+    without these columns.
+    """
+    columns = log.by_name
+    rows = [(column.name, column.unit, column.values, column.device) for column in log.columns]
+    signed_columns = {}
+    used = set()
+    for name, sign_name in magnitudes_beside_signs(rows).items():
+        magnitude, sign = columns[name], columns[sign_name]
+        is_declarable = "column" in sign.place and (
+            sign.place.get("group") == magnitude.place.get("group")
+        )
+        if (
+            is_declarable
+            and np.array_equal(sign.stamps, magnitude.stamps)
+            and np.isin(sign.values[np.isfinite(sign.values)], (0.0, 1.0)).all()
+        ):
+            used.add(sign_name)
+            signed_columns[name] = replace(
+                magnitude,
+                values=signed(magnitude.values, sign.values),
+                place={**magnitude.place, "sign_column": sign.place["column"]},
+            )
+    remaining = (column for column in log.columns if column.name not in used)
+    return replace(
+        log, columns=tuple(signed_columns.get(column.name, column) for column in remaining)
+    )
+
+
 def _with_corrected_clock(log: Log, ratio: float, reason: str) -> Log:
     """With the unit of time by which the rate is a ratio of that of the guessed one, which is
     asked; the same log where no unit is.
@@ -336,6 +367,11 @@ def _layout(log: Log) -> dict[str, Any]:
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     """Parts of the files that were not read, and gaps that lines bridge."""
+    yield from (
+        f"'{column.name}' is negative where '{column.place['sign_column']}' is 1"
+        for column in longest.columns
+        if "sign_column" in column.place
+    )
     yield from (f"not read: {text}" for text in longest.skipped[:MAX_LISTED])
     if len(longest.skipped) > MAX_LISTED:
         yield f"not read: {len(longest.skipped) - MAX_LISTED} more"

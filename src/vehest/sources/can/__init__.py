@@ -16,11 +16,16 @@ from typing import Annotated, Any
 import numpy as np
 
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import MISSING
 from vehest.sources.base import require_files
 from vehest.sources.can.database import Database, Message, read_database
 from vehest.sources.can.logs import Frames, read_frames
 from vehest.sources.clocks import require_clock
+from vehest.sources.columns import ColumnName
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
+
+EXTENDED = 1 << 31  # of an identifier's number in a DBC
+GROUP_OF_J1939 = 0x03FFFF00  # bits of an identifier without priority and source address
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,7 @@ class CanChannel(SignalChannel):
     """A channel's signal, with raw values that mean that nothing was measured."""
 
     invalid: Annotated[int | tuple[int, ...], "raw values that mean 'not measured'"] = ()
+    sign_column: ColumnName | None = None  # signal of the message, 1 where values are negative
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,26 @@ class ChannelSignal:
         frozenset()
     )  # values that mean that nothing was measured, in the unit of the DBC
     reserved: tuple[float, float] = (math.nan, math.nan)  # range of further ones, likewise
+    sign_signal: str | None = None  # of the same message: 1 where the value is negative
 
-    def is_measured(self, value: float) -> bool:
-        """Whether a value, in the unit of the DBC, is a measurement."""
-        return value not in self.invalid and not self.reserved[0] <= value <= self.reserved[1]
+    @property
+    def signals(self) -> set[str]:
+        """Signals that a frame must carry."""
+        return {self.signal} if self.sign_signal is None else {self.signal, self.sign_signal}
+
+    def value(self, values: Mapping[str, float]) -> float:
+        """The value of a frame's signals, in the unit of the DBC; NaN where it is no measurement.
+
+        Parameters
+        ----------
+        values : mapping
+            Signal -> value in the DBC's unit, `signals` among them.
+        """
+        value = values[self.signal]
+        if value in self.invalid or self.reserved[0] <= value <= self.reserved[1]:
+            return math.nan
+        sign = 0.0 if self.sign_signal is None else values[self.sign_signal]
+        return {0.0: value, 1.0: -value}.get(sign, math.nan)
 
 
 class CanSource(SignalSource):
@@ -107,17 +129,30 @@ class CanSource(SignalSource):
             The DBC is damaged, or lacks a signal.
         """
         require_files([self.dbc], self.name)
-        database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
+        signs = [declared.sign_column for declared in self.channels.values()]
+        columns = [declared.column for declared in self.channels.values()]
+        database = read_database(self.dbc, [*columns, *filter(None, signs)])
         by_channel = {}
         for name, declared in self.channels.items():
             message, signal = database.places[declared.column]
             invalid = (declared.invalid,) if isinstance(declared.invalid, int) else declared.invalid
+            sign_signal = None
+            if declared.sign_column:
+                sign_message, sign_signal = database.places[declared.sign_column]
+                if sign_message is not message:
+                    raise DataError(
+                        f"'{self.dbc}': signal '{sign_signal}', the sign of channel '{name}', is "
+                        f"in message '{sign_message.name}', '{signal}' in '{message.name}'; only "
+                        "a sign in the same message can be declared: decode the log, and write "
+                        "the signed value to one column"
+                    )
             declared_invalid = frozenset(message.physical(signal, raw) for raw in invalid)
             by_channel[name] = ChannelSignal(
                 message,
                 signal,
                 declared_invalid | message.not_measured(signal),
                 message.reserved(signal),
+                sign_signal,
             )
         return database, by_channel
 
@@ -125,9 +160,8 @@ class CanSource(SignalSource):
         database, by_channel = self.signals_of_channels()
         bus = self.options.bus
         stamps, values = ({name: array("d") for name in by_channel} for _ in range(2))
-        for frame, samples in decoded(
-            read_frames(file, database.messages), database, by_channel, bus
-        ):
+        frames = read_frames(file, database.messages)
+        for frame, samples in decoded(frames, database, by_channel, bus):
             for name, value in samples.items():
                 stamps[name].append(frame.timestamp)
                 values[name].append(value)
@@ -135,7 +169,9 @@ class CanSource(SignalSource):
         rates = {}
         for name, described in by_channel.items():
             if len(stamps[name]) < 2:
-                raise DataError(never_occurs(file, name, described, len(stamps[name]), bus))
+                others = "" if stamps[name] else other_sources(file, described.message)
+                text = never_occurs(file, name, described, len(stamps[name]), bus)
+                raise DataError(text + others)
             times = np.array(stamps[name])
             location = (
                 f"'{file}': message '{described.message.name}', which carries '{described.signal}',"
@@ -146,7 +182,9 @@ class CanSource(SignalSource):
                 origin, times, np.array(values[name]), described.message.units[described.signal]
             )
             rates[described.message.name] = round(signals[name].rate_hz, 3)
-        return signals, {"dbc": self.dbc.name, "messages": rates}
+        cut_end = f"not read: last line '{frames.cut_line}', which has no end"
+        left_out = {MISSING: {"": [cut_end]}} if frames.cut_line else {}
+        return signals, {"dbc": self.dbc.name, "messages": rates, **left_out}
 
 
 def decoded(
@@ -243,14 +281,10 @@ def channel_values(
     by_channel : mapping
         Channel -> its signal.
     """
-    measured = {
-        name: values[by_channel[name].signal]
-        for name in channels
-        if by_channel[name].signal in values
-    }
     return {
-        name: value if by_channel[name].is_measured(value) else math.nan
-        for name, value in measured.items()
+        name: by_channel[name].value(values)
+        for name in channels
+        if by_channel[name].signals <= values.keys()
     }
 
 
@@ -290,6 +324,25 @@ def never_occurs(
         f"'{file}': signal '{signal.signal}' for channel '{channel}' {often}{on}: message "
         f"'{message.name}' carries it, with the {kind} {message.described.frame_id:#x}; leave the "
         "channel out, or correct dbc, bus or the map of channels"
+    )
+
+
+def other_sources(file: Path, message: Message) -> str:
+    """Further error text where frames of a J1939 message come from other source addresses than the
+    DBC says.
+    """
+    if not message.described.is_extended_frame:
+        return ""
+    arrays = read_frames(file).arrays
+    identifiers = np.unique(arrays["identifier"][arrays["extended"] == 1])
+    group = GROUP_OF_J1939 & message.described.frame_id
+    senders = [int(sender) for sender in identifiers if sender & GROUP_OF_J1939 == group]
+    if not senders:
+        return ""
+    return (
+        f". The log has {', '.join(map(hex, senders[:8]))}, the same parameter group of J1939 from "
+        f"another source address; for it write BO_ {senders[0] | EXTENDED} in the DBC, instead of "
+        f"{message.described.frame_id | EXTENDED}"
     )
 
 

@@ -1,4 +1,5 @@
-"""Logs of a CAN bus, .asc, .blf and .log of candump, read by python-can in a limited process.
+"""Logs of a CAN bus, .asc, .blf, .trc of PCAN and .log of candump, read by python-can in a limited
+process.
 
 file -> frames as arrays (`vehest.sources.readers.can_logs`) -> `Frames`, iterated over as messages
 """
@@ -15,7 +16,7 @@ from vehest.data.files import regular_file
 from vehest.sources.limited import Arrays, read_limited, require_package
 
 FRAMES_AT_A_TIME = 1 << 14  # as Python's numbers, which take ten times what they take in an array
-SUFFIXES = (".asc", ".blf", ".log")
+SUFFIXES = (".asc", ".blf", ".log", ".trc")
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Frames:
     file: Path
     arrays: Arrays  # as `vehest.sources.readers.can_logs.read_frames` returns them
     buses: list[Any]  # names or numbers
+    cut_line: str = ""  # the last line of a text, which has no end and was left out
 
     def __iter__(self) -> Iterator[Any]:
         """Messages of python-can, made `FRAMES_AT_A_TIME` at a time."""
@@ -82,4 +84,4 @@ def read_frames(file: Path, selected: Collection[tuple[int, bool]] | None = None
     require_package("can", "bus", "reading CAN")
     request = None if selected is None else [list(identifier) for identifier in selected]
     reading = read_limited("vehest.sources.readers.can_logs:read_frames", file, selected=request)
-    return Frames(file, reading.arrays, reading.summary["buses"])
+    return Frames(file, reading.arrays, reading.summary["buses"], reading.summary["cut_line"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Collection, Sequence
+from datetime import datetime
 from io import TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
@@ -14,17 +15,21 @@ import numpy as np
 from can.io.asc import ASCReader
 from can.io.blf import BLFReader
 from can.io.canutils import CanutilsLogReader
+from can.io.trc import TRCReader
 
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
 LATEST = 1e11  # s
+FRAME = re.compile(r"\s*(\(|\d)")  # begins as a line that holds one
+DATE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{6}")
 EVENT = re.compile(r"\s*(\d+\.\d+)(?=\s)")
 REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")  # to send, sent as Tx later
 NAMED = re.compile(r"\s*\d+\.\d+\s+\d+\s+(?![0-9A-Fa-f]+x?\s)(\w+)\s+[RT]x\s")
 ON_SCREEN = re.compile(
-    r"\s*(?P<time>\([\d.]+\))\s+(?P<bus>\S+)\s+([RT]X\s+\S\s*\S\s+)?(?P<identifier>[\dA-F]{3,8})\s+"
+    r"\s*\((?P<time>[\d.: -]+)\)\s+(?P<bus>\S+)\s+([RT]X\s+\S\s*\S\s+)?"
+    r"(?P<identifier>[\dA-F]{3,8})\s+"
     r"\[(?P<length>\d+)\]\s*(?P<data>([\dA-F]{2}(\s|$))*|remote request)"
 )
 
@@ -37,7 +42,7 @@ def read_frames(
     Parameters
     ----------
     file : Path
-        A log whose ending is ``.blf``, ``.asc`` or ``.log``.
+        A log whose ending is ``.blf``, ``.asc``, ``.trc`` or ``.log``.
     selected : collection or None
         Identifier and whether it is extended of each message that is wanted; None for all.
 
@@ -48,7 +53,8 @@ def read_frames(
         [bytes] and ``bus`` (number in ``buses`` of the summary) of each frame, and ``data``, the
         bytes of all, one frame behind the other.
     summary : dict
-        ``buses``, their names or numbers.
+        ``buses``, their names or numbers; ``cut_line``, the last line, which has no end and was
+        left out.
 
     Raises
     ------
@@ -91,12 +97,14 @@ def read_frames(
                 continue
             times.append(frame.timestamp)
             identifiers.append(frame.arbitration_id)
-            buses.append(numbers.setdefault(frame.channel, len(numbers)))
+            bus = frame.channel - 1 if isinstance(reader, TRCReader) else frame.channel
+            buses.append(numbers.setdefault(bus, len(numbers)))
             flags["extended"].append(frame.is_extended_id)
             flags["fd"].append(frame.is_fd)
             flags["fast"].append(frame.bitrate_switch)
             flags["length"].append(len(frame.data))
             data += frame.data
+        cut_line = printable(getattr(reader.file, "cut_line", "").strip()[:60])
     if not count:
         raise DataError(f"'{file}' holds no frame; is it a log of a bus?")
     arrays = {
@@ -107,7 +115,7 @@ def read_frames(
         "identifier": np.array(identifiers),
         "bus": np.array(buses),
         **arrays,
-    }, {"buses": list(numbers)}
+    }, {"buses": list(numbers), "cut_line": cut_line}
 
 
 def _opened(file: Path) -> Any:
@@ -116,6 +124,8 @@ def _opened(file: Path) -> Any:
         return BLFReader(file)
     if file.suffix.lower() == ".asc":
         return ASCReader(_VectorText(file))
+    if file.suffix.lower() == ".trc":
+        return TRCReader(_LogText(file))
     return CanutilsLogReader(_CandumpText(file))
 
 
@@ -125,6 +135,14 @@ class _LogText(TextIOWrapper):
     def __init__(self, file: Path) -> None:
         super().__init__(open(file, "rb"), encoding="utf-8", errors="replace")  # noqa: SIM115
         self.file = file
+        self.cut_line = ""  # the last one, where it has no end and is left out
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = super().__next__()
+        if line.endswith("\n"):
+            return line
+        self.cut_line = line if FRAME.match(line) else ""
+        return ""
 
 
 class _VectorText(_LogText):
@@ -171,4 +189,7 @@ class _CandumpText(_LogText):
             return line
         fd = "#0" if len(frame["length"]) > 1 else ""  # two digits are those of CAN FD
         data = frame["data"].replace(" ", "").replace("remoterequest", "R").strip()
-        return f"{frame['time']} {frame['bus']} {frame['identifier']}#{fd}{data}\n"
+        time = frame["time"]
+        if DATE.fullmatch(time):
+            time = f"{datetime.fromisoformat(f'{time}+00:00').timestamp():.6f}"
+        return f"({time}) {frame['bus']} {frame['identifier']}#{fd}{data}\n"

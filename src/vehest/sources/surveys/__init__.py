@@ -33,7 +33,7 @@ __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 MDF = (".mf4", ".mdf", ".dat")
 BAGS = (".db3", ".mcap", ".zip")
 ARROW = (".feather", ".arrow", ".ipc")
-CAN = (".blf", ".asc")
+CAN = (".blf", ".asc", ".trc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
 MOST_FIELDS = 60  # of a message
@@ -130,12 +130,6 @@ def _survey(path: Path) -> Log:
         raise DataError(
             f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare "
             "them (docs/sources/can.md)"
-        )
-    if ending == ".trc":
-        raise DataError(
-            f"'{path}' is a trace of PCAN; convert it by 'can_logconvert {path.name} "
-            f"{path.stem}.asc' (of python-can) and declare that (docs/sources/can.md), or save its "
-            "decoded signals as CSV or MDF"
         )
     if ending == ".bag":
         raise DataError(
