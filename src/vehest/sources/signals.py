@@ -242,6 +242,7 @@ class SignalSource(FileSource):
                     "set file_units: ignore",
                 )
         stamps, ticks, rate_hz = self._clock(signals, file, run)
+        about = {key: entry for key, entry in provenance.items() if key != MISSING}
         left_out = provenance.get(MISSING, {}) if run == [*self._runs_of(file)][-1] else {}
         missing = left_out | {
             name: lines
@@ -260,7 +261,7 @@ class SignalSource(FileSource):
             f"'{file}'",
             clock,
             channels,
-            {"file": file.name, **number, **provenance, MISSING: missing},
+            {"file": file.name, **number, **about, **({MISSING: missing} if missing else {})},
         )
 
     @abstractmethod

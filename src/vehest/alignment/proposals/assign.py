@@ -154,8 +154,8 @@ def propose(
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     magnitudes = magnitudes_beside_signs(columns)
-    left_out = {*magnitudes, *magnitudes.values()}
-    usable = candidates([column for column in columns if column[0] not in left_out], clock_hz)
+    parts = {*magnitudes, *magnitudes.values()}
+    usable = candidates([column for column in columns if column[0] not in parts], clock_hz)
     wheels, wheel_notes = find_wheels(usable)
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)

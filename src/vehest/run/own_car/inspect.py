@@ -279,9 +279,10 @@ def _with_signs(log: Log) -> Log:
         is_declarable = "column" in sign.place and (
             sign.place.get("group") == magnitude.place.get("group")
         )
+        stamps = [np.empty(0) if each.stamps is None else each.stamps for each in (sign, magnitude)]
         if (
             is_declarable
-            and np.array_equal(sign.stamps, magnitude.stamps)
+            and np.array_equal(stamps[0], stamps[1])
             and np.isin(sign.values[np.isfinite(sign.values)], (0.0, 1.0)).all()
         ):
             used.add(sign_name)
