@@ -27,7 +27,8 @@ _STRONG = {  # over the name without blanks
     ),
     "yaw_rate": (
         r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
-        r"lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
+        r"lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|"
+        r"ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
         r"^rimu$|psistrich|vgier"
     ),
     "ay": (
@@ -48,7 +49,8 @@ _STRONG = {  # over the name without blanks
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": (
         r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|"
-        r"(vitesse|velocidad|velocità)lat|velocityy|(?<!t)yvel|linear_?y$|latspeed|velocityvehicley|speedlat|vely"
+        r"(vitesse|velocidad|velocità)lat|velocityy|(?<!t)yvel|linear_?y$|latspeed|"
+        r"velocityvehicley|speedlat|vely"
     ),
     "sideslip_ref": (
         r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$|"
@@ -63,7 +65,8 @@ _STRONG = {  # over the name without blanks
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": (
-        r"speed|velocity|vitesse|velocidad|velocità|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|"
+        r"speed|velocity|vitesse|velocidad|velocità|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|"
+        r"longvel|vfzg|tacho|velocityx|"
         r"xvel|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|"
         r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder"
     ),
