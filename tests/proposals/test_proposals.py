@@ -159,6 +159,21 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     assert proposals.by_channel["yaw_rate"].sign == -1
 
 
+@pytest.mark.parametrize(
+    ("vertical", "of_ay", "signs"), [(-1.0, 1, [-1, -1]), (1.0, 1, [1, 1]), (-1.0, -1, [1, -1])]
+)
+def test_gravity_in_a_z_axis_that_points_down_proposes_which_way_is_left(
+    tmp_path, vertical, of_ay, signs
+):
+    table = usual(drive()).drop(columns=["Steer", "Beta"])
+    table["AccZ"] = vertical + 0.02 * np.sin(np.arange(len(table)) / 7.0)
+    table["LatAcc"] *= of_ay
+    examined = examine(tmp_path, table)
+    by_channel = examined.proposals.by_channel
+    assert [by_channel[name].sign for name in ("yaw_rate", "ay")] == signs
+    assert "left_right" in [question.key for question in questions_of(examined)]
+
+
 def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
     d = drive()
     wheels = wheels_of(d, "n_{}", 30.0 / np.pi)

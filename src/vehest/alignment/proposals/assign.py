@@ -857,10 +857,34 @@ def _with_left_right(
         proposals = proposals.with_notes(
             f"left and right are proposed as by '{name}', if it is clockwise as that of a compass"
         )
+    elif name := _downward(columns, proposals):
+        is_mirrored = True
+        proposals = proposals.with_notes(
+            f"left and right are proposed as of sensors whose z axis points down: gravity in "
+            f"'{name}' is negative"
+        )
     else:
         signs = [proposal.sign for proposal in proposals.channels if proposal.channel in LATERAL]
         is_mirrored = sum(signs) < 0
     return proposals.mirrored() if is_mirrored else proposals
+
+
+def _downward(columns: Sequence[Candidate], proposals: Proposals) -> str:
+    """Name of an acceleration along an axis that points down; empty where none does.
+
+    At rest an accelerometer shows +g along an axis that points up. Telephones that show -g reverse
+    all three axes, and their ay counts against the yaw rate.
+    """
+    signs = {proposal.channel: proposal.sign for proposal in proposals.channels}
+    if not signs.get("yaw_rate") == signs.get("ay") == signs.get("ax", 1) == 1:
+        return ""
+    for column in columns:
+        if "az" in column.hints and column.measures("ay"):
+            mean = float(column.slow.mean())
+            sizes = [GRAVITY / si_factor(unit, "ay") for unit in column.units("ay")]
+            if any(abs(mean / size + 1.0) < 0.1 for size in sizes):
+                return column.name
+    return ""
 
 
 def _compass(columns: Sequence[Candidate], motion: Motion | None) -> tuple[str, float] | None:
