@@ -1,18 +1,22 @@
 """Checks: each one fires on the fault it is for, and a clean drive gets none of them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from broadband_drive import changed, found_by, warned, without
+from broadband_drive import broadband_drive, changed, found_by, warned, without
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.configuration.composition import compose_config
 from vehest.data.recording import Recording
+from vehest.data.transforms import MountingCorrection
 from vehest.sources.base import open_source
 
 RATE = 100.0
 LENGTH = 6000
+FERRARI = "20140222_01_01_03_250lm"
 
 
 def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
@@ -208,6 +212,27 @@ def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_na
     assert "dropout" not in {
         check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))
     }
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.0, 8.0, -15.0, 30.0])
+def test_an_accelerometer_that_is_turned_about_the_vertical_is_found_with_its_angle(degrees):
+    drive = MountingCorrection(yaw=-np.deg2rad(degrees))(broadband_drive())
+    found = found_by("rotation", drive)
+    assert set(found) == ({"ay"} if abs(degrees) > 4.0 else set())
+    if found:
+        angle = float(re.search(r"yaw: (\S+) rad", found["ay"].message)[1])
+        assert np.rad2deg(angle) == pytest.approx(degrees, abs=1.5)
+        assert not found_by("rotation", MountingCorrection(yaw=angle)(drive))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0])
+def test_a_turned_accelerometer_is_found_on_the_real_ferrari(data_root, degrees):
+    recording = open_source(compose_config("estimate", ["dataset=ferrari_250lm"])["dataset"])
+    drive = MountingCorrection(yaw=-np.deg2rad(degrees))(recording.read(FERRARI))
+    found = found_by("rotation", drive)
+    assert [finding.message.split(" deg")[0][-2:] for finding in found.values()] == (
+        ["11"] if degrees else []
+    )
 
 
 def backwards(recording, *stretches, speed=-2.0):

@@ -60,6 +60,10 @@ STRAIGHT_SECONDS = 3.0
 MAX_STEERING_OFFSETS = {"steer": np.deg2rad(3.0), "handwheel": np.deg2rad(2.5)}
 MAX_SPEED_DIFFERENCE = 0.04  # share of the reference's; speedometers read up to 10 % too much
 MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit may be wrong
+MIN_ROTATION = np.deg2rad(4.0)
+MIN_ROTATION_AGREEMENT = 0.6  # the smaller of its two estimates over the larger one
+MIN_ROTATION_MOTION = 0.4  # m/s², standard deviation of d(vx)/dt and of vx·yaw_rate
+MAX_ROTATION_GAIN_ERROR = 0.35  # logarithm
 DROPOUT_SPEED = 3.0  # m/s
 DROPOUT_SHARE = 0.1  # of the other wheels' median
 DROPOUT_SECONDS = 0.1
@@ -218,7 +222,8 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     kinematics = [
         finding for finding in _kinematics(motion) if finding.level == "note" or not explained
     ]
-    return findings + kinematics + offset_findings(motion) + clocks
+    rotation = [] if findings else list(_rotation(motion))
+    return findings + kinematics + rotation + offset_findings(motion) + clocks
 
 
 def _without_ax_of_speed(recording: Recording) -> Recording:
@@ -263,6 +268,37 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
             "check units, delays and sensor positions"
         )
         yield Finding("warning", "kinematics", "vy_ref", message)
+
+
+def _rotation(motion: Motion) -> Iterator[Finding]:
+    """d(vx)/dt must show in ax alone and vx·yaw_rate in ay alone.
+
+    A unit that is turned by ψ about the vertical, counter-clockwise, reads ax = cos ψ d(vx)/dt +
+    sin ψ vx·yaw_rate and ay = -sin ψ d(vx)/dt + cos ψ vx·yaw_rate; each of the two has its own
+    estimate of ψ.
+    """
+    band = kinematic_band(motion)
+    if band is None or not motion.speed or not {"ax", "ay", "yaw_rate"} <= set(motion.channels):
+        return
+    causes = np.stack([band(motion.derivative(motion.vx)), band(motion.turning)], axis=1)
+    if causes.std(axis=0).min() < MIN_ROTATION_MOTION:
+        return
+    effects = np.stack([band(motion["ax"]), band(motion["ay"])], axis=1)
+    (along, across), (turning_in_ax, turning_in_ay) = np.linalg.lstsq(causes, effects)[0]
+    angles = np.arctan2(turning_in_ax, turning_in_ay), np.arctan2(-across, along)
+    small, large = sorted(angles, key=abs)
+    gains = np.hypot(turning_in_ax, turning_in_ay), np.hypot(across, along)
+    is_rotation = small * large > 0.0 and max(np.abs(np.log(gains))) < MAX_ROTATION_GAIN_ERROR
+    if is_rotation and abs(small) > max(MIN_ROTATION, MIN_ROTATION_AGREEMENT * abs(large)):
+        angle = float(np.mean(angles))
+        yield Finding(
+            "warning",
+            "rotation",
+            "ay",
+            f"the accelerometer is turned by about {np.rad2deg(angle):.2g} deg about the vertical: "
+            "braking and accelerating show in ay, turning shows in ax; the transform "
+            f"mounting_correction removes it (yaw: {angle:.2g} rad)",
+        )
 
 
 def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
