@@ -254,7 +254,8 @@ def test_a_damaged_log_ends_a_replay_in_a_line_and_is_never_overwritten(
         replayed(written, out=written.log)
     assert written.log.read_bytes() == before
     lines = written.log.read_text().splitlines()
-    written.log.write_text("\n".join([*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz")]))
+    damaged = [*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz"), ""]
+    written.log.write_text("\n".join(damaged))
     for speed in ("max", "10"):
         with pytest.raises(DataError, match=r"is damaged .*zz"):
             replayed(written, speed=speed)
