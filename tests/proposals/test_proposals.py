@@ -32,6 +32,9 @@ from vehest.sources.surveys.clocks import find_clock
 from vehest.sources.surveys.tables import unit_in_name
 
 
+EXAMPLE_LOG = Path(__file__).parents[2] / "docs" / "examples" / "lap.csv"
+
+
 def examine(tmp_path, table, **options):
     return inspect("my_car", [write(tmp_path / "lap.csv", table, **options)])
 
@@ -172,6 +175,15 @@ def test_gravity_in_a_z_axis_that_points_down_proposes_which_way_is_left(
     by_channel = examined.proposals.by_channel
     assert [by_channel[name].sign for name in ("yaw_rate", "ay")] == signs
     assert "left_right" in [question.key for question in questions_of(examined)]
+
+
+def test_an_accelerometer_that_is_turned_by_15_degrees_is_remarked(tmp_path):
+    table = pd.read_csv(EXAMPLE_LOG)  # whose AccY counts to the right
+    turn = np.exp(1j * np.deg2rad(15.0))
+    turned = (table["AccX"].to_numpy() + 1j * table["AccY"].to_numpy()) * turn
+    table["AccX"], table["AccY"] = np.real(turned), np.imag(turned)
+    (remark,) = [text for text in drafted(tmp_path, table).remarks if "turned" in text]
+    assert re.search(r"about 1[456] deg about the vertical.*mounting_correction", remark)
 
 
 def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):

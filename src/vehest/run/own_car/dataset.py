@@ -52,7 +52,7 @@ CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "spike")
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "rotation", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
 MIN_GAIN_FACTOR = 1.15
