@@ -147,6 +147,26 @@ def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held
     assert "4.96 s" in finding.message
 
 
+def test_a_channel_of_coarse_steps_is_not_stuck_where_it_goes_on_by_one_of_them():
+    coarse = changed(clean_drive(), steer=lambda steer: 0.02 * np.round(steer / 0.02))
+    held = np.repeat(coarse["steer"][1000:1001], 150)
+    slow = np.concatenate([coarse["steer"][:1000], held, coarse["steer"][1000:-150]])
+    assert "stuck" not in {finding.check for finding in warned(changed(coarse, steer=slow))}
+    jumping = stuck(0.08, 2000, 2250)(coarse["steer"])
+    assert found_by("stuck", changed(coarse, steer=jumping)).keys() == {"steer"}
+
+
+@pytest.mark.parametrize("offset", [-1.7, 0.0, 0.4, 1.0])
+def test_an_accelerometer_that_is_pitched_has_an_offset_of_ax_without_a_reference(offset):
+    drive = changed(broadband_drive(), ax=lambda ax: ax + offset)
+    drive = without(drive, "vx_ref", "vy_ref", "sideslip_ref")
+    found = found_by("offset", drive)
+    assert set(found) == ({"ax"} if abs(offset) > 0.5 else set())
+    if found:
+        value = float(re.search(r"offset of (\S+) m", found["ax"].message)[1])
+        assert value == pytest.approx(offset, abs=0.05)
+
+
 @pytest.mark.parametrize("steer", [0.0, 0.4])
 def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
     assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=steer)) == []

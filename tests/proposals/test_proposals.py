@@ -31,7 +31,6 @@ from vehest.sources.surveys import survey
 from vehest.sources.surveys.clocks import find_clock
 from vehest.sources.surveys.tables import unit_in_name
 
-
 EXAMPLE_LOG = Path(__file__).parents[2] / "docs" / "examples" / "lap.csv"
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from vehest.alignment.bandwidth import low_pass_findings, low_passed, repetition_findings
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
 from vehest.alignment.findings import Finding
-from vehest.alignment.lateral_offset import offset_findings
 from vehest.alignment.motion import WHEELS, Motion, motion_of
+from vehest.alignment.offsets import offset_findings
 from vehest.alignment.signs import (
     KINEMATIC_BAND_HZ,
     MIN_SAMPLES,
@@ -343,6 +343,7 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
         runs = runs[
             (runs[:, 1] - runs[:, 0] >= MIN_STUCK_SAMPLES)
             & ~(rests & (samples[measured[runs[:, 0]]] == 0.0))
+            & ~_goes_on_by_one_step(samples[measured], runs)
         ]
         begins = measured[runs[:, 0]]
         ends = measured[runs[:, 1] - 1] + 1
@@ -362,6 +363,15 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
                 f"s while the car moves{others}; check the sensor, or exclude "
                 f"{'these ranges' if others else 'this range'}",
             )
+
+
+def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolArray:
+    """Which runs of equal values (N, 2) a coarse channel enters and leaves by its smallest step, as
+    a sensor that was stuck does not.
+    """
+    steps = np.abs(np.diff(samples, prepend=samples[0], append=samples[-1]))
+    smallest = steps[steps > 1e-9 * np.ptp(samples)].min(initial=np.inf)
+    return np.asarray(np.maximum(steps[runs[:, 0]], steps[runs[:, 1]]) < 1.5 * smallest)
 
 
 def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:

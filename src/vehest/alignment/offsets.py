@@ -1,8 +1,9 @@
-"""A constant part of ay that motion does not explain."""
+"""Constant parts of ay and ax that motion does not explain."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -42,16 +43,39 @@ def lateral_offset(motion: Motion) -> Measured | None:
     settled = settled_samples(motion)
     if settled is None or not motion.speed or not {"ay", "yaw_rate"} <= set(motion.channels):
         return None
-    left = (motion["ay"] - motion.sliding if motion.velocity else motion["ay"])[settled]
-    turning = motion.turning[settled]
-    number = min(int(len(left) / (BLOCK_SECONDS * motion.rate_hz)), MAX_GROUPS)
+    left = motion["ay"] - motion.sliding if motion.velocity else motion["ay"]
+    return _offset(left[settled], motion.turning[settled], motion.rate_hz)
+
+
+def longitudinal_offset(motion: Motion) -> Measured | None:
+    """The constant c of ax = c + g·(d(vx)/dt - vy·yaw_rate) [m/s²], as `lateral_offset` of ay.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a speed and ax.
+
+    Returns
+    -------
+    Measured or None
+        None where a channel is missing or the drive is too short.
+    """
+    settled = settled_samples(motion)
+    if settled is None or not motion.speed or "ax" not in motion:
+        return None
+    return _offset(motion["ax"][settled], motion.forward[settled], motion.rate_hz)
+
+
+def _offset(effect: FloatArray, cause: FloatArray, rate_hz: float) -> Measured | None:
+    """Intercept of an effect over its cause, (S,) each, with its interval from blocks of time."""
+    number = min(int(len(effect) / (BLOCK_SECONDS * rate_hz)), MAX_GROUPS)
     if number < MIN_BLOCKS:
         return None
-    starts = np.linspace(0, len(left), number + 1).astype(int)[:-1]
+    starts = np.linspace(0, len(effect), number + 1).astype(int)[:-1]
     sums = np.stack(
         [
             np.add.reduceat(values, starts)
-            for values in (np.ones(len(left)), turning, left, turning * turning, turning * left)
+            for values in (np.ones(len(effect)), cause, effect, cause * cause, cause * effect)
         ]
     )
     (offset,) = jackknife(sums.T, _intercept)
@@ -68,7 +92,8 @@ def _intercept(sums: FloatArray) -> FloatArray:
 
 
 def offset_findings(motion: Motion) -> list[Finding]:
-    """A note of an offset beyond a level mounting, a warning of one beyond any road.
+    """A note of an offset of ay beyond a level mounting, a warning of one of ay or ax beyond any
+    road.
 
     Parameters
     ----------
@@ -78,18 +103,27 @@ def offset_findings(motion: Motion) -> list[Finding]:
     Returns
     -------
     list of Finding
-        At most one. An offset of ay cannot be told from an inclined sensor or road, nor, at about
-        one speed, from an offset of the yaw rate; the message states both.
+        At most one of each. Neither can be told from an inclined sensor or road, nor that of ay,
+        at about one speed, from an offset of the yaw rate; the message states the causes.
     """
+    return [*_lateral_findings(motion), *_longitudinal_findings(motion)]
+
+
+def _longitudinal_findings(motion: Motion) -> Iterator[Finding]:
+    offset = longitudinal_offset(motion)
+    if offset is not None and abs(offset.value) - offset.half_width > MAX_NOTED_OFFSET:
+        yield Finding("warning", "offset", "ax", _described(offset, f"d({motion.speed})/dt"))
+
+
+def _lateral_findings(motion: Motion) -> Iterator[Finding]:
     offset = lateral_offset(motion)
     if (
         offset is None
         or abs(offset.value) < MIN_NOTED_OFFSET
         or abs(offset.value) < offset.half_width
     ):
-        return []
+        return
     level: Level = "warning" if abs(offset.value) > MAX_NOTED_OFFSET else "note"
-    degrees = np.degrees(np.arcsin(min(abs(offset.value) / GRAVITY, 1.0)))
     turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
     gyro = (
         f", or a yaw_rate offset of {turning:.3f} rad/s" if abs(turning) < MAX_GYRO_OFFSET else ""
@@ -97,9 +131,13 @@ def offset_findings(motion: Motion) -> list[Finding]:
     expected = f"{motion.speed}·yaw_rate" + (
         f" + d({motion.velocity})/dt" if motion.velocity else ""
     )
-    message = (
+    yield Finding(level, "offset", "ay", _described(offset, expected, gyro))
+
+
+def _described(offset: Measured, expected: str, another_cause: str = "") -> str:
+    degrees = np.degrees(np.arcsin(min(abs(offset.value) / GRAVITY, 1.0)))
+    return (
         f"constant offset of {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) "
-        f"relative to {expected}: a sensor or road inclined by {degrees:.1f} deg{gyro}; "
+        f"relative to {expected}: a sensor or road inclined by {degrees:.1f} deg{another_cause}; "
         "the transform offset_correction removes it"
     )
-    return [Finding(level, "offset", "ay", message)]
