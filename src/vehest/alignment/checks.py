@@ -369,8 +369,8 @@ def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolAr
     """Which runs of equal values (N, 2) a coarse channel enters and leaves by its smallest step, as
     a sensor that was stuck does not.
     """
-    steps = np.abs(np.diff(samples, prepend=samples[0], append=samples[-1]))
-    smallest = steps[steps > 1e-9 * np.ptp(samples)].min(initial=np.inf)
+    steps = np.concatenate([[0.0], np.abs(np.diff(samples)), [0.0]])
+    smallest = steps[steps > 1e-9 * steps.max()].min(initial=np.inf)
     return np.asarray(np.maximum(steps[runs[:, 0]], steps[runs[:, 1]]) < 1.5 * smallest)
 
 
