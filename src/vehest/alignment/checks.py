@@ -44,6 +44,7 @@ AX_OF_SPEED = "acceleration_from_speed"  # the transform
 MAX_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
 MIN_STUCK_SAMPLES = 3
+MIN_COARSE_LEVELS = 10
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
 USUAL_QUANTILES = (0.005, 0.995)  # of a channel's samples
@@ -367,8 +368,10 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolArray:
     """Which runs of equal values (N, 2) a coarse channel enters and leaves by its smallest step, as
-    a sensor that was stuck does not.
+    a sensor that was stuck does not; none where it takes few values, as a command does.
     """
+    if len(np.unique(samples)) < MIN_COARSE_LEVELS:
+        return np.zeros(len(runs), bool)
     steps = np.concatenate([[0.0], np.abs(np.diff(samples)), [0.0]])
     smallest = steps[steps > 1e-9 * steps.max()].min(initial=np.inf)
     return np.asarray(np.maximum(steps[runs[:, 0]], steps[runs[:, 1]]) < 1.5 * smallest)
