@@ -148,7 +148,7 @@ def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held
 
 
 def test_a_channel_of_coarse_steps_is_not_stuck_where_it_goes_on_by_one_of_them():
-    coarse = changed(clean_drive(), steer=lambda steer: 0.02 * np.round(steer / 0.02))
+    coarse = changed(clean_drive(), steer=lambda steer: 0.005 * np.round(steer / 0.005))
     held = np.repeat(coarse["steer"][1000:1001], 150)
     slow = np.concatenate([coarse["steer"][:1000], held, coarse["steer"][1000:-150]])
     assert "stuck" not in {finding.check for finding in warned(changed(coarse, steer=slow))}
