@@ -599,6 +599,20 @@ def test_validation_from_scratch_is_compared_with_the_worst_pre_trained_seed():
     np.testing.assert_allclose(values[0], 2.0 + np.array([6.0 - 4.0, 6.0 - 8.0]) / 3.0)
 
 
+def test_report_counts_the_seeds_of_a_candidate_beside_the_main_part(part, tmp_path, monkeypatch):
+    undrawn(monkeypatch)
+    parts = {
+        "real": only(part, "NNTF_UH"),
+        "scratch": only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}),
+    }
+    not_trained = {"scratch": ["learned_ukf-nntf_uh-seed2"]}
+    titles = dict.fromkeys(parts, "T")
+    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, not_trained=not_trained)
+    write_document(documents(artefacts)["report"], tmp_path, page=False)
+    text = " ".join((tmp_path / "report.md").read_text().split())
+    assert "where fewer than planned: NNTF_UH from scratch 2 of 3." in text
+
+
 def test_report_is_drawn_with_a_single_candidate(part, tmp_path, monkeypatch):
     undrawn(monkeypatch)
     not_trained = {

@@ -161,7 +161,7 @@ def _values(
             reference: {test: _ratio(blocks, reference, test) for test in SETS}
             for reference in COMPARED_FIRST
         },
-        "incomplete": _incomplete(artefacts, trained, seeds),
+        "incomplete": _incomplete(artefacts, trained),
     }
 
 
@@ -178,14 +178,15 @@ def _ratio(blocks: Mapping[Key, BlockErrors], reference: str, test: str) -> str:
 
 
 def _incomplete(
-    artefacts: StudyArtefacts, trained: Sequence[TrainingRow], seeds: Mapping[str, int]
+    artefacts: StudyArtefacts, trained: Sequence[TrainingRow]
 ) -> list[dict[str, object]]:
     """What the template says of trainings that are planned and not done: one entry, or none."""
     number = sum(len(names) for names in artefacts.not_trained.values())
     if not number:
         return []
+    missing = block_errors.seeds_not_trained(artefacts.not_trained)
     fewer = [
-        f"{row.candidate} {seeds.get(row.candidate, 0)} of {row.seeds_planned}"
+        f"{row.candidate} {row.seeds_planned - missing[row.candidate]} of {row.seeds_planned}"
         for row in trained
         if row.seeds_planned and row.training != "not trained"
     ]
