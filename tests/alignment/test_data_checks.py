@@ -1,6 +1,7 @@
 """Checks: each one fires on the fault it is for, and a clean drive gets none of them."""
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -243,6 +244,13 @@ def test_an_accelerometer_that_is_turned_about_the_vertical_is_found_with_its_an
         angle = float(re.search(r"yaw: (\S+) rad", found["ay"].message)[1])
         assert np.rad2deg(angle) == pytest.approx(degrees, abs=1.5)
         assert not found_by("rotation", MountingCorrection(yaw=angle)(drive))
+
+
+def test_a_dead_accelerometer_is_not_turned():
+    dead = changed(broadband_drive(), ax=np.zeros_like, ay=np.zeros_like)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not found_by("rotation", dead)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0])

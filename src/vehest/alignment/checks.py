@@ -64,7 +64,7 @@ MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit 
 MIN_ROTATION = np.deg2rad(4.0)
 MIN_ROTATION_AGREEMENT = 0.6  # the smaller of its two estimates over the larger one
 MIN_ROTATION_MOTION = 0.4  # m/s², standard deviation of d(vx)/dt and of vx·yaw_rate
-MAX_ROTATION_GAIN_ERROR = 0.35  # logarithm
+MAX_ROTATION_GAIN_ERROR = 0.35  # of 1
 DROPOUT_SPEED = 3.0  # m/s
 DROPOUT_SHARE = 0.1  # of the other wheels' median
 DROPOUT_SECONDS = 0.1
@@ -289,7 +289,9 @@ def _rotation(motion: Motion) -> Iterator[Finding]:
     angles = np.arctan2(turning_in_ax, turning_in_ay), np.arctan2(-across, along)
     small, large = sorted(angles, key=abs)
     gains = np.hypot(turning_in_ax, turning_in_ay), np.hypot(across, along)
-    is_rotation = small * large > 0.0 and max(np.abs(np.log(gains))) < MAX_ROTATION_GAIN_ERROR
+    is_rotation = (
+        small * large > 0.0 and max(np.abs(np.subtract(gains, 1.0))) < MAX_ROTATION_GAIN_ERROR
+    )
     if is_rotation and abs(small) > max(MIN_ROTATION, MIN_ROTATION_AGREEMENT * abs(large)):
         angle = float(np.mean(angles))
         yield Finding(
