@@ -859,6 +859,17 @@ def test_a_column_of_the_sign_beside_a_magnitude_gives_the_signed_value(tmp_path
     np.testing.assert_allclose(recording["yaw_rate"], np.radians(yaw_rate), atol=1e-5)
 
 
+def test_a_declared_sign_of_another_value_is_named_with_its_file_and_remedy(tmp_path):
+    table = usual(drive())
+    signed = signed_elsewhere(table.drop(columns="Gyro"), "Gierrate", table["Gyro"].to_numpy())
+    log_draft, _ = read_back(write(tmp_path / "lap.csv", signed))
+    signed["ESP_VZ_Gierrate"] *= -1
+    file = write(tmp_path / "lap.csv", signed)
+    message = rf"'{file}': column 'ESP_VZ_Gierrate'.*holds -1; .*signed value to one column"
+    with pytest.raises(DataError, match=message):
+        open_source(log_draft.dataset).read("lap")
+
+
 def test_a_sign_of_other_values_than_0_and_1_is_left_out_with_its_magnitude(tmp_path):
     table = usual(drive())
     steering = 16.0 * np.degrees(drive()["r"])

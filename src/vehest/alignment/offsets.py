@@ -84,10 +84,10 @@ def _offset(effect: FloatArray, cause: FloatArray, rate_hz: float) -> Measured |
 
 def _intercept(sums: FloatArray) -> FloatArray:
     """Intercept of a straight line from sums of 1, x, y, x² and xy; NaN where x does not vary."""
-    number, turning, left, squared, product = sums.tolist()
-    determinant = number * squared - turning * turning
+    number, cause, effect, squared, product = sums.tolist()
+    determinant = number * squared - cause * cause
     return np.array(
-        [(left * squared - turning * product) / determinant if determinant > 0.0 else math.nan]
+        [(effect * squared - cause * product) / determinant if determinant > 0.0 else math.nan]
     )
 
 

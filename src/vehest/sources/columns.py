@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -74,33 +75,52 @@ class SampledColumn(Column):
         """The columns of the file that it needs."""
         return [self.column] if self.sign_column is None else [self.column, self.sign_column]
 
-    def measured(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+    def measured(self, file: Path, columns: Mapping[str, FloatArray]) -> FloatArray:
         """Values in the file's unit, NaN where nothing was measured.
 
         Parameters
         ----------
+        file : Path
+            For errors.
         columns : mapping
             Each of `column_names` -> samples in the file's unit, shape (T,); those within 1e-6,
             relatively, of a number of ``invalid`` were not measured.
+
+        Raises
+        ------
+        DataError
+            The column of the sign has a value besides 0, 1 and NaN.
         """
         values = columns[self.column]
         is_code = [np.isclose(values, code, rtol=1e-6, atol=0.0) for code in self.invalid]
         values = np.where(np.any(is_code, axis=0), np.nan, values) if is_code else values
-        return values if self.sign_column is None else signed(values, columns[self.sign_column])
+        if self.sign_column is None:
+            return values
+        signs = columns[self.sign_column]
+        others = signs[~np.isin(signs, (0.0, 1.0)) & ~np.isnan(signs)]
+        if len(others):
+            raise DataError(
+                f"'{file}': column '{self.sign_column}', the sign of '{self.column}', holds "
+                f"{others[0]:g}; 0 (positive) and 1 (negative) can be read: write the signed value "
+                "to one column"
+            )
+        return signed(values, signs)
 
 
 def signed(magnitudes: FloatArray, signs: FloatArray) -> FloatArray:
-    """Magnitudes, negative where another column is 1, NaN where that is neither 0 nor 1."""
-    return magnitudes * np.select([signs == 0.0, signs == 1.0], [1.0, -1.0], np.nan)
+    """Magnitudes (T,), negative where their sign (T,) is 1, NaN where that is missing."""
+    return magnitudes * (1.0 - 2.0 * signs)
 
 
 def measured_columns(
-    columns: Mapping[str, Column], values: Mapping[str, FloatArray]
+    file: Path, columns: Mapping[str, Column], values: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
     """Columns of a table, NaN where a channel's declaration says that nothing was measured.
 
     Parameters
     ----------
+    file : Path
+        For errors.
     columns : mapping
         Channel -> its declaration; only those of `SampledColumn` count.
     values : mapping
@@ -109,7 +129,7 @@ def measured_columns(
     measured = {**values}
     for column in columns.values():
         if isinstance(column, SampledColumn) and values.keys() >= {*column.column_names}:
-            measured[column.column] = column.measured(values)
+            measured[column.column] = column.measured(file, values)
     return measured
 
 

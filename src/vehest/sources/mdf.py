@@ -65,7 +65,7 @@ class MdfSource(SignalSource):
                     "to one signal"
                 )
             values = {column: part.values for column, part in parts.items()}
-            signals[name] = replace(signal, values=declared.measured(values))
+            signals[name] = replace(signal, values=declared.measured(file, values))
         rates = {
             signal.origin.removeprefix("group "): round(signal.rate_hz, 3)
             for signal in signals.values()

@@ -167,7 +167,7 @@ class TabularSource(FileSource):
             layout = self._layout_of(file)
             for values, clock, part in even_parts(file, time, selected, layout):
                 number, _ = part
-                measured = measured_columns(columns, values)
+                measured = measured_columns(file, columns, values)
                 yield self._prepared(self._recording_of(file, None, columns, measured, clock, part))
         except DataError:
             self.read_file(file)  # whose errors are of all its rows
@@ -232,7 +232,7 @@ class TabularSource(FileSource):
         if self.time is not None:
             table = self.time.in_order(table)
         columns = self.columns_of(list(table))
-        values = measured_columns(columns, table)
+        values = measured_columns(Path(name), columns, table)
         return self._prepared(self._recording_of(Path(name), None, columns, values))
 
     def columns_of(self, names: Sequence[str]) -> Mapping[str, Column]:
@@ -260,7 +260,7 @@ class TabularSource(FileSource):
         values = read_columns(file, names, self._layout_of(file))
         if time is not None and time.column in values:
             values = time.in_order(values)
-        values = measured_columns(self.columns or {}, values)
+        values = measured_columns(file, self.columns or {}, values)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values

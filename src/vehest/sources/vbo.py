@@ -117,7 +117,7 @@ class VboSource(FileSource):
         log = self._log(file)
         require_columns(file, list(log.columns), names_read(self.columns))
         columns = (
-            column.measured(log.columns)
+            column.measured(file, log.columns)
             for name, column in self.columns.items()
             if name not in self.gappy
         )
@@ -151,7 +151,7 @@ class VboSource(FileSource):
             require_unit(
                 log.units.get(column.column, ""), column, unit, location, "declare a factor"
             )
-            samples = column.measured(log.columns)[rows]
+            samples = column.measured(file, log.columns)[rows]
             if self.options.max_gap is not None and name not in self.gappy:
                 samples = bridged(samples, log.seconds[rows], self.options.max_gap)
             channels[name] = clock.align(column.to_si(samples, unit), gappy=name in self.gappy)

@@ -184,9 +184,9 @@ def _incomplete(
     number = sum(len(names) for names in artefacts.not_trained.values())
     if not number:
         return []
-    missing = block_errors.seeds_not_trained(artefacts.not_trained)
+    n_missing = block_errors.seeds_not_trained(artefacts.not_trained)
     fewer = [
-        f"{row.candidate} {row.seeds_planned - missing[row.candidate]} of {row.seeds_planned}"
+        f"{row.candidate} {row.seeds_planned - n_missing[row.candidate]} of {row.seeds_planned}"
         for row in trained
         if row.seeds_planned and row.training != "not trained"
     ]

@@ -154,8 +154,9 @@ def propose(
     """
     clock_hz = rate_hz or NOMINAL_RATE_HZ
     magnitudes = magnitudes_beside_signs(columns)
-    parts = {*magnitudes, *magnitudes.values()}
-    usable = candidates([column for column in columns if column[0] not in parts], clock_hz)
+    magnitudes_and_signs = {*magnitudes, *magnitudes.values()}
+    signed_columns = [column for column in columns if column[0] not in magnitudes_and_signs]
+    usable = candidates(signed_columns, clock_hz)
     wheels, wheel_notes = find_wheels(usable)
     usable = [column for column in usable if not column.is_wheel]
     usable += speed_of_wheels(usable, wheels, clock_hz)
@@ -839,7 +840,7 @@ def _with_left_right(
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
     """With signs by the first clue that decides, else by a pose, else by a heading that may be
-    a compass's, else as most columns count.
+    a compass's, else by gravity along a z axis that points down, else as most columns count.
     """
     for text, agreement in clues:
         if abs(agreement) > MIN_SIDE_CORRELATION:
@@ -876,7 +877,7 @@ def _downward(columns: Sequence[Candidate], proposals: Proposals) -> str:
     all three axes, and their ay counts against the yaw rate.
     """
     signs = {proposal.channel: proposal.sign for proposal in proposals.channels}
-    if not signs.get("yaw_rate") == signs.get("ay") == signs.get("ax", 1) == 1:
+    if (signs.get("yaw_rate"), signs.get("ay"), signs.get("ax", 1)) != (1, 1, 1):
         return ""
     for column in columns:
         if "az" in column.hints and column.measures("ay"):

@@ -93,17 +93,20 @@ class Turning:
         reverses: nothing but its sign says which way is ahead.
         """
         speed = self.columns["vx"].slow
-        is_slow = largest(speed) * si_factor(self.units["vx"], "vx") < MAX_REVERSE_SPEED
-        return is_slow and float(np.median(speed)) < 0.0 and not _is_forward(speed)
+        return self._is_slow and float(np.median(speed)) < 0.0 and not _is_forward(speed)
 
     @property
     def may_be_unsigned(self) -> bool:
         """Whether a speed of one sign, no faster than a car reverses, and ay against vx·yaw_rate
         are as those of a car that reverses with a speed without sign.
         """
-        speed = self.columns["vx"].slow
-        is_slow = largest(speed) * si_factor(self.units["vx"], "vx") < MAX_REVERSE_SPEED
-        return is_slow and self.correlation < 0.0 and _is_forward(speed)
+        return self._is_slow and self.correlation < 0.0 and _is_forward(self.columns["vx"].slow)
+
+    @property
+    def _is_slow(self) -> bool:
+        """Whether the speed, either way, is never above that of a car that reverses."""
+        largest_speed = largest(self.columns["vx"].slow) * si_factor(self.units["vx"], "vx")
+        return largest_speed < MAX_REVERSE_SPEED
 
     @property
     def signs(self) -> dict[str, int]:
