@@ -258,7 +258,9 @@ def rational_model(estimator):
         motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
         tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
         spread = (
-            torch.as_tensor(estimator.model().start_tyres) if diverged else state.covariance[4:, 4:]
+            torch.as_tensor(estimator.model().start_tyre_covariance)
+            if diverged
+            else state.covariance[4:, 4:]
         )
         return Gaussian(
             torch.cat([motion, tyres]),

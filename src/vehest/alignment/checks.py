@@ -26,8 +26,8 @@ from vehest.alignment.signs import (
     MIN_SLIDING,
     kinematic_band,
     relations_of,
+    reversed_channels,
     sign_findings,
-    turned_channels,
     wrong_unit,
 )
 from vehest.alignment.standstill import BoolArray, standstill
@@ -198,7 +198,7 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     if not motion.moving.any():
         return []
     relations = relations_of(motion)
-    turned = turned_channels(relations, motion)
+    turned = reversed_channels(relations, motion)
     findings = sign_findings(relations, motion, turned)
     if turned:
         motion = motion.corrected(dict.fromkeys(turned[0], -1.0))

@@ -17,8 +17,8 @@ MIN_NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
 # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
 MAX_NOTED_OFFSET = 0.5
 MAX_GYRO_OFFSET = 0.05  # rad/s
-BLOCK_SECONDS = 2.0
-MIN_BLOCKS = 6
+BLOCK_SECONDS = 2.0  # shortest block of time
+MIN_BLOCKS = 6  # fewer give no interval, and no offset
 
 
 def lateral_offset(motion: Motion) -> Measured | None:

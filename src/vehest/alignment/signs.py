@@ -38,7 +38,8 @@ MAX_REVERSED_CHANNELS = 4  # channels at a time
 KILOMETRES_AN_HOUR = 3.6
 DEGREES_PER_RADIAN = 180.0 / np.pi
 SCALE_TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
-LONGITUDINAL_TOLERANCE = 3.0  # of ax, which pitch, grade and slip change; its wrong factor is 9.8
+# of the scale of ax, which pitch, grade and slip change; ax in g is 9.8 times off
+LONGITUDINAL_TOLERANCE = 3.0
 EXACTNESS = 1.25  # within which a wrong factor must explain a scale
 ALTERNATIVE_UNITS = {
     **dict.fromkeys(("vx", "vx_ref", "vy_ref"), (KILOMETRES_AN_HOUR, "km/h", "m/s")),
@@ -316,13 +317,13 @@ def settled_samples(motion: Motion) -> BoolArray | None:
 # --- signs ----------------------------------------------------------------------------------------
 
 
-def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple[str, ...]]:
+def reversed_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple[str, ...]]:
     """Sets of channels whose reversal would make all relations agree, the smallest first; none if
     all agree or nothing explains it.
 
     The lateral velocity and the sideslip angle come from one sensor: reversed together they count
-    once. A forward speed is only suspected where it is negative, which the check ``reverse`` speaks
-    of.
+    once. A forward speed is a suspect only where it is negative, since the check ``reverse`` warns
+    of that.
 
     Parameters
     ----------
@@ -361,7 +362,7 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
 def sign_findings(
     relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]
 ) -> list[Finding]:
-    """Contradictions in sign, with `turned_channels`, and the channel that points the other way
+    """Contradictions in sign, with `reversed_channels`, and the channel that points the other way
     where steering or heading decides.
 
     Parameters
@@ -371,7 +372,7 @@ def sign_findings(
     motion : Motion
         For its speed.
     explanations : sequence of tuple of str
-        As `turned_channels` returns them.
+        As `reversed_channels` returns them.
 
     Returns
     -------

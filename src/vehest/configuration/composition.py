@@ -429,12 +429,12 @@ def check_jobs(number: int, subject: str) -> None:
 
 
 def limits_of(overrides: Sequence[str]) -> Limits:
-    """The limits of conf/common.yaml, changed by overrides.
+    """Limits of the size of inputs: those of conf/common.yaml, changed by overrides.
 
     Parameters
     ----------
     overrides : sequence of str
-        Those with another key than ``limits`` do not count.
+        Only those of ``limits`` count.
     """
     overrides_of_limits = list(
         dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits")

@@ -125,7 +125,7 @@ class AxleTyres(Group):
 
     @property
     def has_values(self) -> bool:
-        """Whether the tyres are given, so that none is identified."""
+        """Whether the tyres of both axles are given, so that the fit identifies neither."""
         return self.friction_front is not None
 
 

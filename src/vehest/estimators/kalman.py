@@ -67,7 +67,7 @@ class SensorNoise(Group):
 class SensorOffsets(Group):
     """Offsets that are states, first-order Gauss-Markov processes.
 
-    An error that is constant within a manoeuvre is in the covariance.
+    As a state, an error that is constant within a manoeuvre adds to the covariance of the filter.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
     """

@@ -83,7 +83,7 @@ class Ksnn(WindowedEstimator):
 
     @property
     def variant(self) -> str:
-        """Name of the structure as in Table III."""
+        """Structure as a name: kind, biases, P and Q of Table III, and any ``kinematic_gain``."""
         return (
             f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}"
             + (f"_q{self.n_hidden}" if self.n_hidden else "")

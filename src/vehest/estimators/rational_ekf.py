@@ -248,7 +248,7 @@ class RationalTrack(SideslipFilter):
 
         Straight ahead, or an initial state; tyre parameters as fitted.
         """
-        tyres = self.model().start_tyres
+        tyres = self.model().start_tyre_covariance
         deviation = np.array([*ROLLING, *np.zeros(len(tyres))])
         first = self.first_motion(sample, deviation, initial_state)
         first.covariance[4:, 4:] = tyres

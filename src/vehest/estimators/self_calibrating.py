@@ -177,7 +177,7 @@ class SelfCalibrating(SelfCalibratingSettings):
         mean, deviation = self.prior
         mean[kernel.V] = initial_state.get("vy", 0.0)
         mean[kernel.U] = sample[1]
-        lags = np.zeros(kernel.LAGS)
+        lags = np.zeros(kernel.LAGGED)
         first = self.with_ax(sample[None])[0]
         lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = (
             *first[[0, 2, 3]],

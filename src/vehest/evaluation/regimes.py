@@ -32,7 +32,8 @@ Mask = NDArray[np.bool_]
 
 STRAIGHT_YAW_RATE = 0.05  # rad/s
 AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s²
-TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}  # rad/s², m/s³
+# rates of change from which a sample is transient [rad/s², m/s³]
+TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}
 SLOPE_SECONDS = 0.5
 MIN_REGIME_SECONDS = 2.0  # of samples in a regime, below which it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")

@@ -129,7 +129,21 @@ def readme(
     has_trust: bool,
     elsewhere: bool,
 ) -> str:
-    """README of an export: how it is called, units, licences."""
+    """README of an export: how it is called, units, and the notes of the method (licence).
+
+    Parameters
+    ----------
+    stepper : GuardedStepper
+        Of the exported estimator.
+    precision : str
+        ``double`` or ``float``.
+    drive : Recording or None
+        Recording of the test vectors; None: they are a simulated drive with every fault.
+    has_trust : bool
+        Whether the model was calibrated, so that it has bands and health.
+    elsewhere : bool
+        Whether the car or its tyres are others than those that it was calibrated on.
+    """
     context = context_of(stepper, precision, stepper.estimator.full_title)
     reasons = {
         kind: text

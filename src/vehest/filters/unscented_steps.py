@@ -235,6 +235,8 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
         X̄, (2n + 1, n, B).
     mean_bar, covariance_bar : array
         x̄ (n, B) and P̄ (n, n, B), to which is added.
+    rules, first, end
+        See the module.
     """
     n = mean.shape[0]
     (rule, lower, _, _) = rules

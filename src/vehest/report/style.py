@@ -27,8 +27,8 @@ LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
 
-_DARK_PAPER = 0x1A
-_DARK_INK = 0xE6  # as in templates/page.css
+_DARK_PAPER = 0x1A  # grey of the page in its dark scheme, as in templates/page.css
+_DARK_INK = 0xE6  # grey of the text there
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 

@@ -51,7 +51,8 @@ MIN_LOG_RATE_HZ = 5.0  # of a log that is brought to a faster model; a slower on
 MAX_WHEELBASE_OVER_RADIUS = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
-# vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
+# vx² over gravity and wheelbase that a hundredth of a drive may exceed before the wheelbase is
+# doubted; 170 on real race cars
 MAX_FROUDE_NUMBER = 400.0
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 

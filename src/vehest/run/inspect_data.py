@@ -251,8 +251,8 @@ def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Re
 
 
 def _described(recording: Recording) -> dict[str, Any]:
-    """Rate, range, channels with their spread, provenance and origin of a recording, as plain
-    values.
+    """Rate, start, end, channels with their statistics, provenance and origin of a recording, as
+    plain values.
     """
     return {
         "id": recording.id,

@@ -545,7 +545,7 @@ def _describe_excluded(artefacts: PartArtefacts) -> str:
 
 
 def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
-    """A range; of a recording in unix time, seconds after its start."""
+    """A range as text; in a recording with unix time it counts from the start of the recording."""
     file = artefacts.references.get((span.dataset, span.recording))
     begin = 0.0
     bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]

@@ -54,7 +54,10 @@ COLUMNS = {
 }
 """Of a table of `rows_of_curve`."""
 COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
-"""Amounts of reference with a column in the overview [min]; the last column is all of a drive."""
+"""Amounts of reference that get a column in the overview where they occur [min].
+
+The error with the most minutes, and their number, follow.
+"""
 FIGURE_CAPTION = "{title}, test set `{test_set}`: RMSE(β) over the minutes of reference."
 FIGURE_NOTE = (
     "Minutes are those of recording with a reference for training and validation; bars are 95 % "

@@ -26,7 +26,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FitContext:
-    """Surroundings of a fit."""
+    """What a caller gives a fit besides data and settings: checkpoints, stop request, progress."""
 
     # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
     checkpoint_folders: Sequence[Path] = ()

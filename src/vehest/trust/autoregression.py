@@ -24,7 +24,8 @@ OUTLIER = 8.0  # robust standard deviations
 # of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no
 # noise
 MIN_DEVIATION = 1e-7
-LEVELS = (0.2, 5.0)  # between which the noise may change with the speed
+# smallest and largest noise at a speed over that of all speeds
+NOISE_FACTORS = (0.2, 5.0)
 ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
 
 
@@ -177,7 +178,7 @@ def learn_noise_levels(
     -------
     tuple
         Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of
-        samples; and root mean squares there, (L, C), outliers cut off, within `LEVELS`; they
+        samples; and root mean squares there, (L, C), outliers cut off, within `NOISE_FACTORS`; they
         are interpolated linearly between the speeds.
     """
     is_finite = np.isfinite(innovations).all(1) & np.isfinite(speed)
@@ -191,4 +192,4 @@ def learn_noise_levels(
             for rows in bins
         ]
     )
-    return speeds, np.clip(factors, *LEVELS)
+    return speeds, np.clip(factors, *NOISE_FACTORS)

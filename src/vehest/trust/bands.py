@@ -242,8 +242,9 @@ def band_rows(  # type: ignore[no-untyped-def]
         half width of v = q_v w √max(Σ_j c_j f_j² + b_v x, floor_v²)
         half width of β = min(q_β w √max((Σ_j d_j f_j² + b_β x)/max(|u|, 1 m/s)², floor_β²), π)
 
-    with the terms f_j (`TERMS`), the mean squared error x of the tyre check, and w = max(1,
-    |f_j|/m_j) over the features from vx on.
+    with the terms f_j (`TERMS`) and the mean squared error x of the tyre check. Beyond the range of
+    the training w = max(1, |f_j|/m_j) over the features from vx on widens both; m_j is the largest
+    |f_j| of the training (its 99.9th percentile).
 
     Parameters
     ----------

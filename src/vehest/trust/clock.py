@@ -22,11 +22,8 @@ RECOVERY_SECONDS = 1.0  # of even stamps, after which it is trusted again
 RESET_SECONDS = 1.0  # by which a stamp lies before the last one where the clock has been set back
 MIN_ADVANCE = 0.5  # sampling intervals; a stamp that is ahead by less repeats the last sample
 EVEN_INTERVALS = (0.6, 1.6)  # sampling intervals from one stamp to the next that jitter explains
-RATE_INTERVALS = 20
-RATE_TOLERANCE = 0.2
-"""Number of intervals, and deviation of their median, for the warning that samples come at another
-rate.
-"""
+RATE_INTERVALS = 20  # first intervals, whose median is compared with the expected interval
+RATE_TOLERANCE = 0.2  # relative deviation of that median beyond which another rate is warned of
 
 CLOCK_STOPPED = 33
 CLOCK_JUMPED = 34

@@ -22,15 +22,11 @@ REMEMBERED_SECONDS = 3.0  # for which a spinning car is taken to be as fast as b
 LOST_SECONDS = 0.3  # beyond the bound, after which an estimator starts anew
 FADE_SECONDS = 1.0  # time constant with which v goes to 0 where there is no estimate
 
-EXTRAPOLATED = 1
-CLIPPED = 2
-SPINNING = 4
-STARTED = 8
-"""Marks of a sample.
-
-No estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew
-at it.
-"""
+EXTRAPOLATED = 1  # no estimate: v fades from the last one
+CLIPPED = 2  # the estimate was beyond the bound and was set to it
+SPINNING = 4  # the car spins
+STARTED = 8  # the estimator started anew at this sample
+"""Marks of a sample; `Watched.marks` is their sum."""
 
 
 class Watched(NamedTuple):

@@ -44,8 +44,8 @@ Tyres = Literal["plain", "smooth"]
 
 @dataclass(frozen=True)
 class LoadedCar:
-    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves
-    them; a BMW 545i by default.
+    """A single-track car whose axle loads shift with a steady longitudinal acceleration; a BMW
+    545i by default.
 
     Raises
     ------

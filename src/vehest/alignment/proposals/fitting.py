@@ -224,8 +224,8 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
 
 
 def _as_steering(search: Search, column: Candidate) -> Offer | None:
-    """As an angle of the road wheels or of the steering wheel; where it can be neither, as a
-    command of unknown scale.
+    """Offer a column as an angle of the road wheels or of the steering wheel; where it can be
+    neither, as a command of unknown scale. None if it is no steering.
     """
     hint = max(column.hint("steer"), column.hint("handwheel"))
     if hint < 0.0 or not column.measures("steer"):

@@ -33,7 +33,8 @@ RARITY = 0.25  # penalty of a rare unit
 CLOSE_MISMATCH = 0.3  # within, units explain it
 FAR_MISMATCH = 0.6  # beyond, they do not
 MAX_EVIDENT_MISMATCH = 0.1  # within, the gain alone indicates an acceleration
-MIN_COST_MARGIN = 0.2  # by which the next best units must be worse
+# of costs, |logarithm of a gain| and penalties: by which the next best units must be worse
+MIN_COST_MARGIN = 0.2
 # of the 99th percentile, SI
 RANGES = {
     "vx": (0.5, 110.0),
@@ -201,7 +202,7 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, without a lateral acceleration; None where one is missing.
+    """Speed and yaw rate by name, without a lateral acceleration.
 
     Parameters
     ----------
@@ -212,7 +213,7 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
     -------
     Turning or None
         Units by the header, else the first in which the size is plausible; ``decided`` if the
-        header has both.
+        header has units of both columns. None where no two columns have these names.
     """
     columns_by_channel = {}
     units = {}

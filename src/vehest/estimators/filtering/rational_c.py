@@ -56,7 +56,7 @@ def rational_c_values(
         "rolling": ROLLING,
         "largest_sideslip": model.largest_sideslip,
         "lost": MAX_SIDESLIP_DEVIATION,
-        "tyre_root": _square_root(model.start_tyres),
+        "tyre_root": _square_root(model.start_tyre_covariance),
     }
 
 

@@ -102,8 +102,11 @@ class RationalModel:
         return np.array([*self.curves, 1.0])
 
     @cached_property
-    def start_tyres(self) -> FloatArray:
-        """Covariance of the logarithms of adapted tyre parameters at the start, (n - 4, n - 4)."""
+    def start_tyre_covariance(self) -> FloatArray:
+        """Covariance of the logarithms of adapted tyre parameters at the start, (n - 4, n - 4).
+
+        The other four states are those of the motion.
+        """
         if self.adapted == ("friction",):
             return np.array([[FRICTION_DEVIATION**2]])
         rows = [CURVES.index(name) for name in self.adapted]
@@ -112,7 +115,7 @@ class RationalModel:
     @cached_property
     def bounds(self) -> FloatArray:
         """Largest absolute value of each state, (n,)."""
-        spread = MIN_TYRE_BOUND * np.sqrt(np.diagonal(self.start_tyres))
+        spread = MIN_TYRE_BOUND * np.sqrt(np.diagonal(self.start_tyre_covariance))
         return np.array([*MAX_MOTION, *np.maximum(spread, math.log(self.tyre_bound)).tolist()])
 
     def track(self) -> TyreTrack:
@@ -205,7 +208,7 @@ def filter_extended(
         track,
         np.square(deviations),
         np.append(model.bounds, [math.inf] * n_crossfall),
-        model.start_tyres,
+        model.start_tyre_covariance,
         restart,
         (limit, patience, np.zeros(2, np.int64) if refused is None else refused),
         (mean, covariance),
@@ -272,7 +275,7 @@ def filter_unscented(
                     roll_without_slip.py_func(*prior, rolling, geometry, vx, steer)
                 if has_diverged:
                     prior.mean[4:] = 0.0
-                    prior.covariance[4:, 4:] = model.start_tyres
+                    prior.covariance[4:, 4:] = model.start_tyre_covariance
             stepper.update(np.array([yaw_rate, ay]), np.array([vx, steer]), sensors)
             innovation = stepper.innovation
             spread = stepper.innovation_covariance

@@ -81,9 +81,9 @@ def _set_row(values, row, b, vector, end):
 
 @piece
 def _input_terms(inputs, b, car):
-    """Terms of one sample that all points share.
+    """Terms that all sigma points share, of the sequences from b on.
 
-    Speed, tangent and cosine of the steering angle, loads of both axles.
+    Speed, at least the minimum, tangent and cosine of the steering angle, loads of both axles.
     """
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm

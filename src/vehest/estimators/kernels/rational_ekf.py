@@ -29,7 +29,7 @@ _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, out):
+def scan(samples, track, variances, bounds, start_tyre_covariance, restart, gate, state, out):
     """Filter samples of yaw_rate, vx, ay, steer, (T, 4); NaN in yaw_rate and ay is skipped.
 
     Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, and tyre parameters
@@ -52,7 +52,7 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
         (n - 1,).
     bounds
         Largest absolute value of each state, (n,).
-    start_tyres
+    start_tyre_covariance
         Covariance of the logarithms of the adapted parameters at the start, (p, p).
     restart
         Sideslip angle [rad] beyond which motion and tyres restart, the motion as that of a car that
@@ -105,7 +105,7 @@ def scan(samples, track, variances, bounds, start_tyres, restart, gate, state, o
             if not abs(mean[0]) < max_sideslip:
                 roll_without_slip(mean, cov, rolling, car, vx, steer)
                 mean[4:tyres] = 0.0
-                cov[4:tyres, 4:tyres] = start_tyres
+                cov[4:tyres, 4:tyres] = start_tyre_covariance
             elif not cov[0, 0] < lost_variance:
                 roll_without_slip(mean, cov, rolling, car, vx, steer)
         holds_tyres = abs(vx * mean[1]) < adapt_above

@@ -35,9 +35,9 @@ BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, those of the candidates' residuals, the mean
 # square of the axle's error s e over the last moments, and the lateral acceleration that the drive
 # has reached
-LAGS = 17
+LAGGED = 17  # number of lagged signals
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
-SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE, REACHED = range(10, LAGS)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE, REACHED = range(10, LAGGED)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals,
 # and last v
 MOMENTS = 8
@@ -50,8 +50,8 @@ WEIGHT = GRIP + 1  # weight among all filters
 COST = GRIP + 2  # two rows, one a measurement: decrease of the log likelihood
 VARIANCE = GRIP + 4  # two rows, one a measurement: variance of the residual
 DERIVATIVE = GRIP + 6  # derivatives of a measurement by the states
-SHARED = DERIVATIVE + STATES  # covariances of a measurement with the states
-BANK_ROWS = SHARED + STATES
+CROSS = DERIVATIVE + STATES  # covariances of a measurement with each state
+BANK_ROWS = CROSS + STATES
 # index in the bank of a covariance's first lane, by row and column
 AT = np.array(
     [
@@ -91,9 +91,9 @@ def _rear_slip(f, lags, turning, n):
     Parameters
     ----------
     f : array
-        Rows of one vector of filters, (`BANK_ROWS` · lanes,); the first row of `SHARED` is scratch.
+        Rows of one vector of filters, (`BANK_ROWS` · lanes,); the first row of `CROSS` is scratch.
     lags : array
-        Low-passed signals, (17,).
+        Lagged signals (`LAGGED`): low-passed values and running sums, (17,).
     turning : float
         Derivative of the low-passed yaw rate [rad/s²].
     n : namedtuple
@@ -111,10 +111,10 @@ def _rear_slip(f, lags, turning, n):
     ) * turning
     limit = root(most(grip * grip - lags[AX] ** 2, MIN_GRIP_SHARE**2 * grip * grip))
     reserve = 1.0 - least(abs(force) / limit, n.largest_share)
-    store(f, SHARED * lanes, reserve)
-    for k in range(SHARED * lanes, (SHARED + 1) * lanes):
+    store(f, CROSS * lanes, reserve)
+    for k in range(CROSS * lanes, (CROSS + 1) * lanes):
         f[k] **= n.exponent
-    reserve_power = load(f, SHARED * lanes)
+    reserve_power = load(f, CROSS * lanes)
     slip = limit * (1.0 - reserve_power) / n.exponent
     return choose(force < 0.0, -slip, slip), reserve_power / reserve, most(abs(force) - limit, 0.0)
 
@@ -178,9 +178,9 @@ def _measured_sum(f, first, second, factor, measured, variance):
     """A state plus a factor times another, as measured: residual and its variance."""
     lanes = width(f)
     for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, first]) + factor * load(f, AT[i, second]))
+        store(f, (CROSS + i) * lanes, load(f, AT[i, first]) + factor * load(f, AT[i, second]))
     residual_variance = (
-        load(f, (SHARED + first) * lanes) + factor * load(f, (SHARED + second) * lanes) + variance
+        load(f, (CROSS + first) * lanes) + factor * load(f, (CROSS + second) * lanes) + variance
     )
     return measured - load(f, first * lanes) - factor * load(f, second * lanes), residual_variance
 
@@ -224,7 +224,7 @@ def _axle(f, n, lags, turning, speed, size, states):
         shared = 0.0 * slip
         for c in range(states):
             shared += load(f, AT[i, c]) * load(f, (DERIVATIVE + c) * lanes)
-        store(f, (SHARED + i) * lanes, shared)
+        store(f, (CROSS + i) * lanes, shared)
         variance += load(f, (DERIVATIVE + i) * lanes) * shared
     surplus = least(excess / n.grip_excess, n.gate)
     return residual, variance, 0.5 * n.dt * surplus * surplus
@@ -232,11 +232,12 @@ def _axle(f, n, lags, turning, speed, size, states):
 
 @part()
 def _update(f, residual, variance, gate, learns, states):
-    """Update with a measurement, whose covariances with the states are in the rows `SHARED`.
+    """Update a vector of filters, in place, with a measurement; the rows `CROSS` are its
+    covariances with the states.
 
-    Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: all
-    parameters where the filter does not learn, b where the axle slides. Returns half the square of
-    the normalised residual.
+    Beyond ``gate`` deviations a residual is cut off. States stay in Schmidt-Kalman updates: those
+    from `LEAKAGE` to `COMPLIANCE` unless the filter ``learns``, `REAR` where the axle slides.
+    Returns half the square of the normalised residual after it was cut off.
 
     P⁺_ic = P_ic - K_i S_c with the covariances S_c of the measurement with state c and K_i =
     S_i/variance. Of a state that stays, mean and variance do, and so do the covariances of fixed
@@ -249,14 +250,14 @@ def _update(f, residual, variance, gate, learns, states):
     slides = abs(load(f, ERROR * lanes)) > MAX_ERROR_OF_PLACE
     for i in range(states):
         is_fixed = not learns and LEAKAGE <= i <= COMPLIANCE
-        gain = load(f, (SHARED + i) * lanes) * inverse
+        gain = load(f, (CROSS + i) * lanes) * inverse
         step = choose(slides, 0.0 * gain, gain) if i == REAR else gain
         if not is_fixed:
             store(f, i * lanes, load(f, i * lanes) + step * residual)
         for c in range(i, states):
             if not (is_fixed and c <= COMPLIANCE):
                 share = step if c == i else gain
-                store(f, AT[i, c], load(f, AT[i, c]) - share * load(f, (SHARED + c) * lanes))
+                store(f, AT[i, c], load(f, AT[i, c]) - share * load(f, (CROSS + c) * lanes))
     return 0.5 * residual * residual * inverse
 
 

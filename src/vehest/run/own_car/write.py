@@ -524,6 +524,7 @@ def _without_reference(drafted: Draft) -> str:
 
 
 def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
+    """A data set's YAML file; questions ``left`` open, evidence and delays are its comments."""
     examined = drafted.examined
     name = examined.name
     head = [

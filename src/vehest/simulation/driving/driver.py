@@ -268,12 +268,12 @@ def speed_profile(
     car : Car
         Power per mass [W/kg], drag [1/m], top speed [m/s].
     driver : Driver
-        Shares of the grip.
+        Share of the grip for braking.
     highest_speed : FloatArray | float, default inf
         (N,) or one for all [m/s].
     bank, grade : FloatArray | float, default 0.0
-        Of the road, positive with its left side higher, and downhill [rad]; gravity helps or
-        hinders.
+        Angles of the road [rad]: bank is positive with the left side higher, grade is positive
+        downhill.
 
     Returns
     -------

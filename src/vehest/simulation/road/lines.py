@@ -32,7 +32,7 @@ class Gate:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line, sampled every ``SPACING`` metres along itself; arrays of shape (N,)."""
+    """A path for a car, sampled every ``SPACING`` metres along itself; arrays of shape (N,)."""
 
     distance: FloatArray  # [m]
     x: FloatArray  # [m]

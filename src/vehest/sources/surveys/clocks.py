@@ -78,7 +78,7 @@ REGULAR = 0.8  # share of the steps within half a median step
 # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
 GROWING = 0.9
 MOST_RESTARTS = 0.01  # of the rows
-MAX_APART = 1.0  # s between the times of one row
+MAX_APART = 1.0  # s between two columns of times in one row; beyond, they are different clocks
 MIN_TIMES = 10
 MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ
 

@@ -19,9 +19,9 @@ from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
 # deg, root mean square of the reference, below which a test hardly distinguishes estimators
 MIN_SIDESLIP_DEG = 0.5
-MIN_ERROR_OVER_NOISE = (
-    2.0  # lowest error over the noise of the reference, below which the reference may decide
-)
+# lowest error over the noise of the reference, below which errors of the reference may decide the
+# order of estimators
+MIN_ERROR_OVER_NOISE = 2.0
 MAX_BOUND_OVER_SIGNAL = (
     0.7  # bound over the reference itself, above which a drive adds no information on v
 )
