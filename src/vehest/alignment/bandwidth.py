@@ -13,13 +13,15 @@ from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
+# s; a delay that is surely longer is reported, and one by holding is a warning
 MIN_REPORTED_DELAY_SECONDS = 0.015
 MIN_PHASE_SHARE = 0.9  # share of the phase that a low-pass must explain
 MIN_TIME_CONSTANT_SECONDS = 0.1  # s; a shorter one is a delay in the band where cars move
-MAX_YAW_RESPONSE_SECONDS = 0.3  # s; of the yaw rate to the steering angle
-MIN_CHANGES = 20
+# s; yaw rate that surely lags the steering angle by more is reported
+MAX_YAW_RESPONSE_SECONDS = 0.3
+MIN_CHANGES = 20  # changes of value; with fewer a channel does not count as held
 MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
-# share of changes by one quantum from which on a channel is quantised, not held
+# share of changes by one quantum above which a channel is quantised, not held
 MAX_SINGLE_STEP_SHARE = 0.5
 
 

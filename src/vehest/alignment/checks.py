@@ -40,42 +40,47 @@ from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
 
-AX_OF_SPEED = "acceleration_from_speed"  # the transform
-MAX_WRONG_UNITS = 3
-STUCK_SECONDS = 1.0
-MIN_STUCK_SAMPLES = 3
-MIN_COARSE_LEVELS = 10  # values of a coarse sensor; a command that rests takes fewer
+AX_OF_SPEED = "acceleration_from_speed"  # name of the transform that derives ax from the speed
+MAX_WRONG_UNITS = 3  # units that are corrected one after another; further ones are not reported
+STUCK_SECONDS = 1.0  # s of driving with one value, from which on a channel counts as stuck
+MIN_STUCK_SAMPLES = 3  # equal samples in a row; shorter runs do not count as stuck
+MIN_COARSE_LEVELS = 10  # different values of a coarse sensor; a command that rests takes fewer
+# share of the samples at an extreme value, above which it may be saturation
 SATURATED_FRACTION = 2e-3
-SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
-USUAL_QUANTILES = (0.005, 0.995)  # of a channel's samples
-SPIKE_EXCESS = 1.0  # of the usual range, beyond it
-SPIKE_SECONDS = 0.25
-USUAL_STEP_QUANTILE = 0.995  # quantile of the steps between samples
-SPIKE_STEP = 3.0  # of a usual step: a sensor that shakes jumps all the time
-JUMP_STEP = 20.0  # of a usual step, for an excursion that stays within the usual range
-JUMP_SECONDS = 1.0
+# times as often as the value next to it; a quantised sine has 2.4 times as many at its peak
+SATURATED_EXCESS = 4
+USUAL_QUANTILES = (0.005, 0.995)  # quantiles of a channel's samples that bound its usual range
+SPIKE_EXCESS = 1.0  # widths of the usual range; samples that lie further beyond it may be spikes
+SPIKE_SECONDS = 0.25  # s; a longer excursion beyond the usual range is no spike
+USUAL_STEP_QUANTILE = 0.995  # quantile of |steps between samples| that is the usual step
+SPIKE_STEP = 3.0  # usual steps that a spike must jump by: a sensor that shakes jumps all the time
+JUMP_STEP = 20.0  # usual steps by which an excursion within the usual range must jump away and back
+JUMP_SECONDS = 1.0  # s; a longer excursion within the usual range is not reported
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
-STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
+STRAIGHT_SPEED = 3.0  # m/s; slower samples are not used as straight ahead
+# s of driving straight ahead; with less neither steering offset nor speed is checked
 STRAIGHT_SECONDS = 3.0
-# rad; that of the steering wheel is more than the crown of a road asks for
+# rad while driving straight ahead; the limit of the steering wheel is more than the crown of a road
+# requires
 MAX_STEERING_OFFSETS = {"steer": np.deg2rad(3.0), "handwheel": np.deg2rad(2.5)}
 MAX_SPEED_DIFFERENCE = 0.04  # share of the reference's; speedometers read up to 10 % too much
 MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit may be wrong
+# rad, mounting angle about the vertical; smaller ones are not reported
 MIN_ROTATION = np.deg2rad(4.0)
-MIN_ROTATION_AGREEMENT = 0.6  # the smaller of its two estimates over the larger one
+# smaller estimate of that angle over the larger one; below it is no rotation
+MIN_ROTATION_AGREEMENT = 0.6
 MIN_ROTATION_MOTION = 0.4  # m/s², standard deviation of d(vx)/dt and of vx·yaw_rate
-MAX_ROTATION_GAIN_ERROR = 0.35  # of 1
-DROPOUT_SPEED = 3.0  # m/s
-DROPOUT_SHARE = 0.1  # of the other wheels' median
-DROPOUT_SECONDS = 0.1
-DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
-DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
-REVERSE_SPEED = 0.5  # m/s
-REVERSE_SECONDS = 1.0
-# a car slower than this [m/s] that turns faster than this [rad/s] may go backwards: the signs of ay
-# and steering tell
+MAX_ROTATION_GAIN_ERROR = 0.35  # distance of either gain from 1, beyond which it is no rotation
+DROPOUT_SPEED = 3.0  # m/s; wheels of a slower car are not checked
+DROPOUT_SHARE = 0.1  # of the other wheels' median speed, below which a wheel's signal is lost
+DROPOUT_SECONDS = 0.1  # s; a shorter loss is not reported
+DROPOUT_BRAKING = 4.0  # m/s²; while braking harder a wheel may be locked, and does not count
+DROPOUT_CLEAR_SECONDS = 1.0  # s before and after such braking that do not count either
+REVERSE_SPEED = 0.5  # m/s; a car that rolls backwards faster than this is reversing
+REVERSE_SECONDS = 1.0  # s; driving backwards for less is not reported
+# m/s; a faster car does not go backwards. Below, the signs of ay and steering decide
 MAX_REVERSE_SPEED = 8.0
-MIN_REVERSE_YAW_RATE = 0.03
+MIN_REVERSE_YAW_RATE = 0.03  # rad/s; with less the signs of ay and steering do not count
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:

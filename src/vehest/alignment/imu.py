@@ -42,19 +42,23 @@ TILT_GAIN = 0.1
 # assumed correlation of the remaining tilt of body and road with the effect of a parameter
 TILT_LIKENESS = 0.3
 
-ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
+ROAD_CUTOFF = 0.2  # Hz; bank and grade of the road change more slowly
 
-N_BLOCKS = 12
-MIN_BLOCK_SECONDS = 2.0  # s, longer than residuals of the band remember
-MIN_BLOCKS = 8
+MAX_BLOCKS = 12  # blocks at most that a drive is divided into for the jackknife
+MIN_BLOCK_SECONDS = 2.0  # s, longer than the residuals of the band remember
+MIN_BLOCKS = 8  # a drive that is too short for so many blocks of MIN_BLOCK_SECONDS is refused
+# highest one over all searched delays; with less, sensor and reference are refused
 MIN_CORRELATION = 0.5
-MAX_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
+# condition number of the scaled columns, above which a fit is refused; ordinary drives have 4 to 20
+MAX_CONDITION = 50.0
+# of a parameter's effect; with more a requested one is refused, a tilt not fitted
 MAX_NOISE_SHARE = 0.05
-KERNEL_REACH = 6.0  # standard deviations
-N_ITERATIONS = 60
+KERNEL_REACH = 6.0  # standard deviations of the Gaussian kernel, at which it ends
+N_ITERATIONS = 60  # steps of Levenberg and Marquardt at most; a fit that needs more is refused
 STEP_TOLERANCE = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
-MIN_VARIANCE = 1e-24
-SUSPICIOUS_UNCERTAINTIES = 3.0  # standard uncertainties
+MIN_VARIANCE = 1e-24  # (m/s²)² or (rad/s)², of a channel's residuals; avoids an infinite weight
+# standard uncertainties; a parameter outside the fit that moves by more is reported
+SUSPICIOUS_UNCERTAINTIES = 3.0
 MORE_MOTION = "more turning, braking and accelerating"
 
 TILT_PRIOR = {
@@ -701,9 +705,9 @@ def n_blocks(seconds: float) -> int:
     Returns
     -------
     int
-        From MIN_BLOCKS to N_BLOCKS, of at least MIN_BLOCK_SECONDS where the drive allows.
+        From MIN_BLOCKS to MAX_BLOCKS, of at least MIN_BLOCK_SECONDS where the drive allows.
     """
-    return min(max(int(seconds / MIN_BLOCK_SECONDS), MIN_BLOCKS), N_BLOCKS)
+    return min(max(int(seconds / MIN_BLOCK_SECONDS), MIN_BLOCKS), MAX_BLOCKS)
 
 
 def scatter_of(fit: Fit, blocks: int) -> FloatArray:

@@ -21,16 +21,17 @@ from vehest.alignment.spectra import (
 from vehest.constants import FloatArray
 
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
-# of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
+# gain of d(vy)/dt over that of vx·yaw_rate, or its inverse, above which no delay is estimated;
+# noise alone shrinks it to 0.6 in sound drives
 MAX_GAIN_RATIO = 2.5
-MIN_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
-N_SHIFTS = 6
-SHIFT_TOLERANCE_SECONDS = 1e-3  # s
-MIN_SAMPLES = 10
-N_STEPS = 8
-N_WEIGHTINGS = 3
-MAX_STEP_SECONDS = 0.1  # s
-MIN_RESIDUAL_SHARE = 1e-6  # of the power of ay; nothing is known better
+MIN_SLIDING_SHARE = 0.1  # of what the other terms leave of ay, that d(vy)/dt must explain
+N_SHIFTS = 6  # times at most that channels are shifted by the fitted delays and fitted again
+SHIFT_TOLERANCE_SECONDS = 1e-3  # s; once both remaining delays are shorter, no more shifts follow
+MIN_SAMPLES = 10  # with fewer samples no delay is estimated
+N_STEPS = 8  # Gauss-Newton steps of a fit at most
+N_WEIGHTINGS = 3  # fits one after another, each weighted by the residual of the last one
+MAX_STEP_SECONDS = 0.1  # s, largest change of a delay by one Gauss-Newton step
+MIN_RESIDUAL_SHARE = 1e-6  # of the largest power of ay in a bin; limits the weights of bins
 
 
 def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | None:

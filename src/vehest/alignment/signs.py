@@ -21,26 +21,29 @@ from vehest.alignment.standstill import BoolArray
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import listed
 
-KINEMATIC_BAND_HZ = (0.1, 2.0)
-FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording
+KINEMATIC_BAND_HZ = (0.1, 2.0)  # Hz, band-pass of all comparisons with a derivative
+FILTER_END_SECONDS = 2.0  # s at either end, which the band-pass distorts and which do not count
+# samples; with fewer there is no relation, and no check for saturation and spikes
 MIN_SAMPLES = 100
-MIN_SETTLED_SECONDS = 10.0  # of filtered samples
-MIN_STEADY_CORRELATION = 0.7
-MIN_SIGN_CORRELATION = 0.3  # of relations with derivatives
-MIN_SCALE_CORRELATION = 0.8
-MIN_SAME_CORRELATION = 0.95  # of one angle measured twice
-MIN_ACCELERATION = 0.2  # m/s², standard deviation
-MIN_SLIDING = 1e-3  # m/s²
-MIN_SIDESLIP = 1e-3  # rad
+MIN_SETTLED_SECONDS = 10.0  # s of samples behind the band-pass; with less it is not used
+MIN_STEADY_CORRELATION = 0.7  # |correlation| of a relation; a weaker one is dropped
+MIN_SIGN_CORRELATION = 0.3  # the same for d(vy)/dt against ay - vx·yaw_rate
+MIN_SCALE_CORRELATION = 0.8  # |correlation| of a relation; the scale of a weaker one is not checked
+MIN_ANGLE_CORRELATION = 0.95  # the same for sideslip_ref against atan2(vy_ref, vx)
+MIN_ACCELERATION = 0.2  # m/s², standard deviation of ay; with less there is no lateral relation
+MIN_SLIDING = 1e-3  # m/s², standard deviation of d(vy)/dt; with less it is compared with nothing
+# rad, standard deviation of atan2(vy_ref, vx); with less it is compared with nothing
+MIN_SIDESLIP = 1e-3
 MAX_ROLLING_SIDESLIP = 0.2  # rad of sideslip, beyond which drivers steer against the turn
-MIN_STEERED_SECONDS = 5.0
-MAX_REVERSED_CHANNELS = 4  # channels at a time
-KILOMETRES_AN_HOUR = 3.6
+MIN_STEERED_SECONDS = 5.0  # s without a drift; with less, steering and yaw rate are not compared
+MAX_REVERSED_CHANNELS = 4  # channels that are reversed together, at most, to explain the signs
+KILOMETRES_AN_HOUR = 3.6  # km/h in 1 m/s
 DEGREES_PER_RADIAN = 180.0 / np.pi
-SCALE_TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
-# of the scale of ax, which pitch, grade and slip change; ax in g is 9.8 times off
+# factor from 1 that a right scale may have; the smallest factor of a wrong unit is 3.6
+SCALE_TOLERANCE = 1.7
+# the same for ax, which pitch, grade and slip change; the factor of ax in g is 9.8
 LONGITUDINAL_TOLERANCE = 3.0
-EXACTNESS = 1.25  # within which a wrong factor must explain a scale
+UNIT_TOLERANCE = 1.25  # factor from 1 that a wrong scale may have once a unit is corrected
 ALTERNATIVE_UNITS = {
     **dict.fromkeys(("vx", "vx_ref", "vy_ref"), (KILOMETRES_AN_HOUR, "km/h", "m/s")),
     **dict.fromkeys(("ax", "ay"), (1.0 / GRAVITY, "g", "m/s²")),
@@ -236,7 +239,7 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
                 (1, -1, 1),
                 angle,
                 expected,
-                least_correlation=MIN_SAME_CORRELATION,
+                least_correlation=MIN_ANGLE_CORRELATION,
             )
 
 
@@ -250,7 +253,7 @@ def _related(
     min_correlation: float = MIN_STEADY_CORRELATION,
     **limits: float,
 ) -> Iterator[Relation]:
-    """The relation of two signals, about nil, whose correlation is ``least`` at least.
+    """The relation of two signals, about nil, whose correlation is ``min_correlation`` or more.
 
     The scale is the ratio of root mean squares with the sign of the correlation, not a regression's
     slope, which noise would shrink.
@@ -508,7 +511,9 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
         put_right = [
             relation
             for relation in wrong
-            if 1.0 / EXACTNESS < abs(relation.without(mistake.channel, mistake.factor)) < EXACTNESS
+            if 1.0 / UNIT_TOLERANCE
+            < abs(relation.without(mistake.channel, mistake.factor))
+            < UNIT_TOLERANCE
         ]
         broken = [
             relation

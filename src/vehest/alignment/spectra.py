@@ -17,24 +17,26 @@ from vehest.constants import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
-BAND_HZ = (0.1, 3.0)  # where cars move and references can be differentiated
-SEGMENT_SECONDS = (4.0, 16.0)
-SEGMENTS_IN_A_DRIVE = 8.0  # without overlap, of a short one
-MIN_DRIVE_SECONDS = 16.0  # s
-MIN_RATE_HZ = 5.0  # Hz
-MIN_BINS = 4
-MIN_SEGMENTS = 6
-MIN_SAMPLES_A_PERIOD = 5.0
+BAND_HZ = (0.1, 3.0)  # Hz, where cars move and references can be differentiated
+SEGMENT_SECONDS = (4.0, 16.0)  # s, length of the shortest and longest segment
+SEGMENTS_IN_A_DRIVE = 8.0  # that a drive is divided into, without overlap, within SEGMENT_SECONDS
+MIN_DRIVE_SECONDS = 16.0  # s; a shorter drive has no spectra
+MIN_RATE_HZ = 5.0  # Hz; a slower recording has no spectra
+MIN_BINS = 4  # frequencies in the band; with fewer there are no spectra
+MIN_SEGMENTS = 6  # segments of selected samples alone; with fewer there are no spectra
+MIN_SAMPLES_A_PERIOD = 5.0  # of the highest frequency that is used
 MIN_AVERAGED_RATE_HZ = 30.0  # Hz; a faster recording is averaged down to at least this
-MAX_GROUPS = 12
-SMOOTHED_BINS = 5
-MAX_COHERENCE = 0.99
-MIN_POWER_SHARE = 1e-6  # of the strongest bin; below a window leaks more than that
+MAX_GROUPS = 12  # groups of segments, or blocks, that the jackknife leaves out in turn, at most
+SMOOTHED_BINS = 5  # neighbouring bins of a running mean; odd
+MAX_COHERENCE = 0.99  # of a bin; limits its weight, which is infinite at 1
+# of the strongest bin's power (geometric mean of both signals); with less a bin has no weight: a
+# window leaks more
+MIN_POWER_SHARE = 1e-6
 MIN_MEAN_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
-MAX_LAG_SECONDS = 0.5  # s
-MAX_TIME_CONSTANT_SECONDS = 10.0  # s
-N_STEPS = 25
-CONFIDENCE = 0.95
+MAX_LAG_SECONDS = 0.5  # s; longer delays are not searched
+MAX_TIME_CONSTANT_SECONDS = 10.0  # s; longer ones are not searched
+N_STEPS = 25  # Gauss-Newton steps of a fit at most
+CONFIDENCE = 0.95  # level of all intervals, which texts call 95 %
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,26 +72,33 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import abbreviated
 
 MAX_STANDSTILL_SPEED = 0.5  # m/s; a car whose speed never exceeds it did not move
-SCORE_MARGIN = 4.0  # below the best triple, within which an agreement with ax decides
+SCORE_MARGIN = 4.0  # score below that of the best triple, within which an agreement with ax decides
 AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's score
-MAX_AX_CANDIDATES = 40
-MIN_GRAVITY_CORRELATION = 0.7  # of an acceleration's gravity with that by an angle
+MAX_AX_CANDIDATES = 40  # columns at most that are compared with d(vx)/dt, the first ones
+MIN_GRAVITY_CORRELATION = 0.7  # of the gravity in an acceleration with that by an angle
 GRAVITY_WEIGHT = 4.0  # of the correlation of a roll angle with ay beyond vx·yaw_rate
-MAX_LISTED = 8
-SPEED_GAIN_RANGE = (0.97, 1.08)  # of ay over d(vy)/dt + vx·yaw_rate, with a right speed
-SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # where d(vy)/dt is not known
-MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)  # beyond, a unit may be wrong (`scales`)
-MAX_WHEEL_GAIN_DIFFERENCE = 0.02  # of the wheels' speed from ay/yaw_rate
-MIN_WORLD_CORRELATION = 0.98  # of a velocity with the derivative of a position
-MIN_WORLD_CROSSING = 0.05  # change of the other coordinate over it, so that the car turned
-MIN_SIDE_CORRELATION = 0.5  # of wheels or a course, from which they decide left and right
+MAX_LISTED = 8  # columns that a note names at most; further ones are counted
+# of ay over d(vy)/dt + vx·yaw_rate; outside, the speed is questioned
+SPEED_GAIN_RANGE = (0.97, 1.08)
+SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # the same where d(vy)/dt is not known
+MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)  # outside, a unit may be wrong instead (`scales`)
+# between the gains by wheel speeds and by ay/yaw_rate, to correct the speed by it
+MAX_WHEEL_GAIN_DIFFERENCE = 0.02
+# of a column with a derivative of a position, to be along an axis of the world
+MIN_WORLD_CORRELATION = 0.98
+# spread of the steps along one coordinate over that along the other; with less the path is straight
+MIN_WORLD_CROSSING = 0.05
+# of wheels or a course with the yaw rate, from which on they decide left and right
+MIN_SIDE_CORRELATION = 0.5
+# Hz, of which the nearest is proposed
 PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
-NOMINAL_RATE_HZ = 50.0  # of a log without times
-MAX_DECADE_ERROR = 0.1  # of the decimal logarithm of a ratio of two rates
-MIN_COURSE_SAMPLES = 50
+NOMINAL_RATE_HZ = 50.0  # Hz, assumed for a log without times
+# distance of log10(ax over d(vx)/dt) from a whole number, within which a rate is off by decades
+MAX_DECADE_ERROR = 0.1
+MIN_COURSE_SAMPLES = 50  # with so many samples of a course or fewer it gives no side
 MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
-MAX_COURSE_STEP = 1.0  # rad
-SIDESLIP_RANGE = (0.01, 1.0)  # rad, width of 96 % of a sideslip angle's values
+MAX_COURSE_STEP = 1.0  # rad from sample to sample; larger steps do not count
+SIDESLIP_RANGE = (0.01, 1.0)  # rad, width of 96 % of a sideslip angle's values; outside it is none
 MAX_IMPOSSIBLE_SHARE = 0.002  # share of samples outside the possible range that may be spikes
 USUAL_MAGNITUDES = {  # 99th percentile, SI units
     "vx": (1.0, 90.0),

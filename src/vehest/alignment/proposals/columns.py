@@ -17,16 +17,18 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 
-SLOW_HZ = 1.0  # below, a delay of a tenth of a second and vibration matter little
-SLOW_RATE_HZ = 5.0
-MAX_SLOW_SAMPLES = 4000  # samples
-MAX_MISSING_SHARE = 0.5  # of a column's samples, which a line then bridges
-STRAY_DISTANCE = 20.0  # times the spread of nearly all samples; beyond lies no sample of a motion
-MAX_STRAY_SHARE = 0.002
-MIN_CLOCK_SAMPLES = 1000  # samples
-HINT_OF_LETTER = 3.0  # of a name whose axis does not decide
-ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # that no relation to other channels reveals
-MAX_LEVEL_SAMPLES = 200_000  # in which values are counted
+SLOW_HZ = 1.0  # Hz; below, a delay of a tenth of a second and vibration matter little
+SLOW_RATE_HZ = 5.0  # Hz, about the rate of low-passed columns
+MAX_SLOW_SAMPLES = 4000  # samples of a low-passed column; a longer one is thinned out further
+# of a column's samples, which a line then bridges; with more it is left out
+MAX_MISSING_SHARE = 0.5
+STRAY_DISTANCE = 20.0  # times the spread of nearly all samples; no sample of a motion lies beyond
+MAX_STRAY_SHARE = 0.002  # of a column's samples; where more lie far outside, none counts as stray
+# samples; a longer column that never decreases is a clock, unless it is named as a position
+MIN_CLOCK_SAMPLES = 1000
+HINT_OF_LETTER = 3.0  # strength of hints by three names that differ in the letter of an axis alone
+ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # roles that no relation to other channels reveals
+MAX_LEVEL_SAMPLES = 200_000  # samples at most in which different values are counted
 _SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")  # of a magnitude
 _LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz](?= \w+$|$)")  # perhaps before a unit
 MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer

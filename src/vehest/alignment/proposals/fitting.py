@@ -33,8 +33,9 @@ from vehest.data.channels import CHANNELS
 
 CLEAR_CORRELATION = 0.6  # correlation that decides where nothing else comes near
 CLEAR_LATERAL_CORRELATION = 0.45  # of relations with derivatives of noisy channels
+# of a lateral velocity: correlation that decides where its name agrees, and where its score starts
 MIN_STRENGTH = 0.3
-RIVAL_MARGIN = 2.0  # score within which another column comes near
+RIVAL_MARGIN = 2.0  # score below that of the chosen column, within which another one is a rival
 # logarithm of the gain of an acceleration to d(vx)/dt, within which pitch, grade and slip explain
 # it
 MAX_AX_MISMATCH = 1.1
@@ -68,8 +69,8 @@ USUAL_LENGTHS = {
 }
 TYPICAL_LENGTHS = {"steer": 2.7, "handwheel": 43.0}  # m
 MIN_MODEL_WHEELBASE = 0.08  # m, wheelbase of the smallest model
-MAX_MODEL_SPEED = 20.0  # m/s
-MIN_CALM_SAMPLES = 100  # samples
+MAX_MODEL_SPEED = 20.0  # m/s; a drive that is slower throughout may be that of a model
+MIN_CALM_SAMPLES = 100  # samples in slow corners; with fewer all of the drive are used
 # of a length by half of the slow corners from that by all; a lane change at one speed has more
 MAX_HALF_DIFFERENCE = 0.2
 

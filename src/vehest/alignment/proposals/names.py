@@ -11,8 +11,8 @@ from __future__ import annotations
 import re
 from functools import cache
 
-STRONG = 4.0
-WEAK = 2.0
+STRONG = 4.0  # score of a role that a name states
+WEAK = 2.0  # score of a role that a name may state
 
 _STRONG = {  # over the name without blanks
     "other": (

@@ -26,24 +26,25 @@ from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_re
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
 
-MIN_CORRELATION = 0.75
+MIN_CORRELATION = 0.75  # |correlation| of ay with vx·yaw_rate; triples with less are dropped
 UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
-RARITY = 0.25  # penalty of a rare unit
+RARITY = 0.25  # penalty of a rare unit on its mismatch
 # logarithms of a gain that should be 1
 CLOSE_MISMATCH = 0.3  # within, units explain it
 FAR_MISMATCH = 0.6  # beyond, they do not
 MAX_EVIDENT_MISMATCH = 0.1  # within, the gain alone indicates an acceleration
-# of costs, |logarithm of a gain| and penalties: by which the next best units must be worse
+# cost (|logarithm of a gain| and penalties) by which the next best units must be worse, or units
+# are asked for
 MIN_COST_MARGIN = 0.2
-# of the 99th percentile, SI
+# channel -> range of its 99th percentile, SI units; a size outside is implausible
 RANGES = {
     "vx": (0.5, 110.0),
     "yaw_rate": (0.02, 8.0),
     "ay": (0.3, 60.0),
 }
-MAX_COLUMNS = 60
-MAX_TURNINGS = 8
-MIN_SCORE = 6.0
+MAX_COLUMNS = 60  # columns tried as one channel at most, the best by name
+MAX_TURNINGS = 8  # triples at most for which rare units are tried, and that are returned
+MIN_SCORE = 6.0  # of a triple; those with less are dropped
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a
 clear name decides.
@@ -67,11 +68,15 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "vx": 0.7,
     "yaw_rate": 0.9,
 }
+# of a column with ay; one with more repeats ay, or is an angle of lean
 MIN_AY_REPEAT_CORRELATION = 0.99
-MIN_AY_RIVAL_CORRELATION = 0.7  # with and without gravity, as telephones give it
-# of the steps from sample to sample; two sensors differ by as much as their noise
+# of ay with another column named so; with more the user is asked which one has gravity
+MIN_AY_RIVAL_CORRELATION = 0.7
+# of the steps from sample to sample, within which a column is a copy; two sensors differ by as much
+# as their noise
 MAX_COPY_DIFFERENCE = 0.05
-MAX_REPEAT_MISMATCH = 0.35  # logarithm
+# |logarithm| of the ratio of two sizes; with more they are not one quantity in that unit
+MAX_REPEAT_MISMATCH = 0.35
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 
 

@@ -26,18 +26,19 @@ from vehest.constants import FloatArray
 
 USUAL_RADIUS = 0.31  # m, of cars
 NOMINAL_RADIUS = 0.3  # m, by which a speed at the rim is brought to rad/s and back
-RADIUS_RANGE = (0.2, 0.55)
-MIN_MODEL_RADIUS = 0.02  # of models, which are not fast
-MAX_MODEL_SPEED = 20.0
-MAX_SPEED = 110.0  # m/s
-MIN_TOP_SPEED = 1.0
+RADIUS_RANGE = (0.2, 0.55)  # m, of cars; a unit that gives another radius is implausible
+MIN_MODEL_RADIUS = 0.02  # m, of models up to MAX_MODEL_SPEED
+MAX_MODEL_SPEED = 20.0  # m/s; a car whose wheels are faster is no model
+MAX_SPEED = 110.0  # m/s; a unit that gives a higher top speed is implausible
+MIN_TOP_SPEED = 1.0  # m/s; a unit that gives a lower top speed is implausible
 UNIT_PENALTIES = {  # of units tried where the header is silent; a rare one only if no other fits
     **dict.fromkeys(("km/h", "m/s", "rpm", "rad/s"), 0.0),
     "mph": 0.2,
     **dict.fromkeys(("cm/s", "mm/s", "ft/s", "0.01*km/h", "rev/s", "deg/s"), 1.0),
 }
+# cost by which the next best unit must be worse, or the user is asked for it
 MIN_COST_MARGIN = 0.25
-IMPLAUSIBLE = 3.0  # cost of a unit that makes an impossible speed or radius
+IMPLAUSIBLE = 3.0  # cost of a unit that gives an impossible speed or radius
 MAX_RIM_MISMATCH = 0.3  # of a speed at the rim to that of the car, as a logarithm
 PREFIX = "wheel_speed_"
 # a speedometer over the wheels' speed at the rim: none reads too little, many too much
