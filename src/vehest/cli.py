@@ -50,7 +50,7 @@ data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-MAX_ERROR_CHARACTERS = 4_000
+MAX_ERROR_CHARACTERS = 4_000  # of an error message; the rest is cut off
 NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"  # of Typer
 STAGES = "Single stages, all of which `run` includes"
 CLUSTER = "On a cluster"

@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 from vehest.data.files import file_name, writing_error
 
 LOCKS = "locks"
-POLL_SECONDS = 0.05
+POLL_SECONDS = 0.05  # s between two attempts to take a lock that another process has
 
 
 @dataclass(frozen=True)

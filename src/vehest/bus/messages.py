@@ -9,10 +9,11 @@ from typing import Any
 from vehest.data.errors import ConfigurationError
 from vehest.sources.limited import require_package
 
-FIRST_ID = 0x6F0
-LAST_STANDARD_ID = 0x7FE
+FIRST_ID = 0x6F0  # default identifier of the estimates; the bands have the next one
+# highest identifier of the estimates: that of the bands, 0x7FF, is the last of 11 bits
+MAX_FIRST_ID = 0x7FE
 
-COUNTS = 16  # estimates, after which the alive counter begins anew
+COUNTS = 16  # values of the alive counter, after which it begins anew
 
 DBC = """VERSION ""
 
@@ -66,9 +67,9 @@ def dbc_text(first_id: int = FIRST_ID) -> str:
     ConfigurationError
         They are no standard identifiers.
     """
-    if not 0 < first_id <= LAST_STANDARD_ID:
+    if not 0 < first_id <= MAX_FIRST_ID:
         raise ConfigurationError(
-            f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not "
+            f"the identifier of estimates must lie between 0x1 and {MAX_FIRST_ID:#x}, not "
             f"{first_id:#x}"
         )
     return DBC.format(estimate=first_id, band=first_id + 1)

@@ -33,10 +33,10 @@ from vehest.sources.can.logs import Frames
 from vehest.trust.clock import RESET_SECONDS, STOPPED, SampleClock
 from vehest.trust.contract import GuardedStepper
 
-SURVEY_SECONDS = 20.0
+SURVEY_SECONDS = 20.0  # s of a log that are read for its timing; more until each signal came twice
 LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
-# that another thread of Python may go on when the receiver has something to do
+# s that another Python thread may go on when the receiver has something to do
 SWITCH_SECONDS = 2e-4
 
 

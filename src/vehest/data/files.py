@@ -26,6 +26,7 @@ FOREIGN_SECONDS = (
     24 * 3600.0
 )  # after which files of another host count as left over, whose processes cannot be seen from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+# words in the text of an error without a number -> number of the error
 _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.fromkeys(
     ("os error 28", "database or disk is full"), errno.ENOSPC
 )

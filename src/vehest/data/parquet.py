@@ -35,7 +35,7 @@ DAMAGE = (
 An ArrowInvalid is a ValueError, too.
 """
 
-ROWS_AT_A_TIME = 1 << 15
+ROWS_AT_A_TIME = 1 << 15  # rows of a batch at most
 BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else reads all of it
 
 

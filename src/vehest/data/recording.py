@@ -23,8 +23,8 @@ PART = "part"  # in the provenance of a part of a drive: its number and that of 
 DERIVED = "derived"  # likewise: the data set's transforms and points of its sensors
 MISSING = "missing_samples"  # likewise: channel, empty for all of them -> texts
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
-LOWEST_RATE = 1e-6
-HIGHEST_RATE = 1e5  # between which a sampling rate lies [Hz]
+LOWEST_RATE = 1e-6  # Hz; a recording with a lower rate is refused
+HIGHEST_RATE = 1e5  # Hz; a recording, clock or estimator with a higher rate is refused
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -30,7 +30,7 @@ from vehest.data.recording import Kind, Recording
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import first_line, parse_json
 
-_METADATA_KEY = b"vehest"
+_METADATA_KEY = b"vehest"  # key of vehest's description in the metadata of a Parquet file
 _FORMAT = 1
 _LAYOUT: dict[str, Any] = {
     "compression": "zstd",
