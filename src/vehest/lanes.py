@@ -28,7 +28,7 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
-BYTES = 64
+VECTOR_BYTES = 64  # size of a vector, in either precision
 _FUSED = ("contract",)
 
 
@@ -69,7 +69,7 @@ class _Model(models.PrimitiveModel):  # type: ignore[misc]
 
 def width(array: Any) -> int:
     """Number of lanes of a vector of an array's precision: 16 in float32, 8 in float64."""
-    return BYTES // array.itemsize
+    return VECTOR_BYTES // array.itemsize
 
 
 def load(array: Any, at: int) -> Any:
@@ -318,7 +318,7 @@ def _name_of(vector: Lanes) -> str:
 
 def _of(array: Any, fused: bool = True) -> Lanes:
     """Return the type of the vectors of an array type: 64 bytes of its precision."""
-    return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth, fused)
+    return Lanes(array.dtype, VECTOR_BYTES * 8 // array.dtype.bitwidth, fused)
 
 
 def _compiled(function: Any, type_of: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -51,7 +51,7 @@ from vehest.training.sequences import (
     train_phases,
 )
 
-# m/s, rad/s: standard deviations of the true state that a training sequence starts from
+# standard deviations of the true state that a training sequence starts from [m/s, rad/s]
 START = (
     0.1,
     0.02,
@@ -59,9 +59,9 @@ START = (
 # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is
 # pre-trained
 MAX_NOISE = 0.5
-SATURATED = 20.0  # of which the logistic function is 1
-DISTRUST = 1
-PROCESS = [2, 3]  # which outputs they are
+SATURATED = 20.0  # argument at which the logistic function is 1
+DISTRUST = 1  # index of the network's output for the deviation of its angle as a measurement
+PROCESS = [2, 3]  # indices of the outputs for the process noise of both states
 # share of the sequences of a batch beyond which training stops instead of going on without them
 MAX_LOST_SHARE = 0.5
 

@@ -15,9 +15,9 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-MIN_TIME_CONSTANT = 0.02
-MAX_TIME_CONSTANT = 200.0  # s, time constants that are looked at
-N_STARTS = 25  # of a grid over them, in equal ratios, around the best of which the search goes on
+MIN_TIME_CONSTANT = 0.02  # s, first time constant of the grid from which the search starts
+MAX_TIME_CONSTANT = 200.0  # s, its last one
+N_STARTS = 25  # time constants of the grid, in equal ratios; the search goes on around the best
 
 
 class Kinematic(Recursive):

@@ -9,7 +9,7 @@ import scipy
 
 from vehest.constants import FloatArray
 
-STOP_BAND_DB = 60.0
+STOP_BAND_DB = 60.0  # attenuation of the high-pass in its stop band
 
 
 def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:

@@ -41,7 +41,7 @@ import numpy as np
 from numba import types
 
 from vehest.filters.gating import refuses
-from vehest.lanes import BYTES, choose, load_unfused, most, root, store, store_some, width
+from vehest.lanes import VECTOR_BYTES, choose, load_unfused, most, root, store, store_some, width
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 ARGUMENTS: dict[str, Any] = {
@@ -85,7 +85,7 @@ def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
     """
     count = math.prod(shape)
     size = np.dtype(dtype).itemsize
-    return make(count + BYTES // size, dtype)[:count].reshape(shape)
+    return make(count + VECTOR_BYTES // size, dtype)[:count].reshape(shape)
 
 
 def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:

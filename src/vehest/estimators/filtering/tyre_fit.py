@@ -45,13 +45,15 @@ ROAD_TYRE_LOG_C1 = (
     math.log(0.5 * PEAK_SLIP**2),
     2.0 * PEAK_SPREAD,
 )
-MIN_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
+# of the residuals, as a share of the scale of forces: a curve may fit without any
+MIN_SPREAD = 1e-6
 PASSES = 3  # of weighing what is known against what the drives leave unexplained
-SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
-SMOOTHING_ORDER = 2
-BLOCK_SECONDS = 10.0  # residuals further apart than this count as independent
-MIN_SAMPLES = 100
-NORMAL_95 = 1.959964
+# s, window of the polynomial (Savitzky & Golay) by which forces and slips are smoothed
+SMOOTHING_SECONDS = 0.5
+SMOOTHING_ORDER = 2  # its degree; a window of as few samples is refused
+BLOCK_SECONDS = 10.0  # s; residuals further apart than this count as independent
+MIN_SAMPLES = 100  # samples fast enough in all recordings together; fewer are refused
+NORMAL_95 = 1.959964  # half width of the 95 % interval of a Gaussian, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)

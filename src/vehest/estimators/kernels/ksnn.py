@@ -53,7 +53,7 @@ from vehest.lanes import choose, least, load, most, store, total, width
 LINEAR = 8  # parameters of a local model besides its neurons
 # rows that a step saves for its adjoint: v, û, and the blended γ₁, γ₂, β₂ and both w₁
 SAVED_ROWS = 7
-CHANNELS = 4
+CHANNELS = 4  # inputs of a sample: yaw rate, speed, ay, ax
 
 
 def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int, ...]]:

@@ -29,8 +29,8 @@ from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.recursion import add, gather, slopes_of, squared_error, step_of_adam
 from vehest.lanes import load, store, total, width
 
-GRU = 3
-LSTM = 4  # gates
+GRU = 3  # gates, by which a cell is also identified
+LSTM = 4  # gates, likewise
 SAVED_ROWS = 6  # rows of the hidden state's size that a step saves: the gates and two more
 BLOCK = 4  # inputs whose weights' gradients are summed together
 

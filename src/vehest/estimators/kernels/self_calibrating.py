@@ -26,9 +26,9 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.lanes import BYTES, choose, least, load, most, root, store, total, width
+from vehest.lanes import VECTOR_BYTES, choose, least, load, most, root, store, total, width
 
-STATES = 8
+STATES = 8  # states of a filter, which the next line names
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
@@ -51,7 +51,7 @@ COST = GRIP + 2  # two rows, one a measurement: decrease of the log likelihood
 VARIANCE = GRIP + 4  # two rows, one a measurement: variance of the residual
 DERIVATIVE = GRIP + 6  # derivatives of a measurement by the states
 CROSS = DERIVATIVE + STATES  # covariances of a measurement with each state
-BANK_ROWS = CROSS + STATES
+BANK_ROWS = CROSS + STATES  # rows of the bank in all
 # index in the bank of a covariance's first lane, by row and column
 AT = np.array(
     [
@@ -59,7 +59,8 @@ AT = np.array(
         for i in range(STATES)
     ]
 )
-AT = (STATES + AT) * (BYTES // 8)
+# in numbers of float64: VECTOR_BYTES // 8 lanes in each row
+AT = (STATES + AT) * (VECTOR_BYTES // 8)
 MIN_GRIP_SHARE = 0.3  # of a grip limit that remains at any longitudinal acceleration
 ROLLING_DEVIATION = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 # of |e|, in deviations of its prior, above which b stays: a slide does not show the unit's place

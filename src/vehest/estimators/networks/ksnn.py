@@ -15,9 +15,9 @@ from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.kernels.recursion import Recursion
 from vehest.estimators.networks.compiled import CompiledNetwork
 
-GAMMA_START = 0.98
-GAMMA_SPREAD = 0.01
-SMALL = 0.1
+GAMMA_START = 0.98  # mean of the initial γ
+GAMMA_SPREAD = 0.01  # standard deviation of the initial γ, which are 1 at most
+INITIAL_DEVIATION = 0.1  # of the initial β from 1, and of linear and output weights from 0
 
 
 class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
@@ -69,13 +69,13 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
                 if name == "gamma":
                     parameter.copy_((GAMMA_START + GAMMA_SPREAD * noise).clamp(max=1.0))
                 elif name == "beta":
-                    parameter.copy_(1.0 + SMALL * noise)
+                    parameter.copy_(1.0 + INITIAL_DEVIATION * noise)
                 elif name == "hidden_weight":
                     parameter.copy_(noise)
                 elif name == "linear_weight":
-                    parameter.copy_(SMALL * noise.abs())
+                    parameter.copy_(INITIAL_DEVIATION * noise.abs())
                 elif name == "output_weight":
-                    parameter.copy_(SMALL * noise)
+                    parameter.copy_(INITIAL_DEVIATION * noise)
                 else:
                     parameter.copy_(0.01 * noise)
 
