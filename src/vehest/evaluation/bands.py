@@ -25,7 +25,7 @@ from vehest.trust.bands import (
 )
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # level of the interval of a coverage
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
 SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
 

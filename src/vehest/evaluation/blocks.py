@@ -20,9 +20,10 @@ from vehest.data.text_files import number_in, read_rows
 from vehest.evaluation.metrics import Scored, half_turned
 from vehest.evaluation.significance import root_intervals, unexplained_interval
 
-SEGMENT_SECONDS = 1.0
-MIN_PIECES_AS_BLOCKS = 8  # ranges or sequences, from which on each is a block
-MIN_BLOCKS = 3  # below which no interval is given
+SEGMENT_SECONDS = 1.0  # s, length of the segments over which errors are summed
+# ranges or sequences from which on each is a block; of fewer, each is cut into blocks
+MIN_PIECES_AS_BLOCKS = 8
+MIN_BLOCKS = 3  # with fewer blocks no interval is given
 
 
 @dataclass(frozen=True, eq=False)

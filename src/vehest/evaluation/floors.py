@@ -88,13 +88,13 @@ SETS = (
 STIFFNESS_DEVIATION = (
     math.log(15.0 / 6.0) / 4.0
 )  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
-BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white noise
-SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
-MIN_SAMPLES = 20
+BLOCK_SECONDS = 1.0  # s over which residuals are averaged to separate slow from white noise
+SLOW_SECONDS = (2.0, 100.0)  # s, shortest and longest time constant of slow noise
+MIN_SAMPLES = 20  # samples of all drives together; with fewer there is no floor
 MIN_WHITE_SHARE = 0.01  # of an axle's slow error, so that no measurement is exact
-SAMPLES_TOGETHER = 20_000  # samples that are held at once
+SAMPLES_TOGETHER = 20_000  # samples whose matrices are in memory at once
 UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
-MIN_POSITIVE = 1e-9
+MIN_POSITIVE = 1e-9  # least standard deviation of a noise or squared speed, so that none is 0
 
 _SPEEDS = ("motor_speed", "wheel_speed_")
 _SILENT = (

@@ -30,12 +30,12 @@ from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
 Mask = NDArray[np.bool_]
 
-STRAIGHT_YAW_RATE = 0.05  # rad/s
-AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s²
+STRAIGHT_YAW_RATE = 0.05  # rad/s; a car that turns more slowly drives straight ahead
+AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s², limits of the bands of |ay|
 # rates of change from which a sample is transient [rad/s², m/s³]
 TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}
-SLOPE_SECONDS = 0.5
-MIN_REGIME_SECONDS = 2.0  # of samples in a regime, below which it has no errors
+SLOPE_SECONDS = 0.5  # s around a sample; the slope of a line through them is its rate of change
+MIN_REGIME_SECONDS = 2.0  # s of samples in a regime; with less it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")
 
 AY_BANDS = {

@@ -18,10 +18,11 @@ from vehest.data.errors import DataError
 
 Pair = tuple[FloatArray, FloatArray]
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # level of all intervals; 1 - CONFIDENCE is that of tests
+# bootstrap resamples for the standard error of a ratio of pooled losses
 N_RESAMPLES_OF_RATIOS = 4000
-MAX_BLOCKS = 100_000  # that a needed number of blocks is sought up to
-DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
+MAX_BLOCKS = 100_000  # blocks up to which a needed number is searched
+DRAWN_AT_ONCE = 2_000_000  # block counts of resamples that are in memory at once
 
 
 @dataclass(frozen=True)

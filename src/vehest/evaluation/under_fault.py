@@ -20,7 +20,7 @@ from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
 from vehest.evaluation.metrics import Scored, half_turned
 
-SETTLED_SECONDS = 3.0
+SETTLED_SECONDS = 3.0  # s after the end of a fault, from which on samples count as `after`
 FAULTED = "faulted"
 AFTER = "after"
 

@@ -21,7 +21,14 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.export.program import TOLERANCES, context_of, program_files
 from vehest.export.rendering import Precision, render
-from vehest.export.vectors import COLUMNS, SECONDS, drive_for, in_float64, replayed, table_text
+from vehest.export.vectors import (
+    COLUMNS,
+    DRIVE_SECONDS,
+    drive_for,
+    in_float64,
+    replayed,
+    table_text,
+)
 from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
@@ -84,7 +91,7 @@ def export_model(
         twice as wide then.
     drive : Recording or None
         Recorded, at the rate at which samples come, for the test vectors; else they are
-        `SECONDS` of a drive with every fault.
+        `DRIVE_SECONDS` of a drive with every fault.
 
     Raises
     ------
@@ -160,7 +167,7 @@ def readme(
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
-        "vectors": f"{SECONDS:g} s of a drive with faults of every kind"
+        "vectors": f"{DRIVE_SECONDS:g} s of a drive with faults of every kind"
         if drive is None
         else f"{drive.duration:g} s of a recorded drive",
         "tolerance": f"{TOLERANCES[precision]:.0e}",

@@ -23,7 +23,7 @@ from vehest.estimators.base import Estimator
 from vehest.export.program import health_table
 from vehest.trust.contract import GuardedStepper
 
-SECONDS = 12.0
+DRIVE_SECONDS = 12.0  # s, length of the drive that test vectors are made of
 COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
 RADIUS = 0.3  # m, of a wheel where nothing was fitted
 
@@ -76,7 +76,7 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
     rows that are lost for 0.03 s and for 0.7 s; a row that comes twice.
     """
     rate = stepper.input_rate_hz
-    steps = round(SECONDS * rate)
+    steps = round(DRIVE_SECONDS * rate)
     times = np.arange(steps) / rate
     samples = _motion(stepper, times)
     names = list(samples)
