@@ -26,7 +26,7 @@ from vehest.estimators.registry import option_names
 from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.trust.record import Trust
 
-FORMAT = 1
+FORMAT = 1  # version of the record that `vehest identify` writes
 DEVIATION_FACTOR = 1.5
 """By which the deviations of a record are multiplied before an estimate starts from them."""
 LIMITS = {

@@ -37,8 +37,8 @@ PATENT_NOTE = (
 REPORT = "report"  # document of a study that one starts with
 
 MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
-PNG_DPI = 150
-PNG_COLOURS = 256
+PNG_DPI = 150  # resolution of figures as pixels, unless a caller says another
+PNG_COLOURS = 256  # colours of a PNG, the most that a palette may have
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
 _PATH = re.compile(r'\bd="[^"]*"')
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")

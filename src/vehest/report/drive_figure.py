@@ -68,7 +68,7 @@ COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to 
 HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}  # in
 
 DASHES = ("solid", "dashed", "dotted", "dashdot")  # of estimates by the same estimator
-NOTEBOOK_DPI = 110
+NOTEBOOK_DPI = 110  # resolution of the figure in a notebook
 MIN_AXIS = 0.1  # deg, of estimate over reference
 Draw = Callable[[Axes], None]
 

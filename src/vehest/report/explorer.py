@@ -21,8 +21,8 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.runs import true_runs
 
-LEVELS = 65_534
-GAP = 65_535  # code of a value that is not there
+N_STEPS = 65_534  # steps of a column's range, and code of its highest value; 16 bits but for GAP
+GAP = 65_535  # code of a missing value
 
 
 def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray | None]) -> str:
@@ -69,7 +69,7 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
             if finite.any()
             else (0.0, 0.0)
         )
-        scale = (high - low) / LEVELS or 1.0
+        scale = (high - low) / N_STEPS or 1.0
         codes = np.full(len(values), GAP, np.uint16)
         codes[finite] = np.round((values[finite] - low) / scale).astype(np.uint16)
         differences = np.diff(codes, prepend=np.uint16(0))  # modulo 2¹⁶

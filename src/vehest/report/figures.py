@@ -24,12 +24,12 @@ from vehest.report.style import (
 if TYPE_CHECKING:
     import pandas as pd
 
-STATIC_POINTS = 500
+STATIC_POINTS = 500  # points of a line in `traces_figure`, about
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
-MAX_POINTS = 2000  # of a line over a whole drive on one page
-MIN_SAMPLES_IN_BIN = 20
-LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
-SIDESTEP = 0.005  # of intervals that would cover each other
+MAX_POINTS = 2000  # points of a line over a whole drive, about
+MIN_SAMPLES_IN_BIN = 20  # of lateral acceleration; a bin with fewer shows no error
+LABEL_STEP = 0.05  # least distance of two labels, as a share of the axis
+SIDESTEP = 0.005  # shift of intervals that would cover each other, as a share of the axis
 # the reference under the estimates: wide enough to show on both sides of a line
 BELOW_ESTIMATES = {"color": REFERENCE_GREY, "linewidth": 2.4}
 LOSSES = ("epoch", "train_loss", "validation_loss")  # columns of a training history

@@ -52,10 +52,10 @@ from vehest.sources.base import read_single
 from vehest.sources.named_columns import NamedColumn
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
-MIN_COMMON_SECONDS = 5.0
-MIN_RATE_HZ = 1.0  # Hz
+MIN_COMMON_SECONDS = 5.0  # s that reference and all estimates must have in common; less is refused
+MIN_RATE_HZ = 1.0  # Hz; a reference that is sampled more slowly is refused
 BASELINES = ("zero", "static_map")  # rows of every comparison
-RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
+RATE_HZ = 20.0  # Hz, at which estimates are scored, unless the recording has less
 
 
 def compare_files(

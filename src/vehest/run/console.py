@@ -45,7 +45,7 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-MAX_BARS = 16
+MAX_BARS = 16  # progress bars at a time; further names get none
 MAX_SILENT_SECONDS = 5.0
 """After this time a stage that is still running gets a line, so that nobody takes it for a hang."""
 

@@ -18,7 +18,7 @@ from vehest.inference.tables import LOG_SUFFIXES
 from vehest.trust.health import HOLD_SECONDS
 from vehest.trust.health_kernel import CLEAR
 
-LABEL_WIDTH = 10
+LABEL_WIDTH = 10  # characters before the text of a line
 
 
 def point_of_estimate(model: Estimator, model_folder: Path) -> str:

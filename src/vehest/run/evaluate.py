@@ -66,12 +66,12 @@ STAGE = "evaluate"
 METRICS = "metrics.csv"
 BLOCKS = "blocks.csv"
 TIMES = ("train_seconds", "step_seconds")
-TIMED_STEPS = 200
+TIMED_STEPS = 200  # online steps at most, of which the median time is reported
 FIT_FIGURES = ("n_parameters", "epochs", "train_seconds")
 TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
 COLUMNS = METRIC_COLUMNS[1:]
-ALL_UNITS = UNITS | UNITS_UNDER_FAULT
+ALL_UNITS = UNITS | UNITS_UNDER_FAULT  # metric -> unit
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:

@@ -46,7 +46,7 @@ from vehest.run.versions import code_of, is_of_other_stages
 CODE = "code"
 DATA = "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
-MAX_NAMED = 6
+MAX_NAMED = 6  # changes of a cause that are named; further ones are counted
 STALE_LIST = "stale.yaml"
 """File in results/: studies that may still be stale, each with the reason and what will end it."""
 

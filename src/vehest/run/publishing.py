@@ -27,7 +27,7 @@ PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
 PUBLISHED_WEIGHTS = "weights.safetensors"
 SOURCES_OF_RESULTS = ("src", "conf", "pipelines")
-DIGITS = 6
+DIGITS = 6  # significant digits of numbers in published tables
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import describe_band, is_other_vehicle
 
+# of the bus from the model's, relative; with more, samples are filtered and thinned out
 MAX_RATE_DIFFERENCE = 1e-6
 
 

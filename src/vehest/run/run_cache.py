@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from vehest.run.runner import Runner
 
 FINISHED = "finished"  # folder of the records in an output root
-FORMAT = 5
+FORMAT = 5  # version of the records, a part of their keys
 _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 

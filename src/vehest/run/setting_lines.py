@@ -25,7 +25,7 @@ from vehest.data.errors import VehestError
 from vehest.declared import Declaration, declaration
 from vehest.estimators.registry import estimator_class
 
-COMMENT_COLUMN = 45
+COMMENT_COLUMN = 45  # column, from 0, at which the comment of a line of YAML begins
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
-MAX_RATE = 100.0  # Hz, at which both are correlated at most
-MIN_OVERLAP_SECONDS = 5.0
-MIN_OVERLAP_SHARE = 0.5  # of the shorter of both
+MAX_RATE = 100.0  # Hz; estimate and reference are correlated at this rate at most
+MIN_OVERLAP_SECONDS = 5.0  # s of samples that both have; a shift with less does not count
+MIN_OVERLAP_SHARE = 0.5  # the same as a share of the shorter one's samples
 MIN_VARIANCE_RATIO = 1.5
 """By which the second best shift must leave more variance unexplained than the best one, to be
 refused otherwise.

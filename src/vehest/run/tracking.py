@@ -35,7 +35,7 @@ REMOTE_ARTIFACTS = frozenset(
 )  # schemes of addresses at which MLflow writes to another machine
 LOCAL_STORES = frozenset(["sqlite", "file", ""])  # schemes of stores that no server answers for
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
-VALUE_LENGTH = 500
+VALUE_LENGTH = 500  # characters of a value in MLflow; longer ones are cut off
 KEY_TAG = "vehest.key"
 STAGE_TAG = "vehest.stage"
 DIGEST_TAG = "vehest.digest"

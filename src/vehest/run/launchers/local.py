@@ -34,7 +34,7 @@ Task = Callable[
     [Callable[[], bool], Callable[[Progress | Waiting], None]], Any
 ]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]
-POLL_SECONDS = 0.2
+POLL_SECONDS = 0.2  # s that workers are waited for at a time, and between two reports of progress
 READY = "ready"  # kinds of messages of a worker: it waits for its first task,
 PROGRESS = "progress"  # a task goes on,
 ENDED = "ended"  # a task returned or failed

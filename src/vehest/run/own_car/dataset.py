@@ -41,7 +41,7 @@ POLICIES = {
     **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform")),
 }
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
-BAG_HZ = 100.0
+BAG_HZ = 100.0  # Hz, highest rate that is proposed for the recordings of a bag
 MIN_GAP_SECONDS = 0.05  # s
 GAPS = (
     "it has missing samples, which are interpolated, or cut out beyond one second, only in a log "

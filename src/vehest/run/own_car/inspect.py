@@ -34,17 +34,18 @@ from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import STATED_UNITS, between_pauses
 from vehest.sources.unit_spellings import plain_unit
 
+# Hz, highest rate of the samples that proposals rest on; faster ones are averaged
 EVIDENCE_HZ = 50.0
 MIN_COVERED = 0.5  # share of a log that a column covers, for evidence to need it
 MAX_EVIDENCE_SECONDS = 1200.0  # s
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
 # s without a sample that straight lines bridge: as between fixes of a satellite receiver of 1 Hz
 MAX_BRIDGED_SECONDS = 1.1
-MAX_LISTED = 5
-# a column is another's difference from row to row: by so many rows from the middle of the log, the
-# share of them with the smaller steps, and the correlation
+MAX_LISTED = 5  # parts of a log that were not read, in a message; further ones are counted
+# rows in the middle of a log, by which a column is found to be the difference of another one
 MAX_COMPARED_ROWS = 4_000
-USUAL_STEP_QUANTILE = 0.99
+USUAL_STEP_QUANTILE = 0.99  # of the |steps| of a velocity; rows with larger steps are not compared
+# |correlation| with these steps, above which a column is their difference
 MIN_DIFFERENCE_CORRELATION = 0.999
 TABLES = ("tabular", "text_log")
 LAYOUT = {

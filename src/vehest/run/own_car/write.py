@@ -60,6 +60,7 @@ ASSUMED_WHEELBASE = 2.7  # m, where it is not given
 STIFFNESS = 10.0
 HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
+# Hz; slower recordings get no training that starts from the pretrained weights
 PRETRAINED_HZ = 20.0
 EVALUATED_HZ = 20  # that every estimate is scored at, where the recordings are sampled as fast
 RATE = "estimator.rate_hz="
