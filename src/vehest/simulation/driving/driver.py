@@ -25,8 +25,8 @@ from vehest.simulation.road.lines import Line
 
 DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
-LOWEST_CORRECTION = 0.5
-HIGHEST_CORRECTION = 2.0  # frequencies between which a driver corrects [Hz]; assumed
+LOWEST_CORRECTION = 0.5  # Hz, lowest frequency at which a driver corrects; assumed
+HIGHEST_CORRECTION = 2.0  # Hz, highest one; assumed
 
 WAVELENGTHS = (
     310.0,

@@ -70,9 +70,9 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-N_STATES = 29
-N_INPUTS = 5
-N_FORCES = 12
+N_STATES = 29  # numbers of a state in the library
+N_INPUTS = 5  # steering velocity, longitudinal acceleration, yaw moment, gravity along and across
+N_FORCES = 12  # of four wheels: along and across the level body's axes, then vertical
 
 # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
 ROLLED_OVER = 0.6

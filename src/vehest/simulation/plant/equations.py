@@ -53,7 +53,7 @@ stays finite.
 
 SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
 
-HEAVE_RATE = 12
+HEAVE_RATE = 12  # places in the state vector, beside those of `regimes`
 JOINT_FRONT = 27
 JOINT_REAR = 28
 

@@ -9,9 +9,9 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 
-RATE_HZ = 50.0
-AY_RATE = 0.5  # by which the lateral acceleration of a neutral car would grow [m/s³]
-MAX_SECONDS = 60.0  # length of a ramp
+RATE_HZ = 50.0  # Hz, rate of commands and of the motion
+AY_RATE = 0.5  # m/s³, by which the lateral acceleration of a neutral car would grow
+MAX_SECONDS = 60.0  # s; a ramp ends here at the latest
 
 
 def ramp_steer(

@@ -61,7 +61,7 @@ The rest goes into the drag of the steered front wheels, its yaw moment, and the
 against it takes.
 """
 
-HEAVE_FRONT = 16
+HEAVE_FRONT = 16  # places of the axles' heave in the state vector
 HEAVE_REAR = 21
 MIRRORED = (
     1,

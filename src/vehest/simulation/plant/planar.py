@@ -43,13 +43,15 @@ STICTION_SPEED = 1.0
 MIN_RELAXATION_SHARE = 0.2
 
 X, Y, YAW, VX, VY, YAW_RATE = range(6)
-FIRST_WHEEL = 6
-FIRST_SLIP_X = 10
-FIRST_SLIP_Y = 14
-LOAD_AX = 18
-LOAD_AY = 19
-STEER = 20
-CURRENT = 21
+# places in the state vector; from each first one on those of front left, front right, rear left and
+# rear right
+FIRST_WHEEL = 6  # speed of a wheel [rad/s]
+FIRST_SLIP_X = 10  # longitudinal slip of a tyre
+FIRST_SLIP_Y = 14  # lateral slip of a tyre
+LOAD_AX = 18  # longitudinal acceleration, low-passed, that shifts loads [m/s²]
+LOAD_AY = 19  # lateral acceleration, likewise [m/s²]
+STEER = 20  # steering angle [rad]
+CURRENT = 21  # motor current [A]
 N_STATES = 22
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 

@@ -57,10 +57,10 @@ SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes
 
 
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
-VY_FRONT = 15
-VY_REAR = 20
 # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear,
 # right rear by its names
+VY_FRONT = 15
+VY_REAR = 20
 FIRST_WHEEL = 23
 
 _kernel = numba.njit(

@@ -111,7 +111,7 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
     -------
     FloatArray
         (N,). The iteration ends once constraint and change are below ``_TOLERANCE``, or after
-        ``_MOST_ITERATIONS``.
+        ``_MAX_ITERATIONS``.
 
     Source: Boyd et al., "Distributed Optimization and Statistical Learning via the Alternating
     Direction Method of Multipliers", 2011, Section 5.2.
@@ -122,7 +122,7 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
     factor = cholesky_banded(bands)
     y = allowed = np.clip(np.zeros(len(lower)), lower, upper)
     multiplier = np.zeros(len(lower))
-    for _ in range(_MOST_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         before = allowed
         y = cho_solve_banded(
             (factor, False), _PENALTY * bounded * (allowed - multiplier), check_finite=False
@@ -137,9 +137,9 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
     return np.asarray(y)
 
 
-_PENALTY = 0.03
-_TOLERANCE = 1e-4
-_MOST_ITERATIONS = 3000
+_PENALTY = 0.03  # penalty of the alternating direction method; the solution does not depend on it
+_TOLERANCE = 1e-4  # of constraint and change, in the unit of y
+_MAX_ITERATIONS = 3000  # after these the iteration ends without an error
 
 
 def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) -> Line:
