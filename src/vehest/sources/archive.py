@@ -23,10 +23,10 @@ from vehest.data.files import no_room, regular_file, writing_error
 from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
-MOST_BYTES = 8 * 10**9
-ALLOWED_BYTES = 64 * 2**20  # to which any archive may unpack
-MOST_EXPANSION = 250  # times its packed size, to which a larger one may
-MOST_FILES = 10_000
+MOST_BYTES = 8 * 10**9  # bytes to which no archive may unpack, unless a caller allows more
+ALLOWED_BYTES = 64 * 2**20  # bytes to which any archive may unpack
+MOST_EXPANSION = 250  # times its packed size to which a larger one may unpack
+MOST_FILES = 10_000  # entries of an archive; one with more is refused
 # without LZMA, which takes as much memory as an entry asks for, up to 4 GiB
 METHODS = (
     zipfile.ZIP_STORED,

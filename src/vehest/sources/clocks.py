@@ -20,16 +20,16 @@ from vehest.data.recording import HIGHEST_RATE
 
 ClockPolicy = Literal["strict", "interpolate", "uniform"]
 
-LONGEST_STEP = 86_400.0  # s
-MOST_STEPS = 1e8  # median steps from the first to the last stamp
-LATEST_TIME = 1e11  # s; beyond it a double tells no two samples of 1e5 Hz apart
-GAP = 1.5  # median steps
-MOST_JITTER = 0.01  # of a step
-MOST_CLOCK_DRIFT = 0.5  # steps
-# of a step, over a whole recording, by which a plain rate may differ from the one found
+LONGEST_STEP = 86_400.0  # s; a recording with a longer typical step is refused
+MOST_STEPS = 1e8  # median steps from the first to the last stamp; a recording with more is refused
+LATEST_TIME = 1e11  # s; a later stamp is refused: two samples at 1e5 Hz would be the same double
+GAP = 1.5  # median steps; a longer step is a gap
+MOST_JITTER = 0.01  # of a step, by which an even interval may differ from the median
+# steps from the line between first and last stamp, within which a clock is even
+MOST_CLOCK_DRIFT = 0.5
+# steps over a whole recording by which a plain rate may differ from the measured one
 MOST_STRETCH = 0.1
-# of a step, over a whole recording, that may come from the resolution of the stamps
-MOST_DRIFT = 0.01
+MOST_DRIFT = 0.01  # steps over a whole recording that may come from the resolution of the stamps
 # an interpolated clock may run at any rate: take a plain one this near
 INTERPOLATED_TOLERANCE = 5e-3
 SLACK = 1e-6  # of a step; times that are nearer are the same
@@ -37,9 +37,11 @@ SORT = "repair, remove or sort the rows"
 BRIDGE = "cut the range out or set dataset.clock=interpolate"
 
 MIN_SAMPLES_OF_CLOCK = 20  # samples behind which an even clock is looked for
-BLOCK_SECONDS = 1.0
-REJECTED = 3.0  # standard deviations, taken from the median absolute residual
+BLOCK_SECONDS = 1.0  # s; blocks by whose median stamp missing samples and drift are looked for
+# standard deviations, by the median |residual|, beyond which a stamp is no part of the line
+REJECTED = 3.0
 MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
+# relative difference of a measured rate from the stated one, or from a limit, that passes
 RATE_TOLERANCE = 5e-3
 
 

@@ -29,11 +29,13 @@ from vehest.data.limits import Limits, current_limits, use_limits
 
 Arrays = dict[str, NDArray[Any]]
 
-SECONDS = 15.0  # of processor time for a small file
-SECONDS_PER_BYTE = 1e-6
-WAITING = 8.0  # times the processor time: a busy machine, or one without limits of its own
-MEMORY_PER_BYTE = 10.0
-NO_MEMORY = 77  # exit status
+SECONDS = 15.0  # s of processor time, to which SECONDS_PER_BYTE of the file are added
+SECONDS_PER_BYTE = 1e-6  # s of processor time more for each byte of the file
+# times the processor time that a reader may take in all: a busy machine, or one without limits of
+# its own
+WAITING = 8.0
+MEMORY_PER_BYTE = 10.0  # bytes of memory for each byte of the file, besides the limit `memory`
+NO_MEMORY = 77  # exit status of a reader that ran out of memory
 _COMMAND = [sys.executable, "-P", "-m", "vehest.sources.limited"]
 _SINGLE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"

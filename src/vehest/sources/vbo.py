@@ -46,7 +46,7 @@ UNITS = {
     "Longacc": "g",
     "Latacc": "g",
 }
-MAX_SATS = 255.0
+MAX_SATS = 255.0  # largest value of sats that is read: eight bits
 SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
 # measured by them; 0 where there is none
 OF_SATELLITES = re.compile(
@@ -57,7 +57,7 @@ KMH = 3.6
 # slower or straighter, slip angles at two wheels do not reveal where they hold
 MIN_TURNING_SPEED = 5.0  # m/s
 MIN_TURNING_YAW_RATE = 0.05  # rad/s
-MIN_TURNING_SAMPLES = 100
+MIN_TURNING_SAMPLES = 100  # samples in such turns; with fewer the slip angles are not checked
 # of the slip angles' difference that the yaw rate makes between the axles
 MIN_DIFFERENCE_SHARE = 0.25
 SLIP_CHECK = "slip_offsets"

@@ -26,8 +26,8 @@ from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 from vehest.sources.not_measured import marks_not_measured
 
-FINISHED = b"MDF     "
-UNFINISHED = b"UnFinMF "
+FINISHED = b"MDF     "  # first bytes of a file
+UNFINISHED = b"UnFinMF "  # first bytes of a file that its logger did not close
 EVALUATED = {
     v2_v3_blocks.ChannelConversion: {
         v3.CONVERSION_TYPE_FORMULA,

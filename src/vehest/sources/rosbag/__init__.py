@@ -36,6 +36,7 @@ from vehest.sources.pose import ground_plane
 from vehest.sources.rosbag.declarations import Pose, RosbagOptions, Topic
 from vehest.sources.rosbag.topics import STORAGES, bag_files, read_bag
 
+# fields of a pose: position [m], then the quaternion
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(
     f"orientation.{axis}" for axis in "xyzw"
 )

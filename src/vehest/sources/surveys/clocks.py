@@ -59,7 +59,7 @@ PARTS_OF_SECONDS = {  # names of columns that hold them, beside columns of whole
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
-MIN_LOG_SECONDS = 5.0
+MIN_LOG_SECONDS = 5.0  # s; where a unit makes a log shorter, a larger one is taken and asked for
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
@@ -79,7 +79,7 @@ REGULAR = 0.8  # share of the steps within half a median step
 GROWING = 0.9
 MOST_RESTARTS = 0.01  # of the rows
 MAX_APART = 1.0  # s between two columns of times in one row; beyond, they are different clocks
-MIN_TIMES = 10
+MIN_TIMES = 10  # rows; a column with fewer times is not compared, and has no rate
 MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ
 
 

@@ -68,7 +68,7 @@ from vehest.sources.tables import (
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
-HEAD = 1 << 18  # bytes that are looked at
+HEAD = 1 << 18  # bytes of a file that are looked at
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # of its numbers
@@ -87,7 +87,7 @@ ENCODINGS = {
     "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
 }
 CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
-MOST_CONTROLS = 0.01
+MOST_CONTROLS = 0.01  # of the first bytes of a file; with more it is no text
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 STATED_RATE = re.compile(
