@@ -66,7 +66,7 @@ from vehest.studies.kit.standing import (
 from vehest.studies.kit.warnings import sizes_of_sideslip, warnings_of
 
 TAKES = "split"
-MAX_DRAWN = 8
+MAX_DRAWN = 8  # estimators that figures show at most, the best by validation
 
 VERSION = "5"
 _ACCURACY = (
@@ -802,7 +802,7 @@ def _leaderboard_table(
 
 
 def _drawn_rows(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
-    """At most `MOST_SHOWN` rows in the order of the board, picked by validation.
+    """At most `MAX_DRAWN` rows in the order of the board, picked by validation.
 
     Where an estimator is ``named``, it comes first, and the best on the test is among them, since
     the verdict names both.

@@ -25,7 +25,7 @@ from vehest.studies.kit.standing import interval_in_words, standing_columns, ver
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "folds"
-SHOWS_FAILED = True
+SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 TEST = "test"
 
 VERSION = "3"

@@ -28,7 +28,7 @@ from vehest.studies.kit.recommendation import Recommendation, plain_text, recomm
 from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
-SHOWS_FAILED = True
+SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
 PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 

@@ -31,12 +31,12 @@ from vehest.report.style import (
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # level of the interval of a mean over seeds
 METRIC = "rmse_sideslip"
 DONE = "done"
 FAILED = "failed"
-MIN_RATIO_FOR_LOG = 20.0
-MAX_COLUMNS_SIDE_BY_SIDE = 6
+MIN_RATIO_FOR_LOG = 20.0  # highest over lowest value, above which colours are logarithmic
+MAX_COLUMNS_SIDE_BY_SIDE = 6  # columns of a heat map; those with more are drawn below one another
 CELL_HEIGHT = 0.42  # in
 NO_VALUE_COLOUR = "#ececec"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue

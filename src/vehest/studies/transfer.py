@@ -45,9 +45,9 @@ from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 VERSION = "4"
 TEMPLATE = Path(__file__).with_name("transfer.md.j2")
 TAKES = "parts"
-SHOWS_FAILED = True
-MAX_PANEL_COLUMNS = 4
-TITLE_WIDTH = 24
+SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
+MAX_PANEL_COLUMNS = 4  # panels side by side at most; further ones begin a row
+TITLE_WIDTH = 24  # characters of a line of a panel's title
 ROW_HEIGHT = 0.16  # in, height of an estimator
 REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
 """Baselines, in the order in which tables list them first."""

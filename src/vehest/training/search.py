@@ -21,7 +21,7 @@ from vehest.data.errors import DataError, MissingError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
-INITIAL_STEP_SHARE = 0.05
+INITIAL_STEP_SHARE = 0.05  # of a parameter's range: edges of the first simplex
 UNUSABLE_COST = 1e6  # instead of a cost that is not finite: a search goes on elsewhere
 MAX_GRID = 1000  # starts along a parameter
 Cost = Callable[[FloatArray], float]

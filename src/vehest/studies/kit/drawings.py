@@ -23,7 +23,7 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name
 
-ZOOM_SECONDS = 20.0
+ZOOM_SECONDS = 20.0  # s, length of the busiest part, which has a figure of its own
 MAX_IN_ZOOM = 4  # estimates in the figure of the busiest seconds
 TEST_COLOUR = "#0b4f9c"
 

@@ -20,7 +20,7 @@ from vehest.studies.kit.runs import Name
 from vehest.trust.health import health_rows
 from vehest.trust.record import TRUST, read_trust
 
-MAX_INPUTS = 16
+MAX_INPUTS = 16  # channels that the page can draw; further ones are left out
 DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
 RECKONED = (
     "No positions were recorded: the course is integrated from speed, reference and yaw rate, and "
