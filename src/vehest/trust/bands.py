@@ -44,15 +44,15 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number, check_numbers
 from vehest.trust.tyre_check import TyreCheck
 
-LEVELS = (0.5, 0.68, 0.9, 0.95)
-CHANNEL_LEVEL = 0.9  # of the channels band_vy and band_sideslip
+LEVELS = (0.5, 0.68, 0.9, 0.95)  # coverages, for each of which a band has a factor
+CHANNEL_LEVEL = 0.9  # coverage of the channels band_vy and band_sideslip
 
 MIN_RANGES = 10  # ranges, from which on each is a block
-TURN_YAW_RATE = 0.05  # rad/s
-MIN_BLOCK_SECONDS = 2.0
+TURN_YAW_RATE = 0.05  # rad/s, above which a car turns
+MIN_BLOCK_SECONDS = 2.0  # s; a turn that starts sooner after the last one belongs to the same block
 
-DOMAIN_QUANTILE = 0.999
-OTHER_VEHICLE = 2.0  # by which a band is wider on another car or tyre
+DOMAIN_QUANTILE = 0.999  # quantile of a term's size in training, beyond which bands widen
+OTHER_VEHICLE = 2.0  # factor by which a band is wider on another car or tyre
 LOWEST_SPEED = 1.0  # m/s, below which β is not resolved
 MIN_RELATIVE_SCALE = 0.1  # of the root mean square error in training: the scale's floor
 N_FITS = 20  # of the scale, each with the weights that the last one gives

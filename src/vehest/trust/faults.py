@@ -31,10 +31,10 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 Sizes = tuple[float, float, float]
 
 DEGREE = math.pi / 180.0
-PIECE_SECONDS = 0.2  # of losses in pieces
-LOSS_SECONDS = 0.2  # until a wheel is locked or spins
-SPIKE_SHARE = 0.02  # of the samples
-HUGE_SHARE = 0.05  # of the samples
+PIECE_SECONDS = 0.2  # s, length of the pieces in which samples are lost
+LOSS_SECONDS = 0.2  # s until a wheel is locked or spins
+SPIKE_SHARE = 0.02  # of the samples, which are spikes
+HUGE_SHARE = 0.05  # of the samples, which are huge
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {

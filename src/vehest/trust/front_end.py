@@ -21,11 +21,11 @@ from vehest.data.recording import HIGHEST_RATE
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
-ORDER = 4
-CUTOFF = 0.4  # of the estimator's rate, below its Nyquist frequency
+FILTER_ORDER = 4  # of the Butterworth low-pass
+CUTOFF = 0.4  # cut-off as a share of the estimator's rate, below its Nyquist frequency
 NOISE_BAND = (0.3, 0.4)  # of the model's rate, where the density of a channel's noise is taken
 TYPICAL_RATE_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
-SLACK = 1e-9
+SLACK = 1e-9  # relative; within it rates are equal, and a sample is due
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -74,7 +74,7 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
         axis=0,
     )
     sections = scipy.signal.butter(
-        ORDER, CUTOFF * rate_hz, fs=TYPICAL_RATE_RATIO * rate_hz, output="sos"
+        FILTER_ORDER, CUTOFF * rate_hz, fs=TYPICAL_RATE_RATIO * rate_hz, output="sos"
     )
     start = scipy.signal.sosfilt_zi(sections)[:, :, None] * fast[0]
     filtered = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::TYPICAL_RATE_RATIO]
@@ -123,7 +123,7 @@ class FrontEnd:
         self._phase = 1.0 - self.ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):
             self.sections = scipy.signal.butter(
-                ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos"
+                FILTER_ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos"
             )
         else:
             self.sections = np.zeros((0, 6))

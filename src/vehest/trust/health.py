@@ -51,21 +51,22 @@ from vehest.trust.relations import (
     without_glitches,
 )
 
+# status of an estimate, as the channel ``health`` has it
 VALID = 0
 DEGRADED = 1
 INVALID = 2
 
-HOLD_SECONDS = 1.0  # a flag is held for this time after the last statistic fell below its limit
-BRIDGED_SECONDS = 0.5  # a channel that is missing for longer makes the estimate invalid
-SPIN_SECONDS = 0.3
-SETTLE_SECONDS = 0.5  # after a start, before predictions count
+HOLD_SECONDS = 1.0  # s for which a flag is held after the last statistic fell below its limit
+BRIDGED_SECONDS = 0.5  # s; a channel that is missing for longer makes the estimate invalid
+SPIN_SECONDS = 0.3  # s beyond SPIN_MARGIN without a break, after which the car counts as spinning
+SETTLE_SECONDS = 0.5  # s after a start, before predictions count
 
 # Time constants of the statistics' means.
 SHARE_SECONDS = 0.5  # share of equal samples
 BRAKING_SECONDS = 0.2  # ax
 ENERGY_SECONDS = 0.5  # energy of the innovations before a jump
-OFFSET_SECONDS = 4.0
-RELATION_SECONDS = 1.0
+OFFSET_SECONDS = 4.0  # evidence of an offset in a channel
+RELATION_SECONDS = 1.0  # residual of a relation
 SHORT_SECONDS = 0.25  # both sides of a relation, before their signs and sizes are compared
 
 # Limits from healthy drives.
@@ -73,19 +74,20 @@ BLOCK_SECONDS = 5.0  # limits are set by the largest value in each block of this
 HOURS_BETWEEN_FALSE_ALARMS = 100.0  # healthy driving in which a limit is exceeded about once
 DAY_TO_DAY_FACTOR = 1.25  # tyres, track and wind of another day may raise a statistic by this
 MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, in a drive of any length
-MIN_RUN_SAMPLES = 4.0  # equal samples in a row
-MIN_REPEATED_SHARE = 0.3
+MIN_RUN_SAMPLES = 4.0  # equal samples in a row: smallest limit
+MIN_REPEATED_SHARE = 0.3  # share of equal samples: smallest limit
 MIN_LIMITS = {"normal": 4.5, "slip": 0.3, "largest": 0.0}
 """Rule of a statistic -> smallest limit; statistics of ``normal`` are N(0, 1) without a fault."""
 OUTLIER_FACTOR = 2.0  # a block that exceeds the next largest by this is a fault of the recording
-MAX_OUTLIER_SHARE = 0.01  # of the blocks
+MAX_OUTLIER_SHARE = 0.01  # of the blocks, which are set aside as such faults at most
+# yaw rate and vx·yaw_rate over their largest values in training, beyond which a car spins
 SPIN_MARGIN = 1.3
 MAX_RELATIVE_WEIGHT = 5.0  # of one sample in a likelihood ratio, over the mean weight
 STANDSTILL_LIMITS = {"yaw_rate": 0.05, "ay": 0.5}
 """Channel -> value below which the car may be at standstill [rad/s, m/s²]."""
 
-MAX_ORDER = 10
-MAX_COEFFICIENTS = 700  # of the autoregression, for the time of a step
+MAX_ORDER = 10  # samples that the autoregression looks back at most
+MAX_COEFFICIENTS = 700  # of the autoregression, which limits its order for the time of a step
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 """Channels of the autoregression, besides wheel speeds.

@@ -84,10 +84,10 @@ _SYMBOLS = dict(
 )
 _SYMBOLS[RATE] = "u"
 
-LOW_PASS_SECONDS = 0.5
-HUBER = 1.5  # robust standard deviations
+LOW_PASS_SECONDS = 0.5  # s, time constant of the low-pass of both sides of a relation
+HUBER = 1.5  # robust standard deviations, beyond which a residual weighs less
 MIN_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
-MIN_ROWS = 50
+MIN_ROWS = 50  # samples; with fewer a relation is left out, and glitches are not looked for
 
 
 @dataclass(frozen=True)
