@@ -52,7 +52,7 @@ SATELLITES = 63  # bits of sats that count them; others mark a trigger and a dif
 OF_SATELLITES = re.compile(
     r"lat|long|velocity|heading|height|vert-vel|Longacc|Latacc|True_Head|Slip_\w+|L(at|ng)\._Vel\."
 )
-JUMP = 1.5  # intervals by which the last row may come late
+JUMP = 1.5  # intervals; a last row that comes later is left out
 KMH = 3.6
 # slower or straighter, slip angles at two wheels do not reveal where they hold
 MIN_TURNING_SPEED = 5.0  # m/s

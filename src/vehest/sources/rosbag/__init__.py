@@ -40,7 +40,7 @@ from vehest.sources.rosbag.topics import STORAGES, bag_files, read_bag
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(
     f"orientation.{axis}" for axis in "xyzw"
 )
-MOST_WANDERING = 0.4  # of the grid's interval
+MOST_WANDERING = 0.4  # of the grid's interval, that uniform stamps may be away from an even clock
 
 
 @dataclass(frozen=True)

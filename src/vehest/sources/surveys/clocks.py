@@ -61,9 +61,9 @@ RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
 MIN_LOG_SECONDS = 5.0  # s; where a unit makes a log shorter, a larger one is taken and asked for
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
-MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
-FEWEST_STEPS = 5.0  # of such a gap
-FARTHEST_ROW = 100  # rows by which one may stand out of order
+MAX_GAP = 1.0  # s without a row, and FEWEST_STEPS, beyond which a run ends even so
+FEWEST_STEPS = 5.0  # typical steps that such a gap has
+FARTHEST_ROW = 100  # rows by which one may stand out of order, to be sorted
 TIME_FACTORS = (1, 1e3, 1e6, 1e9)
 PERIODS = {  # of a minute … a GPS week
     period * factor for period in (60.0, 3600.0, 86_400.0, 604_800.0) for factor in TIME_FACTORS
@@ -74,10 +74,11 @@ MODULI = (  # of counters, also as fractions of a second; of a second, a minute 
     *sorted(PERIODS),
 )
 MAX_WRAP_STEPS = 3.0  # steps that a counter that wraps may go ahead there
-REGULAR = 0.8  # share of the steps within half a median step
-# share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
+REGULAR = 0.8  # share of steps within half a typical step, for a column without a name of time
+# share of steps that grow, for a column that is named as time; stamps of a coarser resolution are
+# no clock
 GROWING = 0.9
-MOST_RESTARTS = 0.01  # of the rows
+MOST_RESTARTS = 0.01  # share of the rows at which times may go back, pause or begin anew
 MAX_APART = 1.0  # s between two columns of times in one row; beyond, they are different clocks
 MIN_TIMES = 10  # rows; a column with fewer times is not compared, and has no rate
 MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ

@@ -70,14 +70,14 @@ from vehest.sources.unit_spellings import plain_unit
 
 HEAD = 1 << 18  # bytes of a file that are looked at
 LONGEST_LINE = csv.field_size_limit()
-MAX_ODD_CELLS = 3  # texts in a column of numbers that count as missing samples
-MAX_ODD_SHARE = 0.01  # of its numbers
-MIN_SHARE_OF_KIND = 0.1  # of texts that name a kind of number
-MIN_UNITS_ABOVE = 0.7  # share of known units in a row above the names
-MAX_HEADER_LINES = 4  # of names, units, sources and the like
-MOST_LINES = 600  # of them, those before the names included
+MAX_ODD_CELLS = 3  # different texts in a column of numbers that count as missing samples
+MAX_ODD_SHARE = 0.01  # such cells over the numbers of a column; with more it is a column of texts
+MIN_SHARE_OF_KIND = 0.1  # of the texts of a column, above which an error names their kind
+MIN_UNITS_ABOVE = 0.7  # share of cells that are units, for a row of units above the names
+MAX_HEADER_LINES = 4  # lines of names, units, sources and the like, right above the numbers
+MOST_LINES = 600  # lines of a file that are looked at, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
-LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
+LEAST_NUMBERS = 0.5  # share of cells that are numbers or empty, from which on a row is one of data
 # encoding -> bytes that texts in Windows-1252 hardly have, its letters, and their least share of
 # all letters beyond ASCII: Chinese that is read as Korean has few other ones
 ENCODINGS = {
