@@ -59,7 +59,7 @@ START = (
 # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is
 # pre-trained
 MAX_NOISE = 0.5
-SATURATED = 20.0  # argument at which the logistic function is 1
+SATURATED = 20.0  # argument at which the logistic function is 1 but for 2e-9
 DISTRUST = 1  # index of the network's output for the deviation of its angle as a measurement
 PROCESS = [2, 3]  # indices of the outputs for the process noise of both states
 # share of the sequences of a batch beyond which training stops instead of going on without them

@@ -64,8 +64,8 @@ vx². ``variance`` is P.
 """
 
 MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
-MIN_TERM = 1e-30  # of the terms' sizes that are not 0
-MAX_TERM = 1e12  # of these and of weights
+MIN_TERM = 1e-30  # smallest size of a term in training that is not 0, in a file
+MAX_TERM = 1e12  # largest size or weight of a term, in a file
 FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
 HEAD_LENGTH = 7  # numbers before the weights in a `PackedBands`
 

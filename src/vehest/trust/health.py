@@ -63,7 +63,7 @@ SETTLE_SECONDS = 0.5  # s after a start, before predictions count
 
 # Time constants of the statistics' means.
 SHARE_SECONDS = 0.5  # share of equal samples
-BRAKING_SECONDS = 0.2  # ax
+BRAKING_SECONDS = 0.2  # ax, by which a wheel that stands is locked or lost
 ENERGY_SECONDS = 0.5  # energy of the innovations before a jump
 OFFSET_SECONDS = 4.0  # evidence of an offset in a channel
 RELATION_SECONDS = 1.0  # residual of a relation
@@ -73,7 +73,7 @@ SHORT_SECONDS = 0.25  # both sides of a relation, before their signs and sizes a
 BLOCK_SECONDS = 5.0  # limits are set by the largest value in each block of this length
 HOURS_BETWEEN_FALSE_ALARMS = 100.0  # healthy driving in which a limit is exceeded about once
 DAY_TO_DAY_FACTOR = 1.25  # tyres, track and wind of another day may raise a statistic by this
-MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, in a drive of any length
+MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, that a drive of any length counts for
 MIN_RUN_SAMPLES = 4.0  # equal samples in a row: smallest limit
 MIN_REPEATED_SHARE = 0.3  # share of equal samples: smallest limit
 MIN_LIMITS = {"normal": 4.5, "slip": 0.3, "largest": 0.0}

@@ -18,8 +18,9 @@ from vehest.trust.guard import RESTART, WAIT, GuardLimits
 LEAST_SPEED = 1.0  # m/s, below which the angle is not bounded
 SPIN_RATE = 4.0  # m/s²: |a_y - u r|, the change of v, beyond which a car that keeps it up spins
 SPIN_SECONDS = 0.3  # s beyond SPIN_RATE, less those below it, after which the car spins
-REMEMBERED_SECONDS = 3.0  # for which a spinning car is taken to be as fast as before
-LOST_SECONDS = 0.3  # beyond the bound, after which an estimator starts anew
+# s, time constant with which the speed before a spin, or before it was lost, fades
+REMEMBERED_SECONDS = 3.0
+LOST_SECONDS = 0.3  # s beyond the bound, after which an estimator starts anew
 FADE_SECONDS = 1.0  # time constant with which v goes to 0 where there is no estimate
 
 EXTRAPOLATED = 1  # no estimate: v fades from the last one

@@ -42,7 +42,7 @@ POLICIES = {
 }
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0  # Hz, highest rate that is proposed for the recordings of a bag
-MIN_GAP_SECONDS = 0.05  # s
+MIN_GAP_SECONDS = 0.05  # s, smallest max_gap of a topic; the widest gap makes it larger
 GAPS = (
     "it has missing samples, which are interpolated, or cut out beyond one second, only in a log "
     "with times"
@@ -50,14 +50,15 @@ GAPS = (
 CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
 CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
-POSE_SECONDS = 0.15  # of the filter that differentiates poses
+POSE_SECONDS = 0.15  # s, window of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "rotation", "spike")
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
 MIN_GAIN_FACTOR = 1.15
-MIN_TURN_YAW_RATE = 0.05  # rad/s
-MIN_TURNING_SECONDS = 5.0  # for which each half of a file turns as fast
+MIN_TURN_YAW_RATE = 0.05  # rad/s, above which a car turns
+# s of turning in each half of a file; with less, its gain is not compared
+MIN_TURNING_SECONDS = 5.0
 
 
 @dataclass(frozen=True, eq=False)

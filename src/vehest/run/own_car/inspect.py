@@ -37,7 +37,7 @@ from vehest.sources.unit_spellings import plain_unit
 # Hz, highest rate of the samples that proposals rest on; faster ones are averaged
 EVIDENCE_HZ = 50.0
 MIN_COVERED = 0.5  # share of a log that a column covers, for evidence to need it
-MAX_EVIDENCE_SECONDS = 1200.0  # s
+MAX_EVIDENCE_SECONDS = 1200.0  # s; of a longer log the busiest parts are used
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
 # s without a sample that straight lines bridge: as between fixes of a satellite receiver of 1 Hz
 MAX_BRIDGED_SECONDS = 1.1

@@ -35,10 +35,11 @@ from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
-TRAINED_SHARE = 0.7  # of the recordings: training and validation
-# of a recording's range for validation, a fifth of it; shorter recordings are used whole, if at all
+TRAINED_SHARE = 0.7  # of all recordings, for training and validation together
+# s, shortest range for validation, a fifth of a recording; shorter recordings are used whole, and
+# not at all below this
 MIN_BLOCK_SECONDS = 4.0
-MIN_SECONDS = 30.0  # of all recordings, to train at all
+MIN_SECONDS = 30.0  # s of all recordings together; with less there is no training
 ROLES_OF_THREE = ("train", "validation", "test")
 # of whole recordings, in turn
 ROLES = (
@@ -62,10 +63,11 @@ HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 # Hz; slower recordings get no training that starts from the pretrained weights
 PRETRAINED_HZ = 20.0
-EVALUATED_HZ = 20  # that every estimate is scored at, where the recordings are sampled as fast
+EVALUATED_HZ = 20  # Hz, at which estimates are scored, where all recordings are sampled as fast
 RATE = "estimator.rate_hz="
 ADDED = Trial(1, "added by --with")
-MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
+# minutes of reference, each a part of the pipeline where there are more
+MINUTES = (0.5, 1.0, 2.0, 5.0)
 DATASET_COMMENTS = {
     "kind": "real | simulated, as which tables and reports list the recordings",
     "vehicle": (
