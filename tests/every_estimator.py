@@ -101,7 +101,7 @@ def _fit(name, dtype, config):
     elif estimator.training_type in SAMPLED:
         training = SAMPLED[estimator.training_type](dtype)
         estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0, seed=1)[0]]), training)
-    elif name == "luenberger":
+    elif estimator.training_type is DirectSearchSettings:
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
     else:

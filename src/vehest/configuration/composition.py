@@ -315,7 +315,9 @@ def _error_line(error: Exception, command: str, composed: Any) -> str:
         group, _, option = unknown[1].partition(".")
         family = composed.get(group, {}).get("name") if isinstance(composed, dict) else None
         if group == "estimator" and family and option and "." not in option:
-            return unknown_option(str(family), option, _option_names())
+            message = unknown_option(str(family), option, _option_names())
+            fitted = f"; +estimator.{option}=… gives a number that is otherwise fitted"
+            return message if "did you mean" in message else message + fitted
         listing = f"'vehest config {command}' prints the options there are"
         meant = close_key(unknown[1], composed)
         hint = option_hint(unknown[1])

@@ -91,7 +91,8 @@ def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
     if not estimator.template:
         raise ConfigurationError(
             f"estimator '{estimator.name}' cannot be exported to C; these can: "
-            f"{', '.join(exportable())}"
+            f"{', '.join(exportable())}; a class of your own needs 'template' and 'c_values' "
+            "(docs/adding_an_estimator.md)"
         )
     estimator.online()  # raises where it is not causal, or not fitted
     path = f"methods/{estimator.template}.c.j2"

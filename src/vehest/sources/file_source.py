@@ -229,7 +229,7 @@ class FileSource(Source):
 
     def _gappy_among(self, channels: Iterable[str]) -> frozenset[str]:
         """Channels that the option ``gappy`` names, which must be among the data set's."""
-        gappy = frozenset(self.options.gappy or ())
+        gappy = frozenset(getattr(self.options, "gappy", None) or ())
         for name in sorted(gappy - set(channels)):
             raise ConfigurationError(
                 f"{self.location}: gappy names '{name}', which is not one of its channels"

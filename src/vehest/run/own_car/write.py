@@ -76,7 +76,7 @@ DATASET_COMMENTS = {
     ),
     "car": (
         "wheelbase [m], mass [kg], cg_to_rear_axle [m], imu_to_rear_axle [m] (negative behind it) "
-        "and steering_ratio, if known; every command uses them"
+        "and steering_ratio, if known; used where the estimator's settings leave them open"
     ),
     "time": "unit: s, ms, us, ns, d (days) or clock; null: no time column",
     "clock": "strict | interpolate (across gaps and jitter) | uniform",
