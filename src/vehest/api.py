@@ -202,10 +202,11 @@ def score(
 ) -> dict[str, float]:
     """Metrics of an estimate against the reference of its recording, or of a model on recordings.
 
-    Scored are 20 samples a second where there is an estimate, after the first 1.5 s of a recording,
-    over all recordings together. That a model was not trained on them is for the caller to see to;
-    it runs without the contract that holds online. Each recording's car is used as by `estimate`,
-    and its wheelbase gives the speed from which sideslip counts.
+    Scored are 20 samples a second (all of a slower recording) where there is an estimate, after the
+    first 1.5 s of a recording, over all recordings together. The caller has to make sure that a
+    model was not trained on them. A model runs without the guard, health and bridging of gaps that
+    it has online. Each recording's car is used as by `estimate`; sideslip is scored above a speed
+    that follows from its wheelbase.
 
     Parameters
     ----------

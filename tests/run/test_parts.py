@@ -143,7 +143,7 @@ def test_planning_opens_each_data_set_once_for_all_parts(parts_place, monkeypatc
 
     open_source = runner.open_source
     monkeypatch.setattr(runner, "open_source", counted)
-    monkeypatch.setattr(runner, "car_of", lambda dataset: counted(dataset).car_in_recordings)
+    monkeypatch.setattr(runner, "car_of", lambda dataset: counted(dataset).car_after_transforms)
     monkeypatch.setattr(runner.Runner, "run", lambda *_: ({}, {}))
     parts_place("run", "both", "tracking=none")
     # of the files and of the car; the files of the other one are not there

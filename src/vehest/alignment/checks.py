@@ -107,7 +107,10 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
 
 def _findings(recording: Recording, *, is_undivided: bool) -> list[Finding]:
-    """Findings of one part; only impossible values where the car stands throughout a part."""
+    """Findings of one part of a drive, or of all of it if ``is_undivided``.
+
+    Of a part in which the car stands throughout, only impossible values count.
+    """
     moving = ~standstill(recording)
     checks = _CHECKS if is_undivided or moving.any() else (_impossible_values,)
     return [finding for check in checks for finding in check(recording, moving)]

@@ -464,7 +464,7 @@ class WrongUnit:
 
     @property
     def factors(self) -> dict[str, float]:
-        """Factors that put the first explanation right."""
+        """Channel -> factor that corrects its values, by the first explanation, if there is one."""
         return {mistake.channel: 1.0 / mistake.factor for mistake in self.explanations[:1]}
 
     @property

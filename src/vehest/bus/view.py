@@ -11,7 +11,7 @@ from typing import Any, TextIO
 from vehest.trust.health import reason_in_words
 
 HEALTH = ("valid", "degraded", "invalid")
-LINE_SECONDS = 10.0  # s between two lines on the stream
+LINE_SECONDS = 10.0  # s, at least, between two lines that `View` writes
 
 
 @dataclass

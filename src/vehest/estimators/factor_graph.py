@@ -31,7 +31,7 @@ from vehest.filters.kalman_scan import kalman_scan
 
 @dataclass(frozen=True)
 class FactorNoise(Group):
-    """Standard deviations of the factors, per sample at 100 Hz."""
+    """Standard deviations of the factors, per sample at 100 Hz; the same numbers at other rates."""
 
     group = "estimator.noise"
     model_sideslip: float = setting(
@@ -58,11 +58,11 @@ class FactorNoise(Group):
 
 
 class WindowState(NamedTuple):
-    """Samples (N, 4) before the next one, the first state before its measurement, refusals."""
+    """What a moving window hands on to the next sample."""
 
-    samples: FloatArray
-    start: Gaussian[FloatArray]
-    refused: NDArray[np.int64]
+    samples: FloatArray  # of the channels: those in the window before the next one, (N, 4)
+    start: Gaussian[FloatArray]  # first state of the window, before its measurement
+    refused: NDArray[np.int64]  # counters of the gate (`vehest.filters.gating`), (2,)
 
 
 class FactorGraph(SideslipFilter):

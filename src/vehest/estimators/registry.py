@@ -43,7 +43,11 @@ def estimator_names() -> list[str]:
 
 @cache
 def estimator_class(name: str) -> type[Estimator]:
-    """The class behind a name; raises `ConfigurationError`: the name is unknown."""
+    """The class behind a name.
+
+    Raises `ConfigurationError` where the name is unknown, or an estimator of another package cannot
+    be loaded.
+    """
     module_class = _class_of_module(name)
     if module_class is not None:
         return module_class

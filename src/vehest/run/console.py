@@ -28,7 +28,7 @@ from vehest.data.errors import printable
 
 WARNING = "warn"
 REUSED = "skip"  # status of an existing artefact, also in records of finished studies
-RUNNING = "run"
+RUNNING = "run"  # status of a stage that is running
 PLAN = "plan"  # stage before those of a study: libraries and configurations are loaded
 MARKS = {
     WARNING: ("warning", "yellow"),

@@ -36,7 +36,7 @@ SCORE_HEADER = (
 
 @dataclass(frozen=True)
 class TerminalTable:
-    """A table in a terminal, with or without a title."""
+    """Cells, header and title of a table that `emit` prints; ``title`` may be empty."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]

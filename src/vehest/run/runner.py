@@ -320,8 +320,8 @@ class Runner(Stages):
         """Train and evaluate groups, side by side where there are cores; where members of a group
         fail by their data, each is tried alone.
 
-        Raises `MissingError` where no member is there and a command has to be run first, `Stopped`
-        at a signal; finished artefacts stay.
+        Raises `Stopped` at a signal; finished artefacts stay. With ``train_first``, trainings that
+        are missing raise nothing here; they are in neither mapping.
 
         Parameters
         ----------

@@ -461,9 +461,10 @@ def _settings_without(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> tuple[tuple[str, ...], str]:
-    """Overrides that avoid channels without a supply, taken while they help.
+    """Overrides of the estimator by which fewer channels are missing, and the same in words.
 
-    And the same in words.
+    Step by step the one that leaves the fewest is taken, until none leaves fewer. ``missing`` are
+    the channels that no transform makes.
     """
     changes: dict[str, Any] = {}
     while missing:

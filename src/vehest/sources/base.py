@@ -142,7 +142,7 @@ def car_of(dataset: Mapping[str, Any]) -> CarValues:
     ConfigurationError
         A value is not positive, or the data set makes no sense.
     """
-    return open_source(dataset).car_in_recordings
+    return open_source(dataset).car_after_transforms
 
 
 class Source(ABC):
@@ -223,8 +223,8 @@ class Source(ABC):
         return self.declared_car or CarValues()
 
     @cached_property
-    def car_in_recordings(self) -> CarValues:
-        """Values of the car that recordings show, after the transforms; see `car_of`."""
+    def car_after_transforms(self) -> CarValues:
+        """Configured values of the car, scaled as the transforms scale it; see `car_of`."""
         car = self.car
         for transform in self.transforms:
             if isinstance(transform, ScaleToWheelbase):
@@ -303,7 +303,7 @@ class Source(ABC):
                 f"{self.location}, recording '{recording.id}'",
                 "correct time or rate_hz",
             )
-        recording = replace(recording, car=self.car_in_recordings)
+        recording = replace(recording, car=self.car_after_transforms)
         if DERIVED in recording.provenance:
             return recording
         for transform in self.transforms:
@@ -339,7 +339,7 @@ class Source(ABC):
         )
 
     def file_names(self) -> list[str]:
-        """Files that the configuration alone names, which ``download`` fetches if it lists none."""
+        """Files that the configuration alone names; ``download`` without ``files`` fetches them."""
         return []
 
     def recordings(self) -> Iterator[Recording]:

@@ -39,7 +39,7 @@ class MdfChannel(SignalChannel, SampledColumn):
 
 
 class MdfSource(SignalSource):
-    """Measurements, a recording each."""
+    """Measurements, a recording each or, with ``max_gap``, one for each part between pauses."""
 
     options_type = MdfOptions
     channel_type = MdfChannel

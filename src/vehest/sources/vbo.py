@@ -46,7 +46,7 @@ UNITS = {
     "Longacc": "g",
     "Latacc": "g",
 }
-MAX_SATS = 255.0  # largest value of sats that is read: eight bits
+MAX_SATS = 255.0  # sats has eight bits; larger values are clipped to this
 SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
 # measured by them; 0 where there is none
 OF_SATELLITES = re.compile(
@@ -54,7 +54,7 @@ OF_SATELLITES = re.compile(
 )
 JUMP = 1.5  # intervals; a last row that comes later is left out
 KMH = 3.6
-# slower or straighter, slip angles at two wheels do not reveal where they hold
+# slower or straighter samples do not show whether the logger's slip offsets changed places
 MIN_TURNING_SPEED = 5.0  # m/s
 MIN_TURNING_YAW_RATE = 0.05  # rad/s
 MIN_TURNING_SAMPLES = 100  # samples in such turns; with fewer the slip angles are not checked
@@ -98,7 +98,7 @@ class Log:
 
 
 class VboSource(FileSource):
-    """Logs, a recording each."""
+    """Logs of a VBOX, a recording each, or one for each part between pauses."""
 
     options_type = VboOptions
 

@@ -129,7 +129,7 @@ class EvaluatedModel:
         return {row["metric"]: number_in(row, "value", path) for row in rows}
 
     def segments(self, test_set: str) -> Segments:
-        """Sums of its errors over segments of a test set.
+        """Sums of the model's errors over the segments of a test set.
 
         Returns
         -------

@@ -25,9 +25,9 @@ EVEN_INTERVALS = (0.6, 1.6)  # sampling intervals from one stamp to the next tha
 RATE_INTERVALS = 20  # first intervals, whose median is compared with the expected interval
 RATE_TOLERANCE = 0.2  # relative deviation of that median beyond which another rate is warned of
 
-CLOCK_STOPPED = 33
-CLOCK_JUMPED = 34
-CLOCK_UNEVEN = 35
+CLOCK_STOPPED = 33  # reason of a health code: time stamps do not advance
+CLOCK_JUMPED = 34  # time stamps jump
+CLOCK_UNEVEN = 35  # time stamps are unevenly spaced
 """Kinds of reasons that follow from time stamps (`vehest.trust.health.REASONS`)."""
 
 REPEATED = -1

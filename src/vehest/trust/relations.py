@@ -158,7 +158,8 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
 def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[str, FloatArray]:
     """Feature -> (T,), of channels as they are measured.
 
-    Those that need a channel that is not there are of zeros.
+    A channel that is not there counts as zeros; without a speed, ``r/u`` and ``ay/u²`` divide by
+    ``least_speed``.
 
     Parameters
     ----------

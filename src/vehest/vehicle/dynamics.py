@@ -89,7 +89,7 @@ class Perceptron(nn.Sequential):
                         )
 
     def layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weight and offset of each layer, scales included.
+        """Weight and bias of each layer, with the scales of inputs and outputs in them.
 
         Returns
         -------

@@ -371,7 +371,10 @@ def _beyond(explaining: FloatArray, samples: FloatArray) -> FloatArray:
 
 
 def _agreements_with_ax(search: Search, unit: str = "") -> list[tuple[Agreement, Candidate]]:
-    """Agreements of d(vx)/dt with possible columns of ax, in ``unit`` where they have none."""
+    """Agreements of d(vx)/dt with columns that may be ax.
+
+    A column without a unit is taken in ``unit``; if that is empty, in the unit that fits best.
+    """
     columns = [column for column in search.free if may_be_ax(column)][:MAX_AX_CANDIDATES]
     return [
         (longitudinal(search.motion, column, [column.unit or unit] if unit else ()), column)

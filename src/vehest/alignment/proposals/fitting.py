@@ -62,7 +62,7 @@ POSSIBLE_LENGTHS = {
     "steer": (1.2, 7.0),
     "handwheel": (12.0, 130.0),
 }
-# the same of usual cars [m]; an estimate beyond is an error
+# wheelbase, and wheelbase times steering ratio, of usual cars [m]; others hint at a wrong unit
 USUAL_LENGTHS = {
     "steer": (1.8, 5.0),
     "handwheel": (25.0, 80.0),

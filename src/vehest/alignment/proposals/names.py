@@ -14,7 +14,7 @@ from functools import cache
 STRONG = 4.0  # score of a role that a name states
 WEAK = 2.0  # score of a role that a name may state
 
-_STRONG = {  # over the name without blanks
+_STRONG = {  # role -> pattern, searched for in the name without blanks
     "other": (
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
         r"status|lapn|^lap|runde|dist|strecke|weg$|height|altit|hoehe|vertvel|cov|^rms|rms$|std|"

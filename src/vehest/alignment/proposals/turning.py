@@ -43,7 +43,7 @@ RANGES = {
     "ay": (0.3, 60.0),
 }
 MAX_COLUMNS = 60  # columns tried as one channel at most, the best by name
-MAX_TURNINGS = 8  # triples at most for which rare units are tried, and that are returned
+MAX_TURNINGS = 8  # triples vx, yaw_rate, ay, at most, that rare units are tried for and returned
 MIN_SCORE = 6.0  # of a triple; those with less are dropped
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a
@@ -75,7 +75,7 @@ MIN_AY_RIVAL_CORRELATION = 0.7
 # of the steps from sample to sample, within which a column is a copy; two sensors differ by as much
 # as their noise
 MAX_COPY_DIFFERENCE = 0.05
-# |logarithm| of the ratio of two sizes; with more they are not one quantity in that unit
+# |logarithm| of the ratio of the sizes of two columns; with more, one does not repeat the other
 MAX_REPEAT_MISMATCH = 0.35
 MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
 

@@ -31,7 +31,7 @@ from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
 from vehest.training.sequences import record_of_phases, train_phases
 
 CORNERS = ("fl", "fr", "rl", "rr")
-IMU = ("ax", "ay", "vx", "steer", "yaw_rate")
+IMU = ("ax", "ay", "vx", "steer", "yaw_rate")  # motion and steering, without tyre forces
 INPUTS: dict[str, tuple[str, ...]] = {
     "full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)),
     "imu": IMU,

@@ -55,7 +55,7 @@ class Series:
 
 
 class RosbagSource(FileSource):
-    """Bags, a recording each; its options are those of `RosbagOptions`."""
+    """Bags, a recording each or, with ``max_gap``, one for each part between pauses."""
 
     options_type = RosbagOptions
     options: RosbagOptions

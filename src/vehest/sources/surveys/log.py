@@ -75,9 +75,9 @@ class Log:
         return {column.name: column for column in self.columns}
 
     def file_row(self, place: int) -> int:
-        """Number in the file, from 1, of a row of the columns, from 0.
+        """Number among the file's data rows, from 1, of a row of the columns, from 0.
 
-        It differs by one and by the rows before it that repeat the names.
+        Rows that repeat the names are counted in the file, but are in no column.
         """
         row = place + 1
         for repeated in self.repeated_names:
