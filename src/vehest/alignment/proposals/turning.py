@@ -169,11 +169,19 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
             if len({id(column) for column in (speed, rates[i], accelerations[j])}) == 3:
                 named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
                 turnings.append((named, float(correlations[i, j]), float(ay_scales[j] / scales[i])))
+    names = NameEvidence.of(columns)
+    choices = {
+        channel: {column: _unit_choices(column, channel) for column in pool}
+        for channel, pool in zip(RANGES, (speeds, rates, accelerations), strict=True)
+    }
     scored = sorted(
-        ((_scored(columns, *turning), turning) for turning in turnings),
+        ((_scored(names, choices, *turning), turning) for turning in turnings),
         key=lambda entry: -entry[0].score,
     )
-    best = [_scored(columns, *turning, try_rare_units=True) for _, turning in scored[:MAX_TURNINGS]]
+    best = [
+        _scored(names, choices, *turning, try_rare_units=True)
+        for _, turning in scored[:MAX_TURNINGS]
+    ]
     return sorted(
         (turning for turning in best if turning.score >= MIN_SCORE),
         key=lambda turning: -turning.score,
@@ -292,34 +300,78 @@ def is_plausible(size: float, channel: str, unit: str) -> bool:
     return low <= size * si_factor(unit, channel) <= high
 
 
+class NameEvidence(NamedTuple):
+    """What the names of all columns of a log say, beside the three that are tried."""
+
+    strongest: Mapping[str, float]  # by channel: the clearest name of any column for it
+    n_ay: int  # columns that are named like a lateral acceleration
+    is_bus: bool  # whether one of these is a signal of a bus
+
+    @classmethod
+    def of(cls, columns: Sequence[Candidate]) -> NameEvidence:
+        """Of the columns of a log."""
+        accelerations = [column for column in columns if "ay" in column.hints]
+        return cls(
+            {
+                channel: max((column.hints.get(channel, 0.0) for column in columns), default=0.0)
+                for channel in RANGES
+            },
+            len(accelerations),
+            any(column.is_of_bus for column in accelerations),
+        )
+
+
+class UnitChoice(NamedTuple):
+    """A unit that a column may have as a channel."""
+
+    unit: str
+    factor: float  # to SI
+    is_implausible: bool  # by the size that the column then has
+    rarity: float  # cost
+
+
+def _unit_choices(
+    column: Candidate, channel: str, *, try_rare_units: bool = False
+) -> tuple[UnitChoice, ...]:
+    """Units of a column as a channel; with ``try_rare_units`` rare ones too if it states none."""
+    units = (
+        (*UNITS[channel], *RARE_UNITS[channel])
+        if try_rare_units and not column.unit
+        else column.units(channel)
+    )
+    return tuple(
+        UnitChoice(
+            unit,
+            si_factor(unit, channel),
+            not is_plausible(column.size, channel, unit),
+            UNIT_PENALTIES.get(unit, RARITY * (unit in RARE_UNITS[channel]))
+            if column.unit != unit
+            else 0.0,
+        )
+        for unit in units
+    )
+
+
 def _ranked(
-    named: Mapping[str, Candidate], file_gain: float, units_of: Mapping[str, Sequence[str]]
+    choices: Sequence[Sequence[UnitChoice]], file_gain: float
 ) -> list[tuple[float, float, tuple[str, ...], float, int]]:
     """Units of the three with their cost, the logarithm of the gain, the gain and the number of
     implausible sizes, the best first.
     """
     ranked = []
-    for units in product(*units_of.values()):
-        speed, rate, acceleration = (
-            si_factor(unit, channel) for unit, channel in zip(units, named, strict=True)
-        )
-        gain = file_gain / (speed * rate / acceleration)
-        n_implausible = sum(
-            not is_plausible(column.size, channel, unit)
-            for (channel, column), unit in zip(named.items(), units, strict=True)
-        )
-        rarity = sum(
-            UNIT_PENALTIES.get(unit, RARITY * (unit in RARE_UNITS[channel]))
-            for unit, (channel, column) in zip(units, named.items(), strict=True)
-            if column.unit != unit
-        )
+    for speed, rate, acceleration in product(*choices):
+        gain = file_gain / (speed.factor * rate.factor / acceleration.factor)
+        n_implausible = speed.is_implausible + rate.is_implausible + acceleration.is_implausible
+        rarity = speed.rarity + rate.rarity + acceleration.rarity
         mismatch = abs(math.log(gain))
+        units = (speed.unit, rate.unit, acceleration.unit)
         ranked.append((mismatch + rarity + n_implausible, mismatch, units, gain, n_implausible))
     return sorted(ranked)
 
 
 def _scored(
-    columns: Sequence[Candidate],
+    names: NameEvidence,
+    choices: Mapping[str, Mapping[Candidate, Sequence[UnitChoice]]],
     named: Mapping[str, Candidate],
     correlation_with_ay: float,
     file_gain: float,
@@ -329,13 +381,10 @@ def _scored(
     """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
     evidence.
     """
-    ranked = _ranked(named, file_gain, {name: column.units(name) for name, column in named.items()})
+    ranked = _ranked([choices[name][column] for name, column in named.items()], file_gain)
     if try_rare_units and ranked[0][0] >= FAR_MISMATCH:
-        units_of = {
-            name: column.units(name) if column.unit else (*UNITS[name], *RARE_UNITS[name])
-            for name, column in named.items()
-        }
-        ranked = _ranked(named, file_gain, units_of)
+        rare = [_unit_choices(column, name, try_rare_units=True) for name, column in named.items()]
+        ranked = _ranked(rare, file_gain)
     cost, mismatch, units, gain, n_implausible = ranked[0]
     decided = mismatch < FAR_MISMATCH and (
         len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
@@ -346,19 +395,13 @@ def _scored(
             column.hint(channel) + (1.5 if column.unit else 0.0) - 0.5 * is_filtered(column.name)
         )
         if channel not in column.hints:
-            score -= (
-                UNNAMED_PENALTY
-                * max((rival.hints.get(channel, 0.0) for rival in columns), default=0.0)
-                / STRONG
-            )
-    score -= (
-        3.0 if any(column.is_of_bus and "ay" in column.hints for column in columns) else 0.5
-    ) * named["ay"].is_reference + 5.0 * n_implausible
+            score -= UNNAMED_PENALTY * names.strongest[channel] / STRONG
+    score -= (3.0 if names.is_bus else 0.5) * named["ay"].is_reference + 5.0 * n_implausible
     score += -5.0 if mismatch >= FAR_MISMATCH else 3.0 if mismatch < CLOSE_MISMATCH else 1.0
     score -= UNNAMED_PENALTY * (not is_evident(named["ay"], gain))
-    has_other_ay = any("ay" in column.hints for column in columns if column is not named["ay"])
+    n_other_ay = names.n_ay - ("ay" in named["ay"].hints)
     score -= COMPUTED_PENALTY * (
-        abs(correlation_with_ay) > MIN_COMPUTED_CORRELATION and has_other_ay
+        abs(correlation_with_ay) > MIN_COMPUTED_CORRELATION and n_other_ay > 0
     )
     return Turning(
         named, dict(zip(named, units, strict=True)), decided, correlation_with_ay, gain, score
