@@ -30,6 +30,7 @@ OF_A_DTYPE = [
     for name in estimator_names()
     if "dtype" in {field.name for field in fields(estimator_class(name).training_type)}
 ]
+SLOW_TO_COMPILE = {"learned_ukf": pytest.mark.apart}  # a minute for each precision
 
 
 def test_parameter_counts_are_those_of_the_paper():
@@ -67,7 +68,10 @@ def test_configuration_file_states_the_defaults(name):
     ("name", "dtype", "tolerance"),
     [
         *((name, "float64", 1e-9) for name in estimator_names()),
-        *((name, "float32", 1e-4) for name in OF_A_DTYPE),
+        *(
+            pytest.param(name, "float32", 1e-4, marks=SLOW_TO_COMPILE.get(name, ()))
+            for name in OF_A_DTYPE
+        ),
     ],
 )
 def test_online_agrees_with_batch(name, dtype, tolerance):
@@ -98,7 +102,8 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", estimator_names())
 def test_model_read_back_estimates_the_same(tmp_path, name):
-    estimator = fitted_once(name, "float32" if name in OF_A_DTYPE else "float64")
+    is_single = name in OF_A_DTYPE and name not in SLOW_TO_COMPILE
+    estimator = fitted_once(name, "float32" if is_single else "float64")
     save_model(estimator, tmp_path, {"seed": 0})
     loaded = load_model(tmp_path)
     drive = drive_for(estimator)

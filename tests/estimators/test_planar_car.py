@@ -110,6 +110,7 @@ def test_compiled_filter_has_values_and_gradients_of_the_readable_filter(kind):
         assert float(gradient.abs().max()) > 0, name
 
 
+@pytest.mark.apart  # compiles the filter and its adjoint for a minute
 def test_in_single_precision_values_agree_and_gradients_survive_a_crawl():
     car = a_car(dtype=torch.float32)
     mean, single_gradients = through_the_filter(car, True, torch.float32)
