@@ -4,6 +4,7 @@ import os
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the other core has tests of its own
 
+import gc
 import pickle
 from functools import cache
 from hashlib import sha256
@@ -20,6 +21,7 @@ from vehest.alignment import delays
 from vehest.data.recording import Recording
 
 torch.set_num_threads(1)
+gc.set_threshold(10_000)  # as in every command: compilers make many objects
 
 
 def pytest_collection_modifyitems(items):
