@@ -4,16 +4,31 @@ import os
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the other core has tests of its own
 
+import gc
+import pickle
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+import omegaconf
 import pytest
 import torch
+import typer
 
 import processes
+from vehest.alignment import delays
 from vehest.data.recording import Recording
 
 torch.set_num_threads(1)
+gc.set_threshold(10_000)  # as in every command: compilers make many objects
+
+
+def pytest_collection_modifyitems(items):
+    """Tests of the unscented filters' families come first and thereby on one worker, since each
+    worker that needs their kernels while another compiles them compiles them too, for a minute.
+    """
+    items.sort(key=lambda item: not item.name.endswith(("[learned_ukf]", "[cnn_ukf]")))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -65,6 +80,37 @@ def _composed_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(config, "compose", compose_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _commands_built_once():
+    """Typer builds its commands from the functions of the command line once, which takes it 30 ms,
+    and OmegaConf parses the same text once.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", cache(typer.main.get_command))
+        for module in (omegaconf.base, omegaconf.grammar_parser):
+            patch.setattr(module, "parse", cache(omegaconf.grammar_parser.parse))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _drives_aligned_once():
+    """The clocks of the same drive are compared once: most tests of commands read the same few
+    drives, whose delays take 50 ms each to estimate.
+    """
+    estimate = delays.lateral_lateness
+    estimated = {}
+
+    def estimate_once(motion):
+        key = sha256(pickle.dumps(motion)).digest()
+        if key not in estimated:
+            estimated[key] = estimate(motion)
+        return estimated[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(delays, "lateral_lateness", estimate_once)
         yield
 
 

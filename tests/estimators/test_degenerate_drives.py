@@ -18,6 +18,7 @@ from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid, 
 STRAIGHT = dict.fromkeys(("yaw_rate", "ay", "steer", "vy_ref", "sideslip_ref", "yaw_rate_ref"), 0.0)
 AT_REST = STRAIGHT | dict.fromkeys(("vx", "ax", "vx_ref", "motor_speed", "motor_current"), 0.0)
 NO_CURVES = {"rational_ekf": {}}
+TRAINED_THROUGH_A_FILTER = ("cnn_ukf", "learned_ukf")  # eight trainings of them take 15 s
 
 
 def _with(recording, channels):
@@ -67,7 +68,13 @@ def arguments_of(monkeypatch):
     return arguments
 
 
-@pytest.mark.parametrize("name", sorted(estimator_names()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.apart if name in TRAINED_THROUGH_A_FILTER else ())
+        for name in sorted(estimator_names())
+    ],
+)
 def test_a_drive_that_shows_little_is_refused_or_gives_a_finite_model(tmp_path, arguments_of, name):
     data, training = arguments_of(name)
     config = NO_CURVES.get(name, CONFIGS.get(name, {}))

@@ -64,7 +64,7 @@ def estimator(name, gate=None):
         with torch.no_grad():
             network.get_parameter("bias_3")[0, 1:] = torch.tensor([0.0, -6.0, -6.0])
     if name.startswith("learned_ukf"):
-        gated.filter.reset(torch.Generator().manual_seed(0))
+        gated.filter.double().reset(torch.Generator().manual_seed(0))
     return gated
 
 

@@ -64,6 +64,7 @@ def _estimate_of_drive(name, recording, **config):
     return accuracy([score(estimate, Resample(20.0)(recording), span, Protocol(20.0))])
 
 
+@pytest.mark.apart  # optimises the whole drive twice
 def test_kalman_filter_and_factor_graph_reproduce_the_published_ferrari_drive(
     ferrari,
 ):

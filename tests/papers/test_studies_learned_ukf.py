@@ -118,7 +118,7 @@ def recording(name, seconds=3.2, seed=0):
 def filter_of(seed=0, **settings):
     """A filter with networks of random weights, not trained."""
     estimator = LearnedUkf(LearnedUkf.settings_type(**{"width": 4, "scaled": False, **settings}))
-    estimator.filter.reset(torch.Generator().manual_seed(seed))
+    estimator.filter.double().reset(torch.Generator().manual_seed(seed))
     return estimator
 
 
@@ -508,8 +508,8 @@ def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
 
 def test_single_step_error_of_a_model_on_its_simulated_motion_is_zero(part):
     estimator = loaded(model(part, "NNTF_U"))
-    inputs = torch.tensor([[0.1, 10.0]]).expand(6, 2)
-    states = [torch.tensor([2.5, 0.1, 0.5, 2.6, 0.6])]
+    inputs = torch.tensor([[0.1, 10.0]], dtype=torch.float64).expand(6, 2)
+    states = [torch.tensor([2.5, 0.1, 0.5, 2.6, 0.6], dtype=torch.float64)]
     with torch.no_grad():
         for k in range(5):
             states.append(estimator.filter.moved(states[-1][None], inputs[k : k + 1])[0])

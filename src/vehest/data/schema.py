@@ -91,9 +91,9 @@ def _without_names(content: Any, kind: Any) -> Any:
     such field.
     """
     kind, _ = _bare(kind)
-    if not (isinstance(content, dict) and is_dataclass(kind)):
+    if not (isinstance(content, dict) and isinstance(kind, type) and is_dataclass(kind)):
         return content
-    hints = get_type_hints(kind)
+    hints = _field_types(kind)
     return {
         key: _without_names(inner, hints.get(str(key)))
         for key, inner in content.items()
@@ -133,6 +133,12 @@ def check_format(version: Any, newest: int, subject: str, *, oldest: int = 1) ->
             f"to {newest}); make it again"
         )
     return version
+
+
+@cache
+def _field_types(kind: type) -> dict[str, Any]:
+    """Fields of a dataclass -> their types."""
+    return get_type_hints(kind)
 
 
 @cache

@@ -76,6 +76,8 @@ def marks_not_measured(text: str, signal: str = "") -> bool:
     """
     if _SYMBOLS.fullmatch(text.strip()):
         return True
+    if text.lower() == text.upper():  # no letters, as most cells of a table
+        return False
     spaced = re.sub(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])", " ", text.removeprefix(signal)).lower()
     words = re.findall(r"[^\W\d_]+", spaced)
     phrase = [word for word in words if word not in _FILLERS]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 import os
 import re
 import sys
@@ -90,8 +91,10 @@ def _first_rows(file: Path, layout: TextLayout) -> tuple[list[str], list[str]]:
     """Cells of the line of names, and of the first row of numbers."""
     decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
     try:
-        lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))
-        filled = filter(None, lines[layout.skip_rows :])
+        text = decoder.decode(read_head(file)).removeprefix("\ufeff")
+        # StringIO ends lines as re.split(r"\r\n|\n|\r") would, one at a time
+        lines = islice(io.StringIO(text, newline=None), layout.skip_rows, None)
+        filled = filter(None, (line.removesuffix("\n") for line in lines))
         rows = csv.reader(filled, delimiter=layout.delimiter)
         header = next(rows, [])
         with suppress(csv.Error):  # of an endless line, which the reader of the rows reports

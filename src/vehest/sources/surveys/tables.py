@@ -86,7 +86,7 @@ ENCODINGS = {
     "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
     "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
 }
-CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
+CONTROLS = bytes([*range(0x09), 0x0B, *range(0x0E, 0x20)])
 MOST_CONTROLS = 0.01  # of the first bytes of a file; with more it is no text
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
@@ -447,8 +447,8 @@ def _share(row: Sequence[str], decimal: str) -> float:
 def _is_number(cell: str, decimal: str) -> bool:
     """Whether a cell, perhaps quoted, is a number; with a decimal comma, no point may be in it."""
     text = cell.strip().strip('"')
-    return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (
-        decimal == "," and "." in text
+    return not (decimal == "," and "." in text) and bool(
+        NUMBER.fullmatch(text.replace(decimal, "."))
     )
 
 
@@ -478,19 +478,25 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
-    if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
+    if b"\0" in head or _count_controls(head) > MOST_CONTROLS * len(head):
         raise DataError(
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
     encodings = {"utf8": "utf-8-sig"}
-    encodings |= {name: name for name, (rare, *_) in ENCODINGS.items() if re.search(rare, head)}
-    encodings |= {"cp1252": "cp1252"} if re.search(rb"[\x80-\x9f]", head) else {}
+    if not head.isascii():
+        encodings |= {name: name for name, (rare, *_) in ENCODINGS.items() if re.search(rare, head)}
+        encodings |= {"cp1252": "cp1252"} if re.search(rb"[\x80-\x9f]", head) else {}
     for name, encoding in encodings.items():
         with suppress(UnicodeDecodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
             if name not in ENCODINGS or _has_words(text, *ENCODINGS[name][1:]):
                 return name, text
     return "latin-1", head.decode("latin-1")
+
+
+def _count_controls(head: bytes) -> int:
+    """Number of control characters that texts do not have."""
+    return len(head) - len(head.translate(None, CONTROLS))
 
 
 def _has_words(text: str, letter: str, min_share: float) -> bool:
