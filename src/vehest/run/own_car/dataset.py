@@ -13,11 +13,18 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.align import align
+from vehest.alignment.bandwidth import (
+    MIN_REPORTED_DELAY_SECONDS,
+    coarse_cutoff_hz,
+    coarse_steps,
+    held_channels,
+)
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.motion import rms
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
+from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
@@ -52,7 +59,17 @@ CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "rotation", "spike")
+REMARKS = (
+    *CONTRADICTIONS,
+    "dropout",
+    "stuck",
+    "held",
+    "coarse",
+    "reverse",
+    "offset",
+    "rotation",
+    "spike",
+)
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
 MIN_GAIN_FACTOR = 1.15
@@ -115,7 +132,7 @@ def draft(examined: Examined) -> Draft:
     if not proposals.channels:
         raise ConfigurationError("no column with complete samples remains for a channel")
     dataset = _dataset(examined)
-    speed = (
+    speed: list[dict[str, Any]] = (
         [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}]
         if proposals.wheel_radius is not None
         else []
@@ -128,7 +145,24 @@ def draft(examined: Examined) -> Draft:
         notes.append(
             "a few samples outside the possible range are interpolated (bridge_impossible)"
         )
-    longest = max(recordings, key=lambda recording: recording.duration)
+    held = _held_with_speed(max(recordings, key=_duration)) if dataset["source"] in TABLES else []
+    if held:
+        recordings = _recordings(dataset := dataset | {"held": {"channels": held}})
+        notes.append(
+            f"{', '.join(held)}: rows repeat the values of a slower sensor; they are read as lines "
+            "between its samples (held), which a model in the car does not have"
+        )
+    steps = _coarse(recordings)
+    if steps:
+        cutoff = coarse_cutoff_hz(min(recording.rate_hz for recording in recordings))
+        speed.append({"name": "low_pass", "cutoff_hz": cutoff, "channels": list(steps)})
+        recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
+        sizes = [f"{name} {step:.3g} {CHANNELS[name].unit}" for name, step in steps.items()]
+        notes.append(
+            f"coarse steps ({', '.join(sizes)}) are removed by the transform low_pass at "
+            f"{cutoff:g} Hz, which uses samples of up to half a second later"
+        )
+    longest = max(recordings, key=_duration)
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
@@ -212,6 +246,26 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return list(open_source(dataset).recordings())
+
+
+def _duration(recording: Recording) -> float:
+    return recording.duration
+
+
+def _held_with_speed(recording: Recording) -> list[str]:
+    """Speed and channels of its rate where the table repeats the samples of a slow sensor."""
+    for rate, names in held_channels(recording, ~standstill(recording)).items():
+        if "vx" in names and 0.5 / float(rate) > MIN_REPORTED_DELAY_SECONDS:
+            return names
+    return []
+
+
+def _coarse(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Coarse channels of any recording, and their steps [SI]."""
+    steps: dict[str, float] = {}
+    for recording in recordings:
+        steps = coarse_steps(recording, ~standstill(recording)) | steps
+    return steps
 
 
 def _crawl_speed(recording: Recording) -> float:
