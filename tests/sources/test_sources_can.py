@@ -19,7 +19,7 @@ from vehest.sources.base import open_source
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 
-from can_drive import SIGNALS, write_log  # noqa: E402
+from can_drive import ORIGIN, SIGNALS, write_log  # noqa: E402
 
 FOUR = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
 STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.001}
@@ -214,9 +214,23 @@ def with_dates(text):
     return re.sub(r"\(([\d.]+)\)", date, on_screen(text))
 
 
+def from_zero(text):
+    """What `candump -tz` writes on the screen."""
+    return re.sub(r"\(([\d.]+)\)", lambda m: f"({float(m[1]) - ORIGIN:010.6f})", on_screen(text))
+
+
+def since_last_frame(text):
+    """What `candump -td` writes on the screen."""
+    stamps = [float(stamp) for stamp in re.findall(r"\(([\d.]+)\)", text)]
+    steps = iter(np.diff(stamps, prepend=stamps[0]))
+    return re.sub(r"\(([\d.]+)\)", lambda _: f"({next(steps):010.6f})", on_screen(text))
+
+
 @pytest.mark.parametrize(
     ("suffix", "written_by_another"),
     [
+        (".log", from_zero),
+        (".log", since_last_frame),
         (".asc", since_last_event),
         (".asc", with_requests),
         (".log", on_screen),

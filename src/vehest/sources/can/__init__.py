@@ -182,8 +182,7 @@ class CanSource(SignalSource):
                 origin, times, np.array(values[name]), described.message.units[described.signal]
             )
             rates[described.message.name] = round(signals[name].rate_hz, 3)
-        cut_end = f"not read: last line '{frames.cut_line}', which has no end"
-        left_out = {MISSING: {"": [cut_end]}} if frames.cut_line else {}
+        left_out = {MISSING: {"": [frames.cut_end]}} if frames.cut_end else {}
         return signals, {"dbc": self.dbc.name, "messages": rates, **left_out}
 
 
