@@ -278,7 +278,7 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
 
 def test_a_trace_of_pcan_is_named_as_a_log_of_a_bus(tmp_path):
     (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"is a log of a CAN bus.*declare them"):
+    with pytest.raises(DataError, match=r"is a log of a CAN bus.*vehest new my_car lap.trc"):
         inspect("my_car", [tmp_path / "lap.trc"])
 
 

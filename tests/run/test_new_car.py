@@ -4,6 +4,7 @@ run` takes it.
 
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,31 @@ def test_a_speed_in_whole_kmh_is_estimated_from(log, rows_held):
     table = pd.read_parquet("estimate.parquet")
     error = table["sideslip_deg"] - np.interp(table["time"], lap["Timestamp"], exact)
     assert np.sqrt(np.mean(error[30:] ** 2)) < (0.35 if rows_held < 10 else 0.41)  # of 0.32
+
+
+def test_a_log_of_a_bus_with_its_dbc_is_proposed_and_estimated(log):
+    pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+    for name in ("drive.asc", "car.dbc"):
+        shutil.copy(LAP.parent / name, name)
+    out, _ = log.new("drive.asc", "car.dbc", "--yes", "--wheelbase", "2.7")
+    dataset = segment_of_test(0)
+    assert [dataset[key] for key in ("source", "path", "files", "dbc")] == [
+        "can",
+        ".",
+        "drive.asc",
+        "car.dbc",
+    ]
+    assert dataset["channels"] == {
+        "vx": {"column": "Speed.VehSpd", "unit": "km/h"},
+        "yaw_rate": {"column": "IMU.YawRate", "unit": "deg/s"},
+        "ay": {"column": "IMU.AccLat", "unit": "m/s²", "sign": -1},
+        "ax": {"column": "IMU.AccLong", "unit": "m/s²"},
+        "steer": {"column": "Steering.SteerAng", "unit": "deg"},
+    }
+    command = out.splitlines()[-1].split()
+    code, out, err = log(*command[1:], "--json")
+    assert code == 0, err
+    assert json.loads(out)["valid_percent"] == 100.0
 
 
 def test_invalid_answers_are_requested_again(log):

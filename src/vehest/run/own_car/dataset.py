@@ -385,8 +385,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     columns = log.by_name
     if log.source == "rosbag":
         return dataset | _bag_options(examined)
-    if log.source == "mdf":
-        return dataset | _mdf_options(examined)
+    if log.source in ("mdf", "can"):
+        return dataset | dict(log.options) | _signal_options(examined)
     dataset |= log.options
     clock = log.clock
     if log.source != "vbo":
@@ -509,7 +509,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     return gap_seconds
 
 
-def _mdf_options(examined: Examined) -> dict[str, Any]:
+def _signal_options(examined: Examined) -> dict[str, Any]:
     channels = {}
     rates = []
     paused = False

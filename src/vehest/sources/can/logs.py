@@ -57,7 +57,7 @@ class Frames:
     @property
     def cut_end(self) -> str:
         """What of the log was not read, as text; empty where all was."""
-        return f"not read: last line '{self.cut_line}', which has no end" if self.cut_line else ""
+        return f"last line '{self.cut_line}', which has no end" if self.cut_line else ""
 
     @property
     def last_stamp(self) -> float:
