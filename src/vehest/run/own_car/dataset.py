@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from vehest.alignment.align import align
 from vehest.alignment.bandwidth import (
@@ -75,6 +76,9 @@ MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering rat
 MIN_GAIN_FACTOR = 1.15
 MIN_TURN_YAW_RATE = 0.05  # rad/s
 MIN_TURNING_SECONDS = 5.0  # for which each half of a file turns as fast
+# m/s², of vx·yaw_rate: in sharper turns a car may slide, and its gains differ
+MAX_TURN_ACCELERATION = 4.0
+TURN_MEAN_SECONDS = 0.5  # over which noise of the yaw rate is no turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,16 +344,25 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
 def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
     """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over
     yaw_rate/vx beside understeer.
+
+    Turns at which a car may slide do not count; without enough others there are no gains.
     """
     gains: dict[str, list[float]] = {}
     if not {"vx", "yaw_rate"} <= set(recording.channels):
         return {}
+    size = max(round(TURN_MEAN_SECONDS * recording.rate_hz), 1)
+    means = {
+        name: uniform_filter1d(recording[name], size)
+        for name in ("vx", "yaw_rate", "ay", "handwheel", "steer")
+        if name in recording
+    }
     for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
-        speed = recording["vx"][half]
-        rate = recording["yaw_rate"][half]
+        speed = means["vx"][half]
+        rate = means["yaw_rate"][half]
         is_turning = (
             (speed > 0.2 * float(np.quantile(speed, 0.99)))
             & (np.abs(rate) > MIN_TURN_YAW_RATE)
+            & (np.abs(speed * rate) < MAX_TURN_ACCELERATION)
             & (speed > 0.0)
         )
         if np.count_nonzero(is_turning) < MIN_TURNING_SECONDS * recording.rate_hz:
@@ -357,13 +370,11 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         speed = speed[is_turning]
         rate = rate[is_turning]
         turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)
-        if "ay" in recording:
-            gains.setdefault("ay", []).append(
-                rms(recording["ay"][half][is_turning]) / rms(turn[:, 1])
-            )
+        if "ay" in means:
+            gains.setdefault("ay", []).append(rms(means["ay"][half][is_turning]) / rms(turn[:, 1]))
         for name in ("handwheel", "steer"):
-            if name in recording:
-                steering = recording[name][half][is_turning]
+            if name in means:
+                steering = means[name][half][is_turning]
                 by_turn = np.linalg.lstsq(turn, steering, rcond=None)[0]
                 gains.setdefault(name, []).append(abs(float(by_turn[0])))
     return {name: (min(halves), max(halves)) for name, halves in gains.items() if min(halves) > 0.0}
