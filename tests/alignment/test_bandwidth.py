@@ -6,12 +6,14 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 from broadband_drive import Wave, broadband_drive, changed, found_by, warned, without
 
 from real_drives import source_of
 from vehest.alignment.bandwidth import update_rate_hz
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.spectra import cross_spectra, lag_of
+from vehest.data.transforms import transform_from_config
 
 
 @pytest.mark.parametrize("time_constant", [0.2, 0.4, 1.0])
@@ -86,6 +88,42 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays():
     )
     (fast,) = found_by("held", hold_accelerations(2)).values()
     assert (fast.level, fast.channel) == ("note", "ax")
+
+
+def rounded_to(step):
+    return lambda samples: np.round(samples / step) * step
+
+
+def test_coarse_channels_are_named_with_their_step_and_the_remedy_removes_them():
+    drive = broadband_drive(rate_hz=20.0)
+    coarse = changed(drive, vx=rounded_to(1.0 / 3.6), ay=rounded_to(1.0))
+    findings = found_by("coarse", coarse)
+    assert set(findings) == {"vx", "ay"}
+    assert "in steps of 0.278 m/s" in findings["vx"].message
+    (remedy,) = re.findall(r"transform (\{.*\}) removes", findings["vx"].message)
+    smooth = transform_from_config(yaml.safe_load(remedy))(coarse)
+    assert set(found_by("coarse", smooth)) == {"ay"}
+    error = smooth["vx"] - drive["vx"]
+    assert np.sqrt(np.mean(error[20:-20] ** 2)) < 0.06  # of 0.08 before
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        lambda vx: vx,
+        lambda vx: np.round(vx, 3),
+        lambda vx: np.repeat(vx[::4], 4)[: len(vx)],  # held
+        lambda vx: np.where(np.arange(len(vx)) < 20, np.nan, rounded_to(0.3)(vx)),
+        np.zeros_like,
+    ],
+)
+def test_fine_held_missing_and_constant_speeds_are_not_coarse(samples):
+    drive = broadband_drive(rate_hz=20.0)
+    assert not found_by("coarse", changed(drive, vx=samples, gappy=["vx"]))
+
+
+def test_a_fast_recording_of_a_coarse_speed_is_low_passed_anyway():
+    assert not found_by("coarse", changed(broadband_drive(), vx=rounded_to(1.0 / 3.6)))
 
 
 def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):

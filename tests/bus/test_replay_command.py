@@ -57,6 +57,15 @@ def test_replay_prints_json_writes_a_table_and_reports_progress_in_plain_lines(b
     assert "\x1b" not in err
 
 
+def test_a_last_line_that_is_cut_short_is_named(bus):
+    log = Path("raw/bus/drive.asc")
+    lines = [line for line in log.read_text().splitlines() if "Rx" in line]
+    text = log.read_text()
+    log.write_text(text[: text.index(lines[-1]) + 20])
+    _, err = bus.done(*NAMED, "--quiet")
+    assert f"not read: last line '{lines[-1][:20].strip()}', which has no end" in err
+
+
 def test_a_data_set_serves_replays_and_estimates_and_faults_are_a_line(bus):
     code, _, err = bus(*REPLAY, "--dataset", "bus", "--quiet", "-o", "online.csv")
     assert (code, err) == (0, "")

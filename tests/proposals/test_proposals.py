@@ -1454,6 +1454,22 @@ def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
     assert not any("another car" in remark for remark in draft(inspect("my_car", files)).remarks)
 
 
+def test_noise_on_a_straight_and_a_slide_are_no_other_car(tmp_path):
+    """Their gains of ay are 0.25 and 0.7 times that of the turns in the other file."""
+    slide = drive(60.0)
+    generator = np.random.default_rng(0)
+    is_straight = slide["t"] < 30.0
+    turn = np.where(is_straight, 0.0, 0.55 * np.sin(2.0 * slide["t"]))
+    slide["vx"] = 22.0 + 0.02 * generator.standard_normal(len(turn))
+    slide["ay"] = 0.7 * turn * slide["vx"] + 0.2 * generator.standard_normal(len(turn))
+    slide["r"] = turn + 0.06 * generator.standard_normal(len(turn))
+    files = [
+        write(tmp_path / "lap_1.csv", usual(drive())),
+        write(tmp_path / "lap_2.csv", usual(slide)),
+    ]
+    assert not any("gain in turns" in remark for remark in draft(inspect("my_car", files)).remarks)
+
+
 def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     d = drive()
     table = usual(d).drop(columns="Beta")

@@ -278,8 +278,37 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
 
 def test_a_trace_of_pcan_is_named_as_a_log_of_a_bus(tmp_path):
     (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"is a log of a CAN bus.*declare them"):
+    with pytest.raises(DataError, match=r"is a log of a CAN bus.*vehest new my_car lap.trc"):
         inspect("my_car", [tmp_path / "lap.trc"])
+
+
+@pytest.mark.parametrize("has_pauses", [False, True])
+def test_the_rate_by_times_that_repeat_is_that_of_the_rows_between_pauses(tmp_path, has_pauses):
+    """Each time stands in two to five rows of 100 Hz."""
+    table = usual(drive(60.0, rate_hz=100.0)).drop(columns="LongAcc")
+    times = table["Time [s]"].to_numpy()
+    firsts = np.cumsum(np.random.default_rng(0).integers(2, 6, len(times)))
+    table["Time [s]"] = times[np.r_[0, firsts[firsts < len(times)]]][
+        np.searchsorted(firsts, np.arange(len(times)), side="right")
+    ].round(2)
+    is_paused = ((times > 10.0) & (times < 18.0)) | ((times > 40.0) & (times < 43.0))
+    write(tmp_path / "lap.csv", table[~is_paused] if has_pauses else table)
+    examined = inspect("my_car", [tmp_path / "lap.csv"])
+    assert examined.rate_hz == 100.0
+    assert "rate" in [question.key for question in questions_of(examined)]
+    is_named = any("2 pauses of 'Time" in note for note in examined.proposals.notes)
+    assert is_named == has_pauses
+
+
+def test_a_table_that_writes_its_rows_several_times_is_refused_with_the_way_out(tmp_path):
+    table = usual(drive(60.0, rate_hz=20.0))
+    n_times = np.random.default_rng(0).integers(2, 6, len(table))
+    file = write(tmp_path / "lap.csv", table.loc[np.repeat(table.index, n_times)])
+    with pytest.raises(DataError, match=r"repeats 3\d\d\d of its .* rows.*drop_duplicates"):
+        inspect("my_car", [file])
+    write(file, pd.read_csv(file).drop_duplicates())
+    assert inspect("my_car", [file]).log.rate_hz is None
+    assert read_back(file)[1].rate_hz == 20.0
 
 
 UNSUITED = {

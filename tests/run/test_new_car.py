@@ -4,8 +4,11 @@ run` takes it.
 
 import io
 import json
+import shutil
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from planted_logs import drive, usual, write
@@ -18,6 +21,7 @@ from vehest.data.files import ASIDE_PREFIX
 
 pytestmark = pytest.mark.apart
 
+LAP = Path(__file__).parents[2] / "docs" / "examples" / "lap.csv"
 FILES = ("conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_car.yaml")
 
 
@@ -107,6 +111,53 @@ def test_an_uncertain_steering_ratio_leaves_steer_out_and_names_the_answer(log, 
     log.new(file, "--yes", "--wheelbase", "2.941", "--steering-ratio", "16.3", "--force")
     assert {"name": "steering_ratio", "ratio": 16.3} in segment_of_test(0)["transforms"]
     assert segment_of_test(0)["car"] == {"wheelbase": 2.941, "steering_ratio": 16.3}
+
+
+@pytest.mark.parametrize("rows_held", [1, 4, 10])
+def test_a_speed_in_whole_kmh_is_estimated_from(log, rows_held):
+    """As an OBD logger writes it, also repeated in the rows between its samples: before, 1 % of the
+    samples were valid.
+    """
+    lap = pd.read_csv(LAP)
+    exact = lap["SlipAngle"].to_numpy()
+    speed = lap["Speed"].round().to_numpy()
+    lap["Speed"] = speed[np.arange(len(lap)) // rows_held * rows_held]
+    lap.drop(columns="SlipAngle").to_csv("lap.csv", index=False)
+    _, err = log.new("lap.csv", "--yes", "--wheelbase", "2.4")
+    transforms = segment_of_test(0)["transforms"]
+    assert {"name": "low_pass", "cutoff_hz": 3.0, "channels": ["vx"]} in transforms
+    assert segment_of_test(0).get("held") == (None if rows_held == 1 else {"channels": ["vx"]})
+    code, out, err = log("estimate", "lap.csv", "dataset=my_car", "--json")
+    assert code == 0, err
+    assert json.loads(out)["valid_percent"] > 70.0  # of 81 with an exact speed
+    table = pd.read_parquet("estimate.parquet")
+    error = table["sideslip_deg"] - np.interp(table["time"], lap["Timestamp"], exact)
+    assert np.sqrt(np.mean(error[30:] ** 2)) < (0.35 if rows_held < 10 else 0.41)  # of 0.32
+
+
+def test_a_log_of_a_bus_with_its_dbc_is_proposed_and_estimated(log):
+    pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+    for name in ("drive.asc", "car.dbc"):
+        shutil.copy(LAP.parent / name, name)
+    out, _ = log.new("drive.asc", "car.dbc", "--yes", "--wheelbase", "2.7")
+    dataset = segment_of_test(0)
+    assert [dataset[key] for key in ("source", "path", "files", "dbc")] == [
+        "can",
+        ".",
+        "drive.asc",
+        "car.dbc",
+    ]
+    assert dataset["channels"] == {
+        "vx": {"column": "Speed.VehSpd", "unit": "km/h"},
+        "yaw_rate": {"column": "IMU.YawRate", "unit": "deg/s"},
+        "ay": {"column": "IMU.AccLat", "unit": "m/s²", "sign": -1},
+        "ax": {"column": "IMU.AccLong", "unit": "m/s²"},
+        "steer": {"column": "Steering.SteerAng", "unit": "deg"},
+    }
+    command = out.splitlines()[-1].split()
+    code, out, err = log(*command[1:], "--json")
+    assert code == 0, err
+    assert json.loads(out)["valid_percent"] == 100.0
 
 
 def test_invalid_answers_are_requested_again(log):

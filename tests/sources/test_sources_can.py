@@ -12,14 +12,18 @@ import pytest
 from refusals import refusal
 
 from conftest import planar_drive
+from vehest.data.errors import VehestError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import MISSING
 from vehest.run.inspect_data import check
+from vehest.run.own_car.inspect import inspect
 from vehest.sources.base import open_source
+from vehest.sources.surveys import survey
 
+cantools = pytest.importorskip("cantools", reason="cantools is not installed")
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 
-from can_drive import SIGNALS, write_log  # noqa: E402
+from can_drive import ORIGIN, SIGNALS, write_log  # noqa: E402
 
 FOUR = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
 STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.001}
@@ -48,7 +52,8 @@ def log(folder, dbc, frames):
     (folder / "car.dbc").write_text(dbc)
     with can.Logger(folder / "drive.asc") as writer:
         for stamp, bus, data in frames:
-            writer(can.Message(stamp, 291, False, data=data, channel=bus))
+            is_fd = len(data) > 8
+            writer(can.Message(stamp, 291, False, data=data, channel=bus, is_fd=is_fd))
 
 
 def one(signal, length=8):
@@ -214,9 +219,23 @@ def with_dates(text):
     return re.sub(r"\(([\d.]+)\)", date, on_screen(text))
 
 
+def from_zero(text):
+    """What `candump -tz` writes on the screen."""
+    return re.sub(r"\(([\d.]+)\)", lambda m: f"({float(m[1]) - ORIGIN:010.6f})", on_screen(text))
+
+
+def since_last_frame(text):
+    """What `candump -td` writes on the screen."""
+    stamps = [float(stamp) for stamp in re.findall(r"\(([\d.]+)\)", text)]
+    steps = iter(np.diff(stamps, prepend=stamps[0]))
+    return re.sub(r"\(([\d.]+)\)", lambda _: f"({next(steps):010.6f})", on_screen(text))
+
+
 @pytest.mark.parametrize(
     ("suffix", "written_by_another"),
     [
+        (".log", from_zero),
+        (".log", since_last_frame),
         (".asc", since_last_event),
         (".asc", with_requests),
         (".log", on_screen),
@@ -231,6 +250,69 @@ def test_logs_of_other_writers_hold_the_same_drive(tmp_path, suffix, written_by_
     assert written.log.read_text() != text
     for name, samples in read(tmp_path).channels.items():
         np.testing.assert_allclose(samples, expected[name], atol=1e-6)
+
+
+LAYOUTS = """VERSION ""
+
+BO_ 291 Layouts: 24 Car
+ SG_ Which M : 0|4@1+ (1,0) [0|0] "" Car
+ SG_ Little : 13|11@1- (0.25,-3) [0|0] "m/s" Car
+ SG_ Big : 27|13@0- (-0.5,7) [0|0] "m/s" Car
+ SG_ Wide : 46|30@0+ (1,0) [0|0] "" Car
+ SG_ Selected m3 : 72|16@1- (0.01,0) [0|0] "" Car
+ SG_ Single : 96|32@1- (1,0) [0|0] "" Car
+ SG_ Double : 135|64@0- (1,0) [0|0] "" Car
+
+SIG_VALTYPE_ 291 Single : 1 ;
+SIG_VALTYPE_ 291 Double : 2 ;
+"""
+
+
+def test_all_signals_of_a_log_are_decoded_as_cantools_does(tmp_path):
+    generator = np.random.default_rng(0)
+    frames = [(k / 100, 0, generator.bytes(24)) for k in range(400)]
+    log(tmp_path, LAYOUTS, frames)
+    (message,) = cantools.database.load_string(LAYOUTS, "dbc").messages
+    expected = [
+        {name: float(value) for name, value in message.decode(data).items()}
+        for _, _, data in frames
+        if data[0] % 16 == 3
+    ]
+    (file,) = tmp_path.glob("drive.*")
+    columns = survey(file, tmp_path / "car.dbc").by_name
+    others = {"Layouts.Little", "Layouts.Big", "Layouts.Wide", "Layouts.Single", "Layouts.Double"}
+    assert set(columns) == {*others, "Layouts.Selected"}
+    is_selected = np.array([data[0] % 16 == 3 for _, _, data in frames])
+    np.testing.assert_allclose(
+        columns["Layouts.Selected"].stamps - columns["Layouts.Little"].stamps[0],
+        np.flatnonzero(is_selected) / 100.0,
+        atol=1e-6,
+    )
+    for name, column in columns.items():
+        values = column.values if name == "Layouts.Selected" else column.values[is_selected]
+        sent = np.array([sample[name.removeprefix("Layouts.")] for sample in expected])
+        usual = np.abs(sent) < 1e15
+        np.testing.assert_allclose(values[usual], sent[usual], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["car.dbc"], "describes a bus; name a log of it as well"),
+        (["drive.asc"], "name the DBC file of the bus behind it, as in: vehest new"),
+        (["drive.asc", "car.dbc", "other.dbc"], "a data set has one DBC"),
+        (["lap.csv", "car.dbc"], "is no log of a CAN bus"),
+        (["drive.asc", "other.dbc"], "has no frame of a message of"),
+        (["drive.asc", "broken.dbc"], "cannot be read as a DBC"),
+    ],
+)
+def test_what_new_cannot_do_with_a_dbc_is_one_line(tmp_path, names, message):
+    write_log(drive(3.0), tmp_path)
+    (tmp_path / "other.dbc").write_text(one('0|16@1+ (1,0) [0|0] "m/s" Car'))
+    (tmp_path / "broken.dbc").write_text("no DBC")
+    (tmp_path / "lap.csv").write_text("t,v\n0,1\n")
+    files = [tmp_path / name for name in names]
+    assert message in refusal(lambda: inspect("my_car", files), VehestError)
 
 
 def ramp(first, missing, n=200):

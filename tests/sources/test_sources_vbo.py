@@ -11,10 +11,11 @@ from refusals import refusal
 from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
 from vehest.data.errors import DataError
+from vehest.run.own_car.inspect import inspect
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.surveys import survey
-from vehest.sources.vbo import read_log
+from vehest.sources.vbo import read_log, require_slip_offsets
 
 
 def read(folder, **more):
@@ -54,6 +55,21 @@ def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path)
         "File created on 12/09/2018 @ 12:47",
         0,
     )
+
+
+@pytest.mark.parametrize(("unit", "read_as"), [("kmh", "km/h"), ("mph", "mph"), ("knots", "knots")])
+def test_the_header_states_the_unit_of_the_speed(tmp_path, unit, read_as):
+    write_log(tmp_path / "lap.vbo", speed=unit)
+    channels = dataset(tmp_path)["channels"] | {"vx": {"column": "velocity", "unit": read_as}}
+    assert np.allclose(read(tmp_path, channels=channels)["vx"], drive()["vx"], rtol=0, atol=1e-3)
+    assert inspect("my_car", [tmp_path / "lap.vbo"]).proposals.by_channel["vx"].unit == read_as
+    if unit != "kmh":
+        assert f"'velocity', for channel 'vx', is in '{unit}' by the file" in refusal(
+            lambda: read(tmp_path)
+        )
+    write_log(tmp_path / "lap.vbo", speed=unit, swapped=True)
+    with pytest.raises(DataError, match="changed places"):
+        require_slip_offsets(read_log(tmp_path / "lap.vbo"), "lap")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ COLUMNS = (
     "sats time lat long velocity heading height vert-vel Longacc Latacc event-1 SWA Lat._Vel. "
     "YawRate X_Accel Y_Accel Slip_FL Slip_RL"
 )
+SPEED_UNITS = {"kmh": 1.0 / 3.6, "mph": 0.44704, "knots": 1852.0 / 3600.0, "m/s": 1.0}
 UNITS = ("rad", "km/h", "°/s", "g", "g", "°", "°")
 
 
@@ -36,10 +37,11 @@ def clock(seconds):
     ]
 
 
-def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
+def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end="", speed="kmh"):
     """Write a log from a clock time on [s].
 
-    ``swapped``: lateral and longitudinal offsets of slip change places; ``end`` comes last.
+    ``swapped``: lateral and longitudinal offsets of slip change places; ``end`` comes last;
+    ``speed``: unit of the speed, which the header states.
     """
     d = drive()
     n = len(d["vx"])
@@ -48,7 +50,7 @@ def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
         ahead = lateral if swapped else longitudinal
         slip.append(np.degrees(np.arctan2(d["vy"] + ahead * d["yaw_rate"], d["vx"])))
     numbers = [
-        d["vx"] * 3.6,
+        d["vx"] / SPEED_UNITS[speed],
         np.degrees(-d["yaw_rate"]),
         d["ax"] / 9.80665,
         d["ay"] / 9.80665,
@@ -72,7 +74,7 @@ def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
     ]
     head = [
         "File created on 12/09/2018 @ 12:47   \r\n",
-        "[header]\r\nsatellites\r\ntime\r\n",
+        f"[header]\r\nsatellites\r\ntime\r\nvelocity {speed}\r\n",
         "[channel units]",
         *units,
         "",

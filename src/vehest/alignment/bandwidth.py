@@ -1,4 +1,4 @@
-"""Channels that show less than their rate promises: low-passed ones and held ones."""
+"""Channels that show less than their rate promises: low-passed, held and coarse ones."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import MAX_TIME_CONSTANT_SECONDS, CrossSpectra, Lag, Measured, lag_of
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
 # s; a delay that is surely longer is reported, and one by holding is a warning
@@ -23,6 +24,17 @@ MIN_CHANGES = 20  # changes of value; with fewer a channel does not count as hel
 MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
 # share of changes by one quantum above which a channel is quantised, not held
 MAX_SINGLE_STEP_SHARE = 0.5
+COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")  # that health expects to change all the time
+# Hz; a faster recording is low-passed where it is brought to the rate of a model
+MAX_COARSE_RATE_HZ = 30.0
+MAX_LEVELS = 5000.0  # steps in the range of a channel, beyond which none is coarse
+MIN_WHOLE_STEP_SHARE = 0.99  # of the changes are whole numbers of a coarse channel's smallest step
+STEP_TOLERANCE = 0.02  # of a step
+REPEAT_SECONDS = 0.5
+MIN_REPEAT_SHARE = 0.3  # of the samples in this time, at which health calls a channel held
+MIN_COARSE_SHARE = 0.05  # of the moving time
+COARSE_CUTOFF_HZ = 3.0
+MAX_CUTOFF_SHARE = 0.4  # of the sampling rate
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
@@ -147,19 +159,15 @@ def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding
         A warning where the mean delay by holding, half an update, exceeds
         MIN_REPORTED_DELAY_SECONDS, else a note.
     """
-    names_by_rate: dict[str, list[str]] = {}
-    for name, samples in recording.channels.items():
-        rate = update_rate_hz(samples[moving], recording.rate_hz)
-        if rate is not None:
-            names_by_rate.setdefault(f"{rate:.3g}", []).append(name)
     findings = []
-    for rate_text, names in names_by_rate.items():
+    for rate_text, names in held_channels(recording, moving).items():
         delay = 0.5 / float(rate_text)
         further = f" (also {', '.join(names[1:])})" if len(names) > 1 else ""
         message = (
             f"updated at only {rate_text} Hz and held in between{further}, in a recording at "
             f"{recording.rate_hz:.4g} Hz, which delays it by {1e3 * delay:.3g} ms on average; "
-            f"downsample to {rate_text} Hz, or keep only the new samples (gappy)"
+            f"of a table, declare held: {{channels: [{', '.join(names)}]}}, which draws lines "
+            f"between new samples; else downsample to {rate_text} Hz"
         )
         findings.append(
             Finding(
@@ -170,6 +178,73 @@ def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding
             )
         )
     return findings
+
+
+def held_channels(recording: Recording, moving: BoolArray) -> dict[str, list[str]]:
+    """Rates at which held channels are updated, as text [Hz] -> these channels; (T,) ``moving``."""
+    names_by_rate: dict[str, list[str]] = {}
+    for name, samples in recording.channels.items():
+        rate = update_rate_hz(samples[moving], recording.rate_hz)
+        if rate is not None:
+            names_by_rate.setdefault(f"{rate:.3g}", []).append(name)
+    return names_by_rate
+
+
+def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
+    """Warnings of channels in steps so coarse that their samples repeat, such as a speed in km/h.
+
+    Parameters
+    ----------
+    recording : Recording
+        Any channels.
+    moving : BoolArray
+        Where the car moves, (T,); other samples do not count.
+    """
+    return [
+        Finding(
+            "warning",
+            "coarse",
+            name,
+            f"in steps of {step:.3g} {CHANNELS[name].unit}, between which samples repeat: a model "
+            "that was calibrated on finer ones takes this for a fault; the transform "
+            f"{{name: low_pass, cutoff_hz: {coarse_cutoff_hz(recording.rate_hz):g}, "
+            f"channels: [{name}]}} removes the steps, by samples of up to half a second later",
+        )
+        for name, step in coarse_steps(recording, moving).items()
+    ]
+
+
+def coarse_steps(recording: Recording, moving: BoolArray) -> dict[str, float]:
+    """Coarse channels -> their step [SI]; those that are held or have gaps are left out.
+
+    A coarse channel changes by whole numbers of its step, and repeats its samples for a while at
+    least; ``moving``: where the car moves, (T,).
+    """
+    steps = {}
+    n_samples = max(round(REPEAT_SECONDS * recording.rate_hz), 1)
+    names = [name for name in COARSE_CHANNELS if name in recording]
+    for name in names if recording.rate_hz <= MAX_COARSE_RATE_HZ else ():
+        samples = recording[name][moving]
+        changes = np.abs(np.diff(samples))
+        is_change = changes > np.ptp(samples) / MAX_LEVELS if len(samples) else changes > 0.0
+        if np.isnan(recording[name]).any() or np.count_nonzero(is_change) < MIN_CHANGES:
+            continue
+        step = float(changes[is_change].min())
+        in_steps = changes[changes > 0.0] / step
+        is_whole = np.abs(in_steps - np.rint(in_steps)) < STEP_TOLERANCE
+        repeated = np.convolve(changes == 0.0, np.ones(n_samples) / n_samples, mode="same")
+        if (
+            is_whole.mean() >= MIN_WHOLE_STEP_SHARE
+            and np.mean(repeated >= MIN_REPEAT_SHARE) >= MIN_COARSE_SHARE
+            and update_rate_hz(samples, recording.rate_hz) is None
+        ):
+            steps[name] = step
+    return steps
+
+
+def coarse_cutoff_hz(rate_hz: float) -> float:
+    """Cut-off of the low-pass that removes the steps of a coarse channel [Hz]."""
+    return float(f"{min(COARSE_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz):.2g}")
 
 
 def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:

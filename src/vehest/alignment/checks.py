@@ -14,7 +14,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from vehest.alignment.bandwidth import low_pass_findings, low_passed, repetition_findings
+from vehest.alignment.bandwidth import (
+    coarse_findings,
+    low_pass_findings,
+    low_passed,
+    repetition_findings,
+)
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import WHEELS, Motion, motion_of
@@ -659,6 +664,7 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _not_measured,
     _stuck,
     repetition_findings,
+    coarse_findings,
     _saturated,
     _spikes,
     _steering_offset,

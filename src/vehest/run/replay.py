@@ -112,6 +112,8 @@ def replay_log(
     with use_limits(options.limits):
         bus_signals = _signals(options.dataset if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
+        if frames.cut_end:
+            say(f"not read: {frames.cut_end}")
         timing = survey(frames, bus_signals, bus_rate)
         faster = (
             timing.rate_hz

@@ -23,6 +23,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.recording import Recording
+from vehest.data.units import factor_to_si
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, bridged, uniform_clock
@@ -36,16 +37,18 @@ from vehest.sources.columns import (
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
-from vehest.sources.unit_spellings import require_unit
+from vehest.sources.unit_spellings import plain_unit, require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
-# units that the format has without saying so
+# units of columns that state none
 UNITS = {
     "velocity": "km/h",
     "vert-vel": "km/h",
     "Longacc": "g",
     "Latacc": "g",
 }
+# lines of [header] that state the unit of the logger's own speeds
+SPEED_IN_HEADER = re.compile(r"(?mi)^(vertical )?velocity[ \t(\[]+([^\s()\[\]]+)[ \t)\]]*$")
 MAX_SATS = 255.0  # sats has eight bits; larger values are clipped to this
 SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
 # measured by them; 0 where there is none
@@ -53,7 +56,6 @@ OF_SATELLITES = re.compile(
     r"lat|long|velocity|heading|height|vert-vel|Longacc|Latacc|True_Head|Slip_\w+|L(at|ng)\._Vel\."
 )
 JUMP = 1.5  # intervals; a last row that comes later is left out
-KMH = 3.6
 # slower or straighter samples do not show whether the logger's slip offsets changed places
 MIN_TURNING_SPEED = 5.0  # m/s
 MIN_TURNING_YAW_RATE = 0.05  # rad/s
@@ -213,6 +215,11 @@ def read_log(file: Path) -> Log:
         _of_last_columns(names, sections.get(title, ""))
         for title in ("channel units", "module information")
     )
+    speeds = {
+        "vert-vel" if vertical else "velocity": unit
+        for vertical, written in SPEED_IN_HEADER.findall(sections.get("header", ""))
+        if (unit := plain_unit(written)) is not None
+    }
     entered = OFFSETS.findall(sections.get("comments", ""))
     offsets = {
         point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in entered
@@ -228,7 +235,7 @@ def read_log(file: Path) -> Log:
         provenance["rows_dropped_with_repeated_times"] = int(is_repeated.sum())
     return Log(
         columns,
-        {name: unit for name, unit in {**UNITS, **units}.items() if unit},
+        {name: unit for name, unit in {**UNITS, **speeds, **units}.items() if unit},
         seconds,
         modules,
         offsets,
@@ -292,7 +299,7 @@ def require_slip_offsets(log: Log, location: str) -> None:
         return
     front, rear, yaw_rate, speed = (log.columns[name] for name in required)
     yaw_rate = np.radians(yaw_rate)
-    speed = speed / KMH
+    speed = factor_to_si(plain_unit(log.units["velocity"]) or "km/h", "m/s") * speed
     turns = (speed > MIN_TURNING_SPEED) & (np.abs(yaw_rate) > MIN_TURNING_YAW_RATE)
     if turns.sum() < MIN_TURNING_SAMPLES:
         return

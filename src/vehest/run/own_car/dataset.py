@@ -11,13 +11,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from vehest.alignment.align import align
+from vehest.alignment.bandwidth import (
+    MIN_REPORTED_DELAY_SECONDS,
+    coarse_cutoff_hz,
+    coarse_steps,
+    held_channels,
+)
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.motion import rms
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
+from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
@@ -52,13 +60,26 @@ CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # s, window of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset", "rotation", "spike")
+REMARKS = (
+    *CONTRADICTIONS,
+    "dropout",
+    "stuck",
+    "held",
+    "coarse",
+    "reverse",
+    "offset",
+    "rotation",
+    "spike",
+)
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
 MIN_GAIN_FACTOR = 1.15
 MIN_TURN_YAW_RATE = 0.05  # rad/s, above which a car turns
 # s of turning in each half of a file; with less, its gain is not compared
 MIN_TURNING_SECONDS = 5.0
+# m/s², of vx·yaw_rate: in sharper turns a car may slide, and its gains differ
+MAX_TURN_ACCELERATION = 4.0
+TURN_MEAN_SECONDS = 0.5  # s over which the yaw rate is averaged, so that its noise is no turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +137,7 @@ def draft(examined: Examined) -> Draft:
     if not proposals.channels:
         raise ConfigurationError("no column with complete samples remains for a channel")
     dataset = _dataset(examined)
-    speed = (
+    speed: list[dict[str, Any]] = (
         [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}]
         if proposals.wheel_radius is not None
         else []
@@ -129,7 +150,24 @@ def draft(examined: Examined) -> Draft:
         notes.append(
             "a few samples outside the possible range are interpolated (bridge_impossible)"
         )
-    longest = max(recordings, key=lambda recording: recording.duration)
+    held = _held_with_speed(max(recordings, key=_duration)) if dataset["source"] in TABLES else []
+    if held:
+        recordings = _recordings(dataset := dataset | {"held": {"channels": held}})
+        notes.append(
+            f"{', '.join(held)}: rows repeat the values of a slower sensor; they are read as lines "
+            "between its samples (held), which a model in the car does not have"
+        )
+    steps = _coarse(recordings)
+    if steps:
+        cutoff = coarse_cutoff_hz(min(recording.rate_hz for recording in recordings))
+        speed.append({"name": "low_pass", "cutoff_hz": cutoff, "channels": list(steps)})
+        recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
+        sizes = [f"{name} {step:.3g} {CHANNELS[name].unit}" for name, step in steps.items()]
+        notes.append(
+            f"coarse steps ({', '.join(sizes)}) are removed by the transform low_pass at "
+            f"{cutoff:g} Hz, which uses samples of up to half a second later"
+        )
+    longest = max(recordings, key=_duration)
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
@@ -215,6 +253,26 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return list(open_source(dataset).recordings())
 
 
+def _duration(recording: Recording) -> float:
+    return recording.duration
+
+
+def _held_with_speed(recording: Recording) -> list[str]:
+    """Speed and channels of its rate where the table repeats the samples of a slow sensor."""
+    for rate, names in held_channels(recording, ~standstill(recording)).items():
+        if "vx" in names and 0.5 / float(rate) > MIN_REPORTED_DELAY_SECONDS:
+            return names
+    return []
+
+
+def _coarse(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Coarse channels of any recording, and their steps [SI]."""
+    steps: dict[str, float] = {}
+    for recording in recordings:
+        steps = coarse_steps(recording, ~standstill(recording)) | steps
+    return steps
+
+
 def _crawl_speed(recording: Recording) -> float:
     """Speed below which a sideslip angle has no meaning [m/s]; 0 where it has one throughout or no
     speed is known.
@@ -287,16 +345,25 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
 def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
     """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over
     yaw_rate/vx beside understeer.
+
+    Turns at which a car may slide do not count; without enough others there are no gains.
     """
     gains: dict[str, list[float]] = {}
     if not {"vx", "yaw_rate"} <= set(recording.channels):
         return {}
+    size = max(round(TURN_MEAN_SECONDS * recording.rate_hz), 1)
+    means = {
+        name: uniform_filter1d(recording[name], size)
+        for name in ("vx", "yaw_rate", "ay", "handwheel", "steer")
+        if name in recording
+    }
     for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
-        speed = recording["vx"][half]
-        rate = recording["yaw_rate"][half]
+        speed = means["vx"][half]
+        rate = means["yaw_rate"][half]
         is_turning = (
             (speed > 0.2 * float(np.quantile(speed, 0.99)))
             & (np.abs(rate) > MIN_TURN_YAW_RATE)
+            & (np.abs(speed * rate) < MAX_TURN_ACCELERATION)
             & (speed > 0.0)
         )
         if np.count_nonzero(is_turning) < MIN_TURNING_SECONDS * recording.rate_hz:
@@ -304,13 +371,11 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         speed = speed[is_turning]
         rate = rate[is_turning]
         turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)
-        if "ay" in recording:
-            gains.setdefault("ay", []).append(
-                rms(recording["ay"][half][is_turning]) / rms(turn[:, 1])
-            )
+        if "ay" in means:
+            gains.setdefault("ay", []).append(rms(means["ay"][half][is_turning]) / rms(turn[:, 1]))
         for name in ("handwheel", "steer"):
-            if name in recording:
-                steering = recording[name][half][is_turning]
+            if name in means:
+                steering = means[name][half][is_turning]
                 by_turn = np.linalg.lstsq(turn, steering, rcond=None)[0]
                 gains.setdefault(name, []).append(abs(float(by_turn[0])))
     return {name: (min(halves), max(halves)) for name, halves in gains.items() if min(halves) > 0.0}
@@ -332,8 +397,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     columns = log.by_name
     if log.source == "rosbag":
         return dataset | _bag_options(examined)
-    if log.source == "mdf":
-        return dataset | _mdf_options(examined)
+    if log.source in ("mdf", "can"):
+        return dataset | dict(log.options) | _signal_options(examined)
     dataset |= log.options
     clock = log.clock
     if log.source != "vbo":
@@ -456,7 +521,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
     return gap_seconds
 
 
-def _mdf_options(examined: Examined) -> dict[str, Any]:
+def _signal_options(examined: Examined) -> dict[str, Any]:
     channels = {}
     rates = []
     paused = False

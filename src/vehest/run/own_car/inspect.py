@@ -28,6 +28,7 @@ from vehest.data.limits import check_limit, limits_from_config, use_limits
 from vehest.data.recording import Kind
 from vehest.data.splits import check_name
 from vehest.sources.base import source_names
+from vehest.sources.can.logs import SUFFIXES
 from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, typical_step
 from vehest.sources.columns import signed
 from vehest.sources.surveys import Log, survey
@@ -48,6 +49,7 @@ USUAL_STEP_QUANTILE = 0.99  # of the |steps| of a velocity; rows with larger ste
 # |correlation| with these steps, above which a column is their difference
 MIN_DIFFERENCE_CORRELATION = 0.999
 TABLES = ("tabular", "text_log")
+DBC = ".dbc"
 LAYOUT = {
     "delimiter": ",",
     "decimal": ".",
@@ -127,7 +129,7 @@ def inspect(
     name : str
         Of the data set.
     files : sequence of Path
-        Of one format, with the same columns.
+        Of one format, with the same columns; among logs of a CAN bus its DBC.
     vehicle : mapping of str to float or None, optional
         Values of `VEHICLE`.
     force : bool
@@ -136,7 +138,8 @@ def inspect(
     Raises
     ------
     ConfigurationError
-        The name is taken, or the files are of several formats or folders.
+        The name is taken, the files are of several formats or folders, or a DBC is not beside logs
+        of a bus.
     MissingError
         A file does not exist.
     DataError
@@ -150,8 +153,9 @@ def inspect(
         )
     if name in source_names():
         raise ConfigurationError(f"'{name}' is a built-in source; use another name")
+    files, dbc = _divided(files)
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        logs = [_with_signs(_at_stated_rate(survey(file))) for file in files]
+        logs = [_with_signs(_at_stated_rate(survey(file, dbc))) for file in files]
     longest = _longest(logs)
     others = [log for log in logs if log.file != longest.file]
     differences = _differences(longest)
@@ -233,6 +237,28 @@ def inspect(
         proposals.rate_hz or (longest.rate_hz if longest.clock is None else None),
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
     )
+
+
+def _divided(files: Sequence[Path]) -> tuple[list[Path], Path | None]:
+    """Logs, and the DBC among the files, if any; relative to the working folder if in it."""
+    logs = [file for file in files if file.suffix.lower() != DBC]
+    dbcs = [file for file in files if file.suffix.lower() == DBC]
+    if not dbcs:
+        return logs, None
+    if not logs:
+        raise ConfigurationError(f"'{dbcs[0]}' describes a bus; name a log of it as well")
+    if len(dbcs) > 1:
+        raise ConfigurationError(
+            f"'{dbcs[0]}' and '{dbcs[1]}': a data set has one DBC; join them, or create one for "
+            "each, with a name of its own"
+        )
+    if foreign := [file for file in logs if file.suffix.lower() not in SUFFIXES]:
+        raise ConfigurationError(
+            f"'{foreign[0]}' is no log of a CAN bus ({', '.join(SUFFIXES)}), which '{dbcs[0]}' "
+            "would describe; leave the DBC out"
+        )
+    dbc = dbcs[0].resolve()
+    return logs, Path(os.path.relpath(dbc)) if dbc.is_relative_to(Path.cwd()) else dbc
 
 
 def unread(log: Log) -> str:

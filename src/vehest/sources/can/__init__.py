@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -169,7 +169,8 @@ class CanSource(SignalSource):
         rates = {}
         for name, described in by_channel.items():
             if len(stamps[name]) < 2:
-                others = "" if stamps[name] else other_sources(file, described.message)
+                senders = [] if stamps[name] else [described.message.described]
+                others = other_sources(read_frames(file), senders)
                 text = never_occurs(file, name, described, len(stamps[name]), bus)
                 raise DataError(text + others)
             times = np.array(stamps[name])
@@ -182,8 +183,7 @@ class CanSource(SignalSource):
                 origin, times, np.array(values[name]), described.message.units[described.signal]
             )
             rates[described.message.name] = round(signals[name].rate_hz, 3)
-        cut_end = f"not read: last line '{frames.cut_line}', which has no end"
-        left_out = {MISSING: {"": [cut_end]}} if frames.cut_line else {}
+        left_out = {MISSING: {"": [f"not read: {frames.cut_end}"]}} if frames.cut_end else {}
         return signals, {"dbc": self.dbc.name, "messages": rates, **left_out}
 
 
@@ -327,23 +327,22 @@ def never_occurs(
     )
 
 
-def other_sources(file: Path, message: Message) -> str:
-    """Further error text where frames of a J1939 message come from other source addresses than the
-    DBC says.
+def other_sources(frames: Frames, messages: Sequence[Any]) -> str:
+    """Further error text where frames of a J1939 message of the DBC, as cantools describes it, come
+    from other source addresses than the DBC says.
     """
-    if not message.described.is_extended_frame:
-        return ""
-    arrays = read_frames(file).arrays
+    arrays = frames.arrays
     identifiers = np.unique(arrays["identifier"][arrays["extended"] == 1])
-    group = GROUP_OF_J1939 & message.described.frame_id
-    senders = [int(sender) for sender in identifiers if sender & GROUP_OF_J1939 == group]
-    if not senders:
-        return ""
-    return (
-        f". The log has {', '.join(map(hex, senders[:8]))}, the same parameter group of J1939 from "
-        f"another source address; for it write BO_ {senders[0] | EXTENDED} in the DBC, instead of "
-        f"{message.described.frame_id | EXTENDED}"
-    )
+    for message in messages:
+        group = GROUP_OF_J1939 & message.frame_id
+        senders = [int(sender) for sender in identifiers if sender & GROUP_OF_J1939 == group]
+        if senders and message.is_extended_frame:
+            return (
+                f". The log has {', '.join(map(hex, senders[:8]))}, the same parameter group of "
+                f"J1939 from another source address as message '{message.name}'; for it write BO_ "
+                f"{senders[0] | EXTENDED} in the DBC, instead of {message.frame_id | EXTENDED}"
+            )
+    return ""
 
 
 SOURCE = CanSource

@@ -209,7 +209,7 @@ def read_database(file: Path, selected: Sequence[str]) -> Database:
                     signal for candidate, signal in chosen.values() if candidate is message
                 )
             )
-            messages[key] = _message(message, names, file)
+            messages[key] = message_of(message, names, file)
         elif messages[key].described is not message:
             raise DataError(
                 f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one"
@@ -243,8 +243,14 @@ def _only_place(
     return places[0]
 
 
-def _message(message: Any, selected: Sequence[str], file: Path) -> Message:
-    """A message with its wanted signals and their multiplexers alone."""
+def message_of(message: Any, selected: Sequence[str], file: Path) -> Message:
+    """A message of cantools with its wanted signals and their multiplexers alone.
+
+    Raises
+    ------
+    DataError
+        A signal has no finite scale, lies outside of the message, or has no multiplexer.
+    """
     from cantools.database.can import Message as Coder
 
     location = f"'{file}': message '{message.name}'"

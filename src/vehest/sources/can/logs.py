@@ -55,6 +55,11 @@ class Frames:
                 at += length
 
     @property
+    def cut_end(self) -> str:
+        """What of the log was not read, as text; empty where all was."""
+        return f"last line '{self.cut_line}', which has no end" if self.cut_line else ""
+
+    @property
     def last_stamp(self) -> float:
         """The largest stamp [s]."""
         return float(self.arrays["time"].max())

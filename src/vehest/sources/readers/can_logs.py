@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Collection, Sequence
 from datetime import datetime
 from io import TextIOWrapper
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,9 @@ LATEST = 1e11  # s
 FRAME = re.compile(r"\s*(\(|\d)")  # begins as a line that holds one
 DATE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{6}")
 EVENT = re.compile(r"\s*(\d+\.\d+)(?=\s)")
+DELTA = re.compile(r"\s*\((\d+\.\d+)\)")
+MIN_DECREASE_SHARE = 0.1  # of candump's stamps, from which on they count from the frame before
+N_JUDGED_STAMPS = 2000
 REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")  # to send, sent as Tx later
 NAMED = re.compile(r"\s*\d+\.\d+\s+\d+\s+(?![0-9A-Fa-f]+x?\s)(\w+)\s+[RT]x\s")
 ON_SCREEN = re.compile(
@@ -180,11 +183,31 @@ def _counts_from_last_event(file: Path) -> bool:
         return any(later < earlier for earlier, later in pairwise(stamps))
 
 
+def _counts_from_last_frame(file: Path) -> bool:
+    """Whether stamps of candump count from the frame before, as those of its option -td."""
+    with _LogText(file) as lines:
+        matches = (frame for line in lines if (frame := DELTA.match(line)))
+        stamps = [float(frame[1]) for frame in islice(matches, N_JUDGED_STAMPS)]
+    n_decreasing = sum(later < earlier for earlier, later in pairwise(stamps))
+    return n_decreasing > MIN_DECREASE_SHARE * len(stamps)
+
+
 class _CandumpText(_LogText):
-    """Lines of candump, also of what it writes on the screen, as those of its log."""
+    """Lines of candump, also of what it writes on the screen, as those of its log.
+
+    Stamps that count from the frame before are summed.
+    """
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file)
+        self.is_relative = _counts_from_last_frame(file)
+        self.elapsed = 0.0
 
     def __next__(self) -> str:  # type: ignore[override]
         line = super().__next__()
+        if self.is_relative and (stamp := DELTA.match(line)):
+            self.elapsed += float(stamp[1])
+            line = f"({self.elapsed:.6f}){line[stamp.end() :]}"
         if (frame := ON_SCREEN.match(line)) is None:
             return line
         fd = "#0" if len(frame["length"]) > 1 else ""  # two digits are those of CAN FD

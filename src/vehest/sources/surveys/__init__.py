@@ -23,6 +23,7 @@ from vehest.sources.mdf import read_measurement
 from vehest.sources.not_measured import codes_of_not_measured
 from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.clocks import between_pauses
+from vehest.sources.surveys.frames import survey_frames
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.tables import survey_table
 from vehest.sources.tables import read_head
@@ -51,8 +52,8 @@ UNITS = {  # of ROS's own types, REP 103
 }
 
 
-def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder.
+def survey(path: Path, dbc: Path | None = None) -> Log:
+    """Columns of one file, or of a bag's folder; of a log of a CAN bus the signals of its ``dbc``.
 
     Numbers that stand for a missing sample become NaN, and columns whose own stamps are no clock
     are left out; both are said in ``skipped``.
@@ -68,7 +69,7 @@ def survey(path: Path) -> Log:
     if not path.exists():
         raise missing_file(path)
     require_no_spreadsheet(path)
-    log = _without_codes(_survey(path))
+    log = _without_codes(_survey(path) if dbc is None else survey_frames(path, dbc))
     for run in log.runs:
         if (
             log.seconds is not None
@@ -104,7 +105,7 @@ def _without_codes(log: Log) -> Log:
         codes = codes_of_not_measured(column.values)
         if codes:
             is_code = np.isin(column.values, codes)
-            place = {**column.place, "invalid": codes}
+            place = {**column.place, "invalid": [*map(column.written, codes)]}
             values = np.where(is_code, np.nan, column.values)
             column = replace(column, values=values, place=place)
             texts = " and ".join(f"{code:.9g}" for code in codes)
@@ -128,8 +129,8 @@ def _survey(path: Path) -> Log:
         )
     if ending in CAN:
         raise DataError(
-            f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare "
-            "them (docs/sources/can.md)"
+            f"'{path}' is a log of a CAN bus; name the DBC file of the bus behind it, as in: "
+            f"vehest new my_car {path.name} car.dbc"
         )
     if ending == ".bag":
         raise DataError(

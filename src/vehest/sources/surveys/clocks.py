@@ -81,6 +81,7 @@ GROWING = 0.9
 MOST_RESTARTS = 0.01  # share of the rows at which times may go back, pause or begin anew
 MAX_APART = 1.0  # s between two columns of times in one row; beyond, they are different clocks
 MIN_TIMES = 10  # rows; a column with fewer times is not compared, and has no rate
+MIN_COARSE_TIMES = 100  # times that repeat in most rows, for a mean rate within a per cent
 MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ
 
 
@@ -192,7 +193,8 @@ def may_be_times(values: FloatArray) -> bool:
 
 
 def mean_rate(name: str, times: FloatArray, written: str) -> float | None:
-    """Mean rate of the rows, by times that are no clock: they repeat too often, or have no name.
+    """Mean rate of the rows between pauses, by times that are no clock: they repeat too often, or
+    have no name.
 
     Parameters
     ----------
@@ -206,17 +208,26 @@ def mean_rate(name: str, times: FloatArray, written: str) -> float | None:
     Returns
     -------
     float or None
-        In Hz; None where it goes backwards, repeats most of the time, or pauses.
+        In Hz; None where it goes backwards, hardly grows, or pauses often.
     """
     steps = np.diff(times)
-    if len(steps) < MIN_TIMES or not (steps >= 0.0).all() or (steps > 0.0).mean() < 0.5:
+    pauses = pauses_of(times)
+    n_times = np.count_nonzero(steps > 0.0)
+    min_times = MIN_TIMES if n_times > 0.5 * len(steps) else MIN_COARSE_TIMES
+    if n_times < min_times or not (steps >= 0.0).all():
         return None
-    step = float(steps.mean())
+    step = float((steps.sum() - pauses.sum()) / (len(steps) - len(pauses)))
     unit = _unit_of_time(name, written)
     stamps = _stamps(name, step, unit, named=True, length=float(np.ptp(times)))
-    if stamps is None or stamps.asked or steps.max() > FEWEST_STEPS * step:
+    if stamps is None or stamps.asked or len(pauses) > MOST_RESTARTS * len(steps):
         return None
     return plain_rate(1.0 / (step * STATED_UNITS[stamps.unit]), INTERPOLATED_TOLERANCE)
+
+
+def pauses_of(times: FloatArray) -> FloatArray:
+    """Steps of times that repeat, (N,), beside which the usual ones are short, in their unit."""
+    steps = np.diff(times)
+    return steps[steps > FEWEST_STEPS * np.median(steps[steps > 0.0])] if steps.any() else steps[:0]
 
 
 def _unit_of_time(name: str, written: str) -> str:

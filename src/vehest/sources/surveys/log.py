@@ -27,6 +27,15 @@ class RawColumn:
     # whether the file says that the car measured it, on its bus, or the reference did; empty where
     # it does not
     device: Literal["", "car", "reference"] = ""
+    # scale and offset of raw values, by which a data set of a bus declares those that mean nothing
+    scaling: tuple[float, float] | None = None
+
+    def written(self, value: float) -> float:
+        """A value as a data set declares it: as it stands in the file, whole where it is raw."""
+        if self.scaling is None:
+            return value
+        scale, offset = self.scaling
+        return round((value - offset) / scale)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import pyarrow.compute as compute
 import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, printable
+from vehest.data.errors import DataError, number_of, printable
 from vehest.data.limits import check_limit
 from vehest.data.parquet import (
     DAMAGE,
@@ -47,6 +47,7 @@ from vehest.sources.surveys.clocks import (
     find_clock,
     may_be_times,
     mean_rate,
+    pauses_of,
     plain_name,
     times_apart,
 )
@@ -72,6 +73,7 @@ HEAD = 1 << 18  # bytes of a file that are looked at
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # different texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # such cells over the numbers of a column; with more it is a column of texts
+MIN_REPEATED_ROWS = 0.1  # share of rows that repeat the one before, above which a table is refused
 MIN_SHARE_OF_KIND = 0.1  # of the texts of a column, above which an error names their kind
 MIN_UNITS_ABOVE = 0.7  # share of cells that are units, for a row of units above the names
 MAX_HEADER_LINES = 4  # lines of names, units, sources and the like, right above the numbers
@@ -233,15 +235,26 @@ def survey_table(file: Path) -> Log:
         if stamps is None or name != stamps.column
     ]
     rate_source = "a line above the names"
+    for name, times in named.items():
+        _require_rows_once(file, name, times, values)
     if stamps is None and rate_hz is None:
         unread_times = [text for text in skipped if UNREAD_TIMES.match(text)]
         if unread_times:
             raise DataError(f"'{file}': {unread_times[0]}")
         if unnamed_times is not None:
             named |= {"": unnamed_times}
+        rate_source = "the times of a column that is not read, on average"
         for name, times in named.items():
-            rate_hz = rate_hz or mean_rate(name, times, written.get(name, ""))
-            rate_source = "the times of a column that is not read, on average"
+            rate_hz = mean_rate(name, times, written.get(name, ""))
+            if rate_hz is None:
+                continue
+            if len(pauses := pauses_of(times)):
+                skipped.append(
+                    f"{number_of(len(pauses), 'pause')} of '{printable(name)}', the longest by "
+                    f"{pauses.max():.4g}: the rows on both sides follow one another without it; "
+                    "split the file there"
+                )
+            break
     if stamps is not None and stamps.repair.get("sort"):
         rows = np.argsort(times_and_values[stamps.column], kind="stable")
         values = {name: samples[rows] for name, samples in values.items()}
@@ -280,6 +293,24 @@ def _unread_column(field: pa.Field) -> str:
     if pa.types.is_nested(field.type):
         return f"{text}; make a column of each of its elements (in pandas: .str[0], .str[1] …)"
     return text
+
+
+def _require_rows_once(
+    file: Path, name: str, times: FloatArray, values: Mapping[str, FloatArray]
+) -> None:
+    """Refuse, by a `DataError`, a table that writes its rows several times, by whose distinct rows
+    its times, (N,), are a clock.
+    """
+    rows = np.nan_to_num(np.stack([*values.values()]))
+    is_new = np.append(True, (np.diff(rows) != 0.0).any(axis=0))
+    n_repeats = int((~is_new).sum())
+    if n_repeats < MIN_REPEATED_ROWS * len(times) or (np.diff(times[is_new]) <= 0.0).any():
+        return
+    raise DataError(
+        f"'{file}' repeats {n_repeats} of its {len(times)} rows, the times '{printable(name)}' "
+        f"included; remove the repeats, for example by pandas: read_csv('{file.name}')"
+        f".drop_duplicates().to_csv('{file.stem}_once.csv', index=False)"
+    )
 
 
 def _fault(name: str, times: FloatArray) -> str:

@@ -68,8 +68,8 @@ def require_columns_of_signals(
         )
     if filled and all(map(_CANDUMP.match, filled[:20])):
         raise DataError(
-            f"'{file}' holds raw frames of a CAN bus as candump writes them; "
-            "declare it with the bus's DBC (docs/sources/can.md), or save its decoded signals"
+            f"'{file}' holds raw frames of a CAN bus as candump writes them; name the DBC file of "
+            f"the bus behind it, as in: vehest new my_car {file.stem}.log car.dbc"
         )
     if filled and all(map(_LINE_PROTOCOL.fullmatch, filled[:20])):
         raise DataError(
@@ -124,7 +124,7 @@ def _require_no_frames(file: Path, table: Sequence[Sequence[str]]) -> None:
         ):
             raise DataError(
                 f"'{file}' holds raw frames of a CAN bus; decode them by the bus's DBC, or save "
-                "them as .asc, .blf or candump's .log and declare them (docs/sources/can.md)"
+                "them as .asc, .blf or candump's .log for: vehest new my_car lap.asc car.dbc"
             )
 
 
