@@ -47,13 +47,13 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (after installing, three minutes of processor time the first time, seconds when repeated)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) ## tests; whole studies are in `make test-apart`, style and types in `make lint`
+test: $(INSTALLED) ## tests; studies are in `make test-apart`, style and types in `make lint`
 	$(TESTS)
 
 test-durations: $(INSTALLED) ## the same, with the 50 that take longest
 	$(TESTS) --durations=50
 
-test-apart: $(INSTALLED) ## tests that are slow by nature: whole studies, documentation, fuzzing, the wheel, many processes
+test-apart: $(INSTALLED) ## tests that are slow by nature: studies, among them those of the papers, documentation, fuzzing, the wheel, many processes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
 
 test-docs test-fuzz test-wheel test-processes test-studies: $(INSTALLED) ## one kind of them

@@ -24,10 +24,19 @@ torch.set_num_threads(1)
 gc.set_threshold(10_000)  # as in every command: compilers make many objects
 
 
+PAPERS = Path(__file__).with_name("papers")
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Tests of the unscented filters' families come first and thereby on one worker, since each
-    worker that needs their kernels while another compiles them compiles them too, for a minute.
+    """Tests of the papers' studies are apart, as all of `vehest_papers` is apart from the library.
+
+    Tests of the unscented filters' families come first and thereby on one worker, since each worker
+    that needs their kernels while another compiles them compiles them too, for a minute.
     """
+    for item in items:
+        if PAPERS in item.path.parents:
+            item.add_marker("apart")
     items.sort(key=lambda item: not item.name.endswith(("[learned_ukf]", "[cnn_ukf]")))
 
 
