@@ -24,17 +24,18 @@ MIN_CHANGES = 20  # changes of value; with fewer a channel does not count as hel
 MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
 # share of changes by one quantum above which a channel is quantised, not held
 MAX_SINGLE_STEP_SHARE = 0.5
-COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")  # that health expects to change all the time
+COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")  # health expects these to change all the time
 # Hz; a faster recording is low-passed where it is brought to the rate of a model
 MAX_COARSE_RATE_HZ = 30.0
-MAX_LEVELS = 5000.0  # steps in the range of a channel, beyond which none is coarse
-MIN_WHOLE_STEP_SHARE = 0.99  # of the changes are whole numbers of a coarse channel's smallest step
-STEP_TOLERANCE = 0.02  # of a step
+MAX_LEVELS = 5000.0  # steps in the range of a channel; one with more is not coarse
+MIN_WHOLE_STEP_SHARE = 0.99  # of the changes of a coarse channel are whole numbers of its step
+STEP_TOLERANCE = 0.02  # distance of a change from whole numbers of the step, in steps
+# s around a sample; where the share of repeated samples is MIN_REPEAT_SHARE, health calls them held
 REPEAT_SECONDS = 0.5
-MIN_REPEAT_SHARE = 0.3  # of the samples in this time, at which health calls a channel held
-MIN_COARSE_SHARE = 0.05  # of the moving time
-COARSE_CUTOFF_HZ = 3.0
-MAX_CUTOFF_SHARE = 0.4  # of the sampling rate
+MIN_REPEAT_SHARE = 0.3
+MIN_COARSE_SHARE = 0.05  # of the moving time that a coarse channel repeats samples so
+COARSE_CUTOFF_HZ = 3.0  # Hz, of the low-pass that removes the steps of a coarse channel
+MAX_CUTOFF_SHARE = 0.4  # of the sampling rate, above which that cut-off does not lie
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
@@ -181,7 +182,10 @@ def repetition_findings(recording: Recording, moving: BoolArray) -> list[Finding
 
 
 def held_channels(recording: Recording, moving: BoolArray) -> dict[str, list[str]]:
-    """Rates at which held channels are updated, as text [Hz] -> these channels; (T,) ``moving``."""
+    """Rates at which held channels are updated, as text [Hz] -> these channels.
+
+    Only samples where the car is ``moving``, (T,), count.
+    """
     names_by_rate: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
         rate = update_rate_hz(samples[moving], recording.rate_hz)
@@ -191,15 +195,7 @@ def held_channels(recording: Recording, moving: BoolArray) -> dict[str, list[str
 
 
 def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
-    """Warnings of channels in steps so coarse that their samples repeat, such as a speed in km/h.
-
-    Parameters
-    ----------
-    recording : Recording
-        Any channels.
-    moving : BoolArray
-        Where the car moves, (T,); other samples do not count.
-    """
+    """Warnings of `coarse_steps`, such as those of a speed in whole km/h, with the remedy."""
     return [
         Finding(
             "warning",
@@ -208,7 +204,7 @@ def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
             f"in steps of {step:.3g} {CHANNELS[name].unit}, between which samples repeat: a model "
             "that was calibrated on finer ones takes this for a fault; the transform "
             f"{{name: low_pass, cutoff_hz: {coarse_cutoff_hz(recording.rate_hz):g}, "
-            f"channels: [{name}]}} removes the steps, by samples of up to half a second later",
+            f"channels: [{name}]}} removes the steps; it uses samples of up to half a second later",
         )
         for name, step in coarse_steps(recording, moving).items()
     ]
@@ -217,8 +213,8 @@ def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
 def coarse_steps(recording: Recording, moving: BoolArray) -> dict[str, float]:
     """Coarse channels -> their step [SI]; those that are held or have gaps are left out.
 
-    A coarse channel changes by whole numbers of its step, and repeats its samples for a while at
-    least; ``moving``: where the car moves, (T,).
+    A coarse channel changes by whole numbers of its step, between which its samples repeat; only
+    those where the car is ``moving``, (T,), count.
     """
     steps = {}
     n_samples = max(round(REPEAT_SECONDS * recording.rate_hz), 1)

@@ -170,7 +170,7 @@ def inner_life(
             axes.set_xlabel("time [s]")
         legend_above(figure, grid[0, 0], columns=3)
     caption = (
-        f"Networks of the hybrids in the slalom of Figure 7 (Figure 8 of the paper). Data: {data}."
+        f"Networks of the hybrids in the slalom of Figure 1 (Figure 8 of the paper). Data: {data}."
     )
     return Figure("figure_8", caption, figure)
 

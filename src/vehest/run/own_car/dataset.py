@@ -150,7 +150,7 @@ def draft(examined: Examined) -> Draft:
         notes.append(
             "a few samples outside the possible range are interpolated (bridge_impossible)"
         )
-    held = _held_with_speed(max(recordings, key=_duration)) if dataset["source"] in TABLES else []
+    held = _held_with_speed(_longest(recordings)) if dataset["source"] in TABLES else []
     if held:
         recordings = _recordings(dataset := dataset | {"held": {"channels": held}})
         notes.append(
@@ -167,7 +167,7 @@ def draft(examined: Examined) -> Draft:
             f"coarse steps ({', '.join(sizes)}) are removed by the transform low_pass at "
             f"{cutoff:g} Hz, which uses samples of up to half a second later"
         )
-    longest = max(recordings, key=_duration)
+    longest = _longest(recordings)
     late = late_channels(longest)
     ratio = None
     for stem, rows in dataset.get("drop_rows", {}).items():
@@ -253,12 +253,13 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return list(open_source(dataset).recordings())
 
 
-def _duration(recording: Recording) -> float:
-    return recording.duration
+def _longest(recordings: Sequence[Recording]) -> Recording:
+    """The recording of the longest duration."""
+    return max(recordings, key=lambda recording: recording.duration)
 
 
 def _held_with_speed(recording: Recording) -> list[str]:
-    """Speed and channels of its rate where the table repeats the samples of a slow sensor."""
+    """The speed, and channels that are held at the same rate, where rows repeat its samples."""
     for rate, names in held_channels(recording, ~standstill(recording)).items():
         if "vx" in names and 0.5 / float(rate) > MIN_REPORTED_DELAY_SECONDS:
             return names
@@ -522,6 +523,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
 
 
 def _signal_options(examined: Examined) -> dict[str, Any]:
+    """Channels, rate and gaps of a source whose signals have times of their own."""
     channels = {}
     rates = []
     paused = False

@@ -25,9 +25,11 @@ LATEST = 1e11  # s
 FRAME = re.compile(r"\s*(\(|\d)")  # begins as a line that holds one
 DATE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{6}")
 EVENT = re.compile(r"\s*(\d+\.\d+)(?=\s)")
+# stamp at the head of a line of candump [s]
 DELTA = re.compile(r"\s*\((\d+\.\d+)\)")
-MIN_DECREASE_SHARE = 0.1  # of candump's stamps, from which on they count from the frame before
-N_JUDGED_STAMPS = 2000
+# share of stamps that are smaller than the one before, above which they count from the last frame
+MIN_DECREASE_SHARE = 0.1
+N_JUDGED_STAMPS = 2000  # first stamps of a log that decide this
 REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")  # to send, sent as Tx later
 NAMED = re.compile(r"\s*\d+\.\d+\s+\d+\s+(?![0-9A-Fa-f]+x?\s)(\w+)\s+[RT]x\s")
 ON_SCREEN = re.compile(
