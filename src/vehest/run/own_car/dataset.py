@@ -70,6 +70,7 @@ REMARKS = (
     "offset",
     "rotation",
     "spike",
+    "full_turn",
 )
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
