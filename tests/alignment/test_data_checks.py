@@ -110,7 +110,7 @@ def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
 
 def test_kinematics_are_judged_on_moving_cars_alone():
     finding = only_complaint(
-        changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE)))
+        changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(2.5 * RATE)))
     )
     assert (finding.level, finding.check, finding.channel) == ("warning", "kinematics", "vy_ref")
     generator = np.random.default_rng(0)
@@ -382,6 +382,36 @@ def test_spikes_with_and_beside_missing_samples_are_found_and_a_swerve_at_the_st
     swerve = steering_wheel()
     swerve[:20] += 4.0 * np.cos(np.linspace(0.0, 0.5 * np.pi, 20))
     assert not spikes(handwheel=swerve)
+
+
+@pytest.mark.parametrize(("offset", "code"), [(2.0, 0.0), (3.0, -0.2778)])
+def test_a_code_in_a_twentieth_of_the_samples_is_found_though_its_jumps_are_frequent(offset, code):
+    angle = offset + steering_wheel()
+    angle[np.random.default_rng(0).random(len(angle)) < 0.05] = code
+    found = spikes(handwheel=angle)["handwheel"]
+    assert re.search(r"jumps away and back \d{2,} times", found)
+    assert f"to {code:.4g} rad" in found
+
+
+@pytest.mark.parametrize("kind", ["counted to a turn", "zero found late"])
+def test_steps_of_a_full_turn_of_a_steering_wheel_are_named_and_unwrapping_removes_them(kind):
+    drive = clean_drive()
+    angle = steering_wheel()
+    if kind == "counted to a turn":
+        angle %= 2.0 * np.pi
+    else:
+        angle[500:] += 2.0 * np.pi
+    n_steps = int((np.abs(np.diff(angle)) > 5.0).sum())
+    (finding,) = [
+        finding
+        for finding in warned(changed(drive, handwheel=angle))
+        if finding.channel == "handwheel"
+    ]
+    assert finding.check == "full_turn"
+    assert finding.message.startswith(f"{n_steps} step{'s' * (n_steps > 1)} of a full turn")
+    unwrapped = np.radians(np.unwrap(np.degrees(angle), period=360))
+    checks = [finding.check for finding in warned(changed(drive, handwheel=unwrapped))]
+    assert "full_turn" not in checks
 
 
 def test_a_shaking_sensor_and_a_sideslip_angle_at_standstill_make_no_spike():

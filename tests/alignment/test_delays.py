@@ -2,6 +2,7 @@
 is.
 """
 
+import re
 from itertools import product
 
 import numpy as np
@@ -50,6 +51,13 @@ def test_the_late_channel_is_named_and_no_other(late, rate):
     for delay in delays(drive):
         truth = 0.04 * ((delay.channel in late) - (delay.against in late))
         assert delay.delay.value == pytest.approx(truth, abs=6e-3), delay
+
+
+def test_a_speed_that_a_receiver_reports_almost_a_second_late_is_named():
+    found = reported(without(broadband_drive(rate_hz=25.0, late={"vx": 0.9}), "vx_ref"))
+    assert list(found) == ["vx"]
+    delay = float(re.search(r"delayed by (\d+) ms", found["vx"].message)[1])
+    assert delay == pytest.approx(900.0, abs=10.0)
 
 
 @pytest.mark.parametrize("late", [0.0333, 0.1, 0.25])

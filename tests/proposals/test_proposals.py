@@ -496,6 +496,8 @@ ROLES = {
     "Y Body Velocity": "vy_ref", "X-BdyVel": "vx", "poseDevice.acceleration.y": "ay",
     "LFspeed": "wheel_speed_fl", "VxTarget": "other", "v_soll": "other", "Acc_Z": "az",
     "cmd_vel.linear.x": "other", "Trailer_YawRate": "other", "Hitch_Angle": "other",
+    "AngleRateZ": "yaw_rate", "AngleRateX": "roll_rate", "AngleRateY": "pitch_rate",
+    "Steer_SW": "handwheel", "SteeringAngleRate": "other",
     "ABS_WhlSpdFrntLe": "wheel_speed_fl", "ABS_WhlSpdReRi": "wheel_speed_rr",
 }  # fmt: skip
 
@@ -2025,3 +2027,62 @@ def test_a_column_that_begins_late_is_compared_from_there_on(tmp_path):
     )
     evidence = " ".join(inspect("my_car", [tmp_path / "lap.mf4"]).in_words())
     assert abs(float(re.search(r"gain ([\d.]+)", evidence)[1]) - 1.0) < 0.05
+
+
+def test_a_speed_that_counts_backwards_leaves_the_sign_of_ax_to_a_question(tmp_path):
+    """x points to the rear, and the drive hardly shows ax against d(vx)/dt."""
+    d = drive()
+    table = usual(d)
+    table["Speed"] *= -1.0
+    table["LatAcc"] *= -1.0
+    noise = 0.2 * np.random.default_rng(0).standard_normal(len(table))
+    table["LongAcc [g]"] = -table.pop("LongAcc") + noise
+    proposals = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    ax = proposals.by_channel["ax"]
+    assert (proposals.by_channel["vx"].sign, ax.sign, bool(ax.question)) == (-1, -1, True)
+
+
+def test_a_velocity_along_an_axis_of_the_world_is_no_reference_of_the_speed(tmp_path):
+    d = drive()
+    yaw = 0.25 * np.sin(0.1 * d["t"])  # of a road that hardly turns: vx·cos(yaw) is nearly vx
+    yaw += 0.5 * np.sin(0.013 * d["t"])
+    table = usual(d).assign(
+        **{"Vel_Frame_X": d["vx"] * np.cos(yaw), "Vel_Frame_Y": d["vx"] * np.sin(yaw)}
+    )
+    alone = table.drop(columns="Vel_Frame_Y")
+    assert np.corrcoef(table["Vel_Frame_X"], d["vx"])[0, 1] > 0.9
+    for logged, is_reference in ((table, False), (alone, True)):
+        channels = inspect("my_car", [write(tmp_path / "lap.csv", logged)]).proposals.channels
+        columns = {channel.column for channel in channels}
+        assert ("Vel_Frame_X" in columns) == is_reference
+        assert "Vel_Frame_Y" not in columns
+
+
+def test_raw_counts_are_no_rare_units_and_the_error_names_the_factor(tmp_path):
+    """An MPU-6050: 16384 counts a g, 131 counts a degree a second."""
+    d = drive()
+    table = pd.DataFrame(
+        {
+            "millis": np.round(1e3 * d["t"]),
+            "speed_kmh": 3.6 * d["vx"],
+            "gz": np.round(131.0 * np.degrees(d["r"])),
+            "ay": np.round(16384.0 / G * d["ay"]),
+        }
+    )
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    with pytest.raises(ConfigurationError, match="raw counts need a factor: COLUMN=CHANNEL UNIT"):
+        ask(examined, [], interactive=False)
+    answers = ["gz=yaw_rate deg/s 1 0.0076336", "ay=ay g 1 6.1035e-05", "speed_kmh=vx km/h"]
+    recording = read_back(draft(ask(examined, answers, interactive=False)[0]))
+    np.testing.assert_allclose(recording["ay"], d["ay"], atol=1e-3)
+    np.testing.assert_allclose(recording["yaw_rate"], d["r"], atol=1e-3)
+
+
+def test_a_steering_ratio_is_neither_estimated_nor_missed_beside_the_road_wheels_angle(tmp_path):
+    d = drive()
+    table = usual(d).rename(columns={"Steer": "Steer_SW (deg)"})
+    table["Steer_SW (deg)"] += 5.0 * np.random.default_rng(0).standard_normal(len(table))
+    table["Steer_L1 (deg)"] = np.degrees(d["steer"])
+    vehicle = {"wheelbase": 2.7, "mass": None, "steering_ratio": None}
+    notes = draft(inspect("my_car", [write(tmp_path / "lap.csv", table)], vehicle)).notes
+    assert not [note for note in notes if "steering ratio" in note]

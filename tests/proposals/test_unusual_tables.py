@@ -3,6 +3,7 @@ the way out.
 """
 
 import datetime
+import gzip
 import json
 from zipfile import ZipFile
 
@@ -109,6 +110,88 @@ def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
     log_draft, recording = read_back(file)
     assert log_draft.dataset["drop_rows"] == {"lap": [500]}
     assert_yaw_rate_is(recording, table)
+
+
+HEAD = ["A logger", "Time,Speed,Gyro,LatAcc,LongAcc,Steer,Beta", "s,km/h,deg/s,g,g,deg,deg"]
+
+
+def test_files_that_were_joined_with_their_headers_are_recordings_of_their_own(tmp_path):
+    table = usual(drive())
+    table.loc[4000:, "Time [s]"] -= 75.0
+    rows = lines_of(table)[1:]
+    file = text_file(tmp_path, *HEAD, *rows[:4000], *HEAD, *rows[4000:])
+    log_draft = draft(inspect("my_car", [file]))
+    assert log_draft.dataset["drop_rows"] == {"lap": [4001, 4002]}
+    source = open_source(log_draft.dataset)
+    assert source.ids() == ["lap_run_0", "lap_run_1"]
+    parts = [source.read(name) for name in source.ids()]
+    assert [len(part) for part in parts] == [4000, 2000]
+    yaw_rate = np.concatenate([part["yaw_rate"] for part in parts])
+    np.testing.assert_allclose(yaw_rate, np.radians(table["Gyro"]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("line", "old", "new"), [(1, "Gyro,LatAcc", "LatAcc,Gyro"), (2, "km/h", "mph")]
+)
+def test_files_that_were_joined_with_other_names_or_units_are_refused(tmp_path, line, old, new):
+    rows = lines_of(usual(drive()))[1:]
+    second = list(HEAD)
+    second[line] = second[line].replace(old, new)
+    file = text_file(tmp_path, *HEAD, *rows[:4000], *second, *rows[4000:])
+    message = rf"data row 400{line} holds other names or units .* '{new.split(',')[0]}'; save the"
+    with pytest.raises(DataError, match=message):
+        inspect("my_car", [file])
+
+
+def test_rows_of_marks_of_missing_samples_alone_stay(tmp_path):
+    table = usual(drive()).drop(columns="Time [s]")
+    lines = lines_of(table)
+    lines[500] = ",".join(["SNA"] * 6)
+    log = survey_table(text_file(tmp_path, *lines))
+    assert log.repeated_names == ()
+    assert len(log.by_name["Gyro"].values) == len(table)
+
+
+def test_statistics_above_the_numbers_are_left_out(tmp_path):
+    table = usual(drive())
+    statistics = [
+        ",".join([name, *map(str, getattr(table.iloc[:, 1:], name)().round(3))])
+        for name in ("min", "max", "mean")
+    ]
+    rows = lines_of(table)[1:]
+    log_draft, recording = read_back(text_file(tmp_path, *HEAD, *statistics, *rows))
+    assert log_draft.dataset["drop_rows"] == {"lap": [1, 2, 3]}
+    assert recording.rate_hz == 50.0
+    assert_yaw_rate_is(recording, table)
+
+
+def test_a_table_that_gzip_compressed_is_read_once_its_name_says_so(tmp_path):
+    table = usual(drive())
+    file = write(tmp_path / "lap.csv", table)
+    file.write_bytes(gzip.compress(file.read_bytes()))
+    with pytest.raises(DataError, match=r"by gzip; let its name end in '\.csv\.gz'"):
+        inspect("my_car", [file])
+    log_draft = draft(inspect("my_car", [file.rename(tmp_path / "lap.csv.gz")]))
+    assert_yaw_rate_is(open_source(log_draft.dataset).read("lap.csv"), table)
+
+
+@pytest.mark.parametrize("time", ["Time [s]", "t [s]"])
+def test_two_files_of_one_drive_are_refused_with_the_command_that_joins_them(
+    tmp_path, monkeypatch, time
+):
+    table = usual(drive())
+    slow = table[["Time [s]", "Speed"]][::5].rename(columns={"Time [s]": time})
+    write(tmp_path / "gnss.csv", slow)
+    write(tmp_path / "imu.csv", table.drop(columns="Speed"))
+    with pytest.raises(DataError, match="if the files are of one drive") as refused:
+        inspect("my_car", [tmp_path / "imu.csv", tmp_path / "gnss.csv"])
+    monkeypatch.chdir(tmp_path)
+    command = str(refused.value).partition("by pandas: ")[2]
+    eval(command, {"merge": pd.merge, "read_csv": pd.read_csv})
+    _, recording = read_back(tmp_path / "joined.csv")
+    assert recording.rate_hz == 50.0
+    assert_yaw_rate_is(recording, table[: len(recording)])
+    np.testing.assert_allclose(recording["vx"], table["Speed"][: len(recording)] / 3.6, atol=0.1)
 
 
 @pytest.mark.parametrize("below", [["End of measurement", "# EOF"], ["Mean" + ",1.0" * 6, "Max,9"]])

@@ -238,6 +238,7 @@ def test_spellings_are_known_where_they_mean_one_thing():
         "m/s^2": "m/s²",
         "[m/sec²]": "m/s²",
         "m/(s^2)": "m/s²",
+        "km|h": "km/h",
         "MPa": "MPa",
         "mPa": "another unit",
         "Unit_KiloMeterPerHour": "km/h",

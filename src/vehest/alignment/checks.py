@@ -68,6 +68,9 @@ STRAIGHT_SECONDS = 3.0
 # rad while driving straight ahead; the limit of the steering wheel is more than the crown of a road
 # requires
 MAX_STEERING_OFFSETS = {"steer": np.deg2rad(3.0), "handwheel": np.deg2rad(2.5)}
+# rad, steps of a steering wheel's angle from one sample to the next that are those of a full turn:
+# a hand turns it by less
+FULL_TURN = (1.5 * np.pi, 2.5 * np.pi)
 MAX_SPEED_DIFFERENCE = 0.04  # share of the reference's; speedometers read up to 10 % too much
 MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit may be wrong
 # rad, mounting angle about the vertical; smaller ones are not reported
@@ -494,23 +497,35 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _between_jumps(samples: FloatArray, rate_hz: float) -> Iterator[tuple[int, int]]:
-    """Runs of equal samples, or a single zero, between two jumps that lead away and back, or
-    between a jump and an end of the recording.
+    """Runs of equal samples, or a single sample of a code, between two jumps that lead away and
+    back, or between a jump and an end of the recording.
     """
     rows = np.flatnonzero(np.isfinite(samples))
-    steps = np.diff(samples[rows])
-    usual = float(np.quantile(np.abs(steps), USUAL_STEP_QUANTILE))
+    measured = samples[rows]
+    steps = np.diff(measured)
+    usual, codes = _usual_step(measured)
     jumps = np.flatnonzero((np.abs(steps) > JUMP_STEP * usual) & (usual > 0.0)) + 1
     for first, after in pairwise([0, *jumps.tolist(), len(rows)] if len(jumps) else ()):
         away = steps[first - 1] if first else -steps[after - 1]
         back = steps[after - 1] if after < len(rows) else -away
         is_return = abs(away + back) < 0.5 * min(abs(away), abs(back))
-        run = samples[rows[first:after]]
-        is_code = np.ptp(run) == 0.0 and (after - first > 1 or run[0] == 0.0)
+        run = measured[first:after]
+        is_code = np.ptp(run) == 0.0 and (after - first > 1 or run[0] in codes)
         begin = int(rows[first])
         end = int(rows[after - 1]) + 1
         if is_return and is_code and end - begin <= JUMP_SECONDS * rate_hz:
             yield begin, end
+
+
+def _usual_step(measured: FloatArray) -> tuple[float, set[float]]:
+    """Usual |step| between samples, and values that may be codes: zero and the most frequent one,
+    whose jumps may be so frequent that they do not count.
+    """
+    values, counts = np.unique(measured, return_counts=True)
+    codes = {0.0, float(values[np.argmax(counts)])}
+    others = measured[~np.isin(measured, [*codes])]
+    steps = np.abs(np.diff(others if len(others) > 0.5 * len(measured) else measured))
+    return float(np.quantile(steps, USUAL_STEP_QUANTILE)), codes
 
 
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -519,6 +534,8 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """
     for name, max_offset in MAX_STEERING_OFFSETS.items():
         if not {"vx", "yaw_rate", name} <= set(recording.channels):
+            continue
+        if name == "handwheel" and len(_rows_of_full_turns(recording)):
             continue
         straight = (
             (recording["vx"] > STRAIGHT_SPEED)
@@ -542,6 +559,28 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             )
             remedy = f"the transform offset_correction removes it ({name}: {offset:.3g} rad)"
             yield Finding("warning", "offset", name, f"{message}; {remedy}")
+
+
+def _full_turns(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """A steering wheel's angle steps by a full turn where it is counted from 0 to 360 degrees, or
+    where its sensor finds zero only while driving.
+    """
+    rows = _rows_of_full_turns(recording)
+    if len(rows):
+        message = (
+            f"{number_of(len(rows), 'step')} of a full turn from one sample to the next, the first "
+            f"at t = {recording.time[rows[0]]:.12g} s; write the angle without them, for example "
+            "by numpy.unwrap(angle, period=360) of degrees"
+        )
+        yield Finding("warning", "full_turn", "handwheel", message)
+
+
+def _rows_of_full_turns(recording: Recording) -> NDArray[np.int64]:
+    """Samples before which the steering wheel's angle steps by about a full turn."""
+    if "handwheel" not in recording:
+        return np.empty(0, dtype=np.int64)
+    steps = np.abs(np.diff(recording["handwheel"]))
+    return np.flatnonzero((steps > FULL_TURN[0]) & (steps < FULL_TURN[1])) + 1
 
 
 def _speed_difference(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -668,6 +707,7 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _saturated,
     _spikes,
     _steering_offset,
+    _full_turns,
     _speed_difference,
     _wheel_dropout,
     _reverse,

@@ -33,7 +33,7 @@ MAX_COHERENCE = 0.99  # of a bin; limits its weight, which is infinite at 1
 # window leaks more
 MIN_POWER_SHARE = 1e-6
 MIN_MEAN_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
-MAX_LAG_SECONDS = 0.5  # s; longer delays are not searched
+MAX_LAG_SECONDS = 1.2  # s; longer delays are not searched
 MAX_TIME_CONSTANT_SECONDS = 10.0  # s; longer ones are not searched
 N_STEPS = 25  # Gauss-Newton steps of a fit at most
 CONFIDENCE = 0.95  # level of all intervals, which texts call 95 %
@@ -281,7 +281,7 @@ def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[
     """Delay and time constant [s] of the best point of a grid, by the real part of the weighted
     cross-spectrum once both are compensated for.
     """
-    delays = np.linspace(-MAX_LAG_SECONDS, MAX_LAG_SECONDS, 41)
+    delays = np.linspace(-MAX_LAG_SECONDS, MAX_LAG_SECONDS, 97)
     constants = (
         np.concatenate([[0.0], np.geomspace(0.05, MAX_TIME_CONSTANT_SECONDS, 15)])
         if low_pass

@@ -95,6 +95,7 @@ def plain_unit(text: str) -> str | None:
     text = _FRACTION.sub(lambda match: f"{1.0 / float(match[1]):g} ", text.strip())
     step, rest = _STEPPED.fullmatch(text.strip("()[] ")).groups()  # type: ignore[union-attr]
     bare = re.sub(r"[\s·*×.Â()\[\]]", "", rest)  # Â: UTF-8 that was read as Latin-1
+    bare = bare.replace("|", "/")  # as dSPACE writes km|h
     plain = _CASES.get(bare) or _SPELLINGS.get(_SECOND.sub("s", bare.lower()))
     if not step or plain in (None, "another unit"):
         return None if step else plain

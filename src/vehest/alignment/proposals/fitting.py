@@ -212,7 +212,13 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
     if not fits and "ax" not in column.hints:  # a torque follows d(vx)/dt as well
         return None
     is_clear = best.strength >= CLEAR_CORRELATION and fits
-    question = "" if is_clear or (column.hint("ax") == STRONG and column.unit) else UNCLEAR
+    # where the drive does not show it, the axes of the other channels are those of ax, unless ay
+    # counts against the yaw rate: then the sensor's y axis alone points right, or all axes of it
+    signs = search.turning.signs
+    sign = best.sign if best.strength else signs["vx"]
+    is_sign_known = bool(best.strength) or -1 not in signs.values()
+    is_named = column.hint("ax") == STRONG and column.unit and is_sign_known
+    question = "" if is_clear or is_named else UNCLEAR
     evidence = (best.text or "name only", *_name_evidence(column, "ax"))
     measured = any(bus_column.is_of_bus and "ax" in bus_column.hints for bus_column in search.free)
     score = (
@@ -220,7 +226,7 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
         - (REFERENCE_PENALTY_WITH_BUS if measured else REFERENCE_PENALTY) * column.is_reference
     )
     is_weak = bool(question) and not (column.unit or is_of_ay_sensor)
-    proposal = Proposal(column.name, "ax", unit, best.sign, evidence, question, is_weak=is_weak)
+    proposal = Proposal(column.name, "ax", unit, sign, evidence, question, is_weak=is_weak)
     return Offer(score, column, proposal)
 
 

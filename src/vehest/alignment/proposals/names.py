@@ -26,9 +26,9 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
         r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$|crc|checksum|pruefsumme|bz$|^alive"
     ),
     "yaw_rate": (
-        r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
+        r"yawra?te?|ang(ular|le)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
         r"lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|"
-        r"ang(ular)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
+        r"ang(ular|le)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
         r"^rimu$|psistrich|vgier"
     ),
     "ay": (
@@ -43,7 +43,7 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
     r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
     "az": r"acc(el|eleration)?z|zacc|^az$|verta|accvert",
     "handwheel": (
-        r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
+        r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|steersw|"
         r"volant"
     ),
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
@@ -71,9 +71,11 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
         r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder"
     ),
     "roll_rate": (
-        r"rollra?te?|wankrate|ang(ular)?rateforward|angularvelocityx|omegax|gyr(o)?x|^[gw]x$"
+        r"rollra?te?|wankrate|ang(ular|le)?rate(x|forward)|angularvelocityx|omegax|gyr(o)?x|^[gw]x$"
     ),
-    "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
+    "pitch_rate": (
+        r"pitchrate|ang(ular|le)?rate(y|lateral)|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$"
+    ),
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",
@@ -255,7 +257,8 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
         "vy_ref",
         "handwheel",
     }
-    if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):
+    is_turning = strong & {"yaw_rate", "roll_rate", "pitch_rate"}
+    if is_other or (_STEERING_RATE.search(compact) and not is_turning):
         return {"other": STRONG}
     parts = {
         part

@@ -402,7 +402,9 @@ def _scored(
     ranked = _ranked([choices[name][column] for name, column in named.items()], file_gain)
     if try_rare_units and ranked[0][0] >= FAR_MISMATCH:
         rare = [_unit_choices(column, name, try_rare_units=True) for name, column in named.items()]
-        ranked = _ranked(rare, file_gain)
+        rare_ranked = _ranked(rare, file_gain)
+        if rare_ranked[0][1] < MAX_EVIDENT_MISMATCH:  # raw counts have any gain
+            ranked = rare_ranked
     cost, mismatch, units, gain, n_implausible = ranked[0]
     decided = mismatch < FAR_MISMATCH and (
         len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
@@ -464,6 +466,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
         first = measured[channel]
         repeats = []
         scaled = []
+        for component in _components(search.free, first) if channel == "vx" else ():
+            search.free.remove(component)
         for column in search.free:
             agreement = correlation(column.slow, first.column.slow)
             unit = _unit(column, first, channel, agreement)
@@ -572,6 +576,21 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
         for unit in column.units(channel)[:MAX_REPEAT_UNITS]
     ]
     return min(ranked)[1] if min(ranked)[0] < MAX_REPEAT_MISMATCH else ""
+
+
+def _components(columns: Sequence[Candidate], first: Repeat) -> set[Candidate]:
+    """Velocities that repeat the speed only together, as those along two axes of the world do."""
+    speed = np.abs(first.column.slow)
+    components: set[Candidate] = set()
+    for column in columns:
+        agreement = correlation(column.slow, first.column.slow)
+        if abs(agreement) < MIN_REPEAT_CORRELATION and _unit(column, first, "vx", agreement):
+            for other in columns:
+                size = np.hypot(column.slow, other.slow)
+                is_common = correlation(size, speed) > MIN_REPEAT_CORRELATION
+                if is_pair(column.name, other.name) and is_common:
+                    components |= {column, other}
+    return components
 
 
 def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[Proposal]:

@@ -70,6 +70,7 @@ REMARKS = (
     "offset",
     "rotation",
     "spike",
+    "full_turn",
 )
 MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
 # factor between the gains of two files, of which each half is beyond the other file's
@@ -175,7 +176,8 @@ def draft(examined: Examined) -> Draft:
             f"data rows of '{stem}' left out by drop_rows (duplicates, text, or no sample for "
             f"{MAX_BRIDGED_SECONDS:g} s or more): {counted([str(row) for row in rows])}"
         )
-    if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
+    needs_ratio = "handwheel" in longest and "steer" not in longest
+    if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and needs_ratio:
         try:
             estimate = align(
                 longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"])

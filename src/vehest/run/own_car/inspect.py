@@ -187,7 +187,7 @@ def inspect(
         if missing and not remaining:
             raise DataError(
                 f"'{log.file}' has none of the columns that are channels in '{longest.file}'; use "
-                "files with the same columns"
+                f"files with the same columns{_way_to_join(longest, log)}"
             )
         proposals = proposals.keeping(remaining, notes)
         assigned = {proposal.column for proposal in remaining}
@@ -205,6 +205,7 @@ def inspect(
             f"'{longest.file}': no column is recognised as a channel, by name or by motion, of "
             f"{names}{unread(longest)}; "
             "name the columns of speed, yaw rate and lateral acceleration accordingly, with units"
+            + "".join(_way_to_join(longest, log) for log in others[:1])
         )
     computed = [
         f"'{column}' is left out: it is the difference of '{of}' from row to row, not a measurement"
@@ -236,6 +237,21 @@ def inspect(
         _place(files, longest.source),
         proposals.rate_hz or (longest.rate_hz if longest.clock is None else None),
         dict.fromkeys((*VEHICLE, IMU_PLACE)) | dict(vehicle or {}),
+    )
+
+
+def _way_to_join(log: Log, other: Log) -> str:
+    """How two tables of one drive become one, as the end of a sentence; empty without times."""
+    if log.clock is None or other.clock is None:
+        return ""
+    first, second = log.file, other.file
+    time, other_time = log.clock.column, other.clock.column
+    renamed = "" if time == other_time else f".rename(columns={{'{other_time}': '{time}'}})"
+    return (
+        "; if the files are of one drive, by one clock, join them, for example by pandas: "
+        f"merge(read_csv('{first.name}'), read_csv('{second.name}'){renamed}, on='{time}', "
+        f"how='outer', suffixes=('_{first.stem}', '_{second.stem}'))"
+        ".to_csv('joined.csv', index=False)"
     )
 
 
@@ -365,9 +381,11 @@ def _longest(logs: Sequence[Log]) -> Log:
     for log in logs:
         for key, value in _layout(log).items():
             if value != expected[key]:
+                is_part = key == "times" and not {*log.by_name} & {*longest.by_name}
                 raise DataError(
                     f"'{log.file}' has {key} {value!r}, '{longest.file}' {expected[key]!r}; "
                     "use the same layout in both, or create a data set for each"
+                    + (_way_to_join(longest, log) if is_part else "")
                 )
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import typer
 
 from vehest.alignment.proposals.assign import MAX_IMPOSSIBLE_SHARE
@@ -145,9 +146,14 @@ def ask(
             quantity for name, quantity in REQUIRED.items() if not re.search(name, candidates)
         ]
         lacks = f"; no column looks like {' or '.join(lacking)}" if lacking else ""
+        values = [
+            examined.log.by_name[q.key].values for q in unsure if q.key in examined.log.by_name
+        ]
+        is_counted = any(np.array_equal(each, np.rint(each), equal_nan=True) for each in values)
+        counts = "; raw counts need a factor: COLUMN=CHANNEL UNIT SIGN FACTOR" if is_counted else ""
         raise ConfigurationError(
             "no channel is supported by two pieces of evidence; confirm those that are right: "
-            f"{takes}{lacks}{unread(examined.log)}"
+            f"{takes}{counts}{lacks}{unread(examined.log)}"
         )
     return examined, tuple(left)
 

@@ -74,7 +74,7 @@ class Log:
         # rows of each uninterrupted run, the longest first; one of all where times never restart
     ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
-    repeated_names: tuple[int, ...] = ()  # rows, from 1, that repeat the names; in no column here
+    repeated_names: tuple[int, ...] = ()  # rows of texts, from 1, which are in no column
     rate_hz: float | None = None  # of the rows, where the file states it beside their times
     rate_source: str = ""  # that states it, for people
 
@@ -86,7 +86,7 @@ class Log:
     def file_row(self, place: int) -> int:
         """Number among the file's data rows, from 1, of a row of the columns, from 0.
 
-        Rows that repeat the names are counted in the file, but are in no column.
+        Rows of texts, such as repeated names, are counted in the file, but are in no column.
         """
         row = place + 1
         for repeated in self.repeated_names:

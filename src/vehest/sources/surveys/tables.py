@@ -187,7 +187,8 @@ def survey_table(file: Path) -> Log:
     else:
         shape = shape_of(file)
         table, skipped = _table(file, shape)
-        cells, repeated, marks = _without_texts(table, shape.names)
+        cells, repeated, marks, texts = _without_texts(file, table, shape)
+        skipped += texts
         values, clocks, odd_marks, unread = _columns(file, shape, cells)
         marks |= odd_marks
         skipped += unread
@@ -509,6 +510,8 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
+    if head.startswith(b"\x1f\x8b"):
+        raise DataError(f"'{file}' is compressed by gzip; let its name end in '.csv.gz'")
     if b"\0" in head or _count_controls(head) > MOST_CONTROLS * len(head):
         raise DataError(
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
@@ -540,29 +543,84 @@ def _has_words(text: str, letter: str, min_share: float) -> bool:
 
 
 def _without_texts(
-    table: pa.Table, names: Sequence[str]
-) -> tuple[pa.Table, tuple[int, ...], set[str]]:
-    """Cells without rows that repeat the names, as joined files do, or that begin with text below
-    the numbers, as statistics do; their numbers, from 1, and their texts.
+    file: Path, table: pa.Table, shape: Shape
+) -> tuple[pa.Table, tuple[int, ...], set[str], list[str]]:
+    """Cells without rows of texts, as joined files have between their parts, or that begin with
+    text above or below the numbers, as statistics do.
+
+    Returns
+    -------
+    table : pa.Table
+        The remaining rows.
+    rows : tuple of int
+        Numbers of the others, from 1.
+    marks : set of str
+        Their texts, which are no numbers.
+    skipped : list of str
+        Those of the rows that hold other texts than names and units.
     """
-    named = zip(table.columns, names, strict=False)
+    named = zip(table.columns, shape.names, strict=False)
     texts = [(column, name) for column, name in named if name and pa.types.is_string(column.type)]
     if not texts:
-        return table, (), set()
+        return table, (), set(), []
+    is_text = np.zeros(table.num_rows, dtype=bool)
+    is_text[_rows_without_numbers(table, shape)] = True
     column, name = texts[0]
-    is_text = np.asarray(compute.equal(column, name).fill_null(False))
     is_row = compute.match_substring_regex(column, ROW_OF_NUMBERS, ignore_case=True)
-    below = np.flatnonzero(is_row.fill_null(True)).max(initial=-1) + 1
-    if name == names[0] and 0 < below >= (1.0 - MAX_ODD_SHARE) * table.num_rows:
-        is_text[below:] = True
+    numbered = np.flatnonzero(is_row.fill_null(True))
+    first, below = (numbered[0], numbered[-1] + 1) if len(numbered) else (0, 0)
+    if name != shape.names[0] or below - first < (1.0 - MAX_ODD_SHARE) * table.num_rows:
+        first, below = 0, table.num_rows
+    is_text[:first] = True
+    is_text[below:] = True
     removed = table.filter(pa.array(is_text))
-    cells = {
-        cell
-        for column in removed.columns
-        for cell in column.cast(pa.string()).to_pylist()
-        if not re.search(ROW_OF_NUMBERS, cell or "", re.IGNORECASE)
-    }
-    return table.filter(pa.array(~is_text)), tuple((np.flatnonzero(is_text) + 1).tolist()), cells
+    cells_by_column = [column.cast(pa.string()).to_pylist() for column in removed.columns]
+    rows = (np.flatnonzero(is_text) + 1).tolist()
+    marks: set[str] = set()
+    skipped = []
+    for row, cells in zip(rows, zip(*cells_by_column, strict=True), strict=True):
+        filled = {k: cell for k, cell in enumerate(cells) if cell and cell.strip()}
+        marks |= {cell for cell in filled.values() if not _is_number(cell, shape.layout.decimal)}
+        others = [cell for k, cell in filled.items() if cell.strip() not in _header(shape, k)]
+        if not others or not first < row <= below:
+            continue
+        if set(map(str.strip, others)) & {*shape.names} or _are_units([*filled.values()]):
+            raise DataError(
+                f"'{file}': data row {row} holds other names or units than the lines above the "
+                f"numbers, such as '{printable(others[0].strip())}'; save the rows from there on "
+                "as a file of its own, and create a data set for each"
+            )
+        skipped.append(f"data row {row}, '{printable(others[0].strip())}'")
+    return table.filter(pa.array(~is_text)), tuple(rows), marks, skipped
+
+
+def _header(shape: Shape, k: int) -> tuple[str, str]:
+    """Name and unit of a column by the lines above the numbers; empty where there is none."""
+    name = shape.names[k] if k < len(shape.names) else ""
+    return name, shape.units.get(name, "")
+
+
+def _rows_without_numbers(table: pa.Table, shape: Shape) -> list[int]:
+    """Rows in which nothing but names and units holds a digit, and a cell is more than a mark of a
+    missing sample.
+    """
+    rows = np.arange(table.num_rows)
+    for k, column in enumerate(table.columns):
+        cells = column.take(pa.array(rows))
+        if pa.types.is_string(cells.type):
+            header = pa.array(_header(shape, k))
+            is_header = compute.is_in(compute.utf8_trim_whitespace(cells), value_set=header)
+            has_digit = compute.match_substring_regex(cells, r"\d").fill_null(False)
+            rows = rows[np.asarray(compute.or_(is_header, compute.invert(has_digit)))]
+        else:
+            rows = rows[np.asarray(cells.is_null())]
+    remaining = table.take(pa.array(rows))
+    columns = (column.cast(pa.string()).to_pylist() for column in remaining.columns)
+    return [
+        row
+        for row, *cells in zip(rows.tolist(), *columns, strict=True)
+        if any(cell and cell.strip() and not marks_not_measured(cell) for cell in cells)
+    ]
 
 
 def _columns(
