@@ -1730,6 +1730,16 @@ def test_a_yaw_rate_in_degrees_a_minute_without_a_unit_does_not_change_the_speed
     }
 
 
+def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path):
+    """A speed in rev/min of a motor: before, it was read in 0.01 km/h, and the yaw rate in 0.1
+    deg/s without a word.
+    """
+    d = drive()
+    table = usual(d).drop(columns=["LongAcc", "Steer", "Beta"]).assign(Speed=4300.0 * d["vx"])
+    by_channel = proposed(tmp_path, table)
+    assert all("other units explain" in by_channel[name].question for name in ("vx", "yaw_rate"))
+
+
 def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path):
     """Where the corners do not show the ratio; before, it was a command, in rad for degrees."""
     d = drive()
