@@ -185,7 +185,8 @@ def new_car(
         typer.Option(
             "--answer",
             "-a",
-            help="KEY=ANSWER beforehand, with a KEY that --json lists as open; repeatable.",
+            help="KEY=ANSWER beforehand, with a KEY that --json lists as open, or any column: "
+            "COLUMN=CHANNEL UNIT; repeatable.",
         ),
     ] = None,
     wheelbase: Annotated[

@@ -157,6 +157,16 @@ def test_a_channel_of_coarse_steps_is_not_stuck_where_it_goes_on_by_one_of_them(
     assert found_by("stuck", changed(coarse, steer=jumping)).keys() == {"steer"}
 
 
+def test_an_offset_that_no_inclination_explains_questions_the_column():
+    """As of a temperature that is named ay: before, the warning spoke of 90 degrees and offered to
+    remove 25 m/s².
+    """
+    drive = changed(broadband_drive(), ax=lambda ax: ax + 25.0)
+    message = found_by("offset", drive)["ax"].message
+    assert "too large for an inclined sensor; check the column, its unit and its axis" in message
+    assert "offset_correction" not in message
+
+
 @pytest.mark.parametrize("offset", [-1.7, 0.0, 0.4, 1.0])
 def test_an_accelerometer_that_is_pitched_has_an_offset_of_ax_without_a_reference(offset):
     drive = changed(broadband_drive(), ax=lambda ax: ax + offset)

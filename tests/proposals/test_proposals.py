@@ -499,6 +499,9 @@ ROLES = {
     "AngleRateZ": "yaw_rate", "AngleRateX": "roll_rate", "AngleRateY": "pitch_rate",
     "Steer_SW": "handwheel", "SteeringAngleRate": "other",
     "ABS_WhlSpdFrntLe": "wheel_speed_fl", "ABS_WhlSpdReRi": "wheel_speed_rr",
+    "ESP_v_Signal": "vx", "V_VEH": "vx", "v_Vehicle": "vx", "rotationRateZ": "yaw_rate",
+    "z_rate_of_rotation": "yaw_rate", "AngVelZ": "yaw_rate", "VehLatComp_A_Actl": "ay",
+    "ACLNX_COG": "ax", "LW_Winkel": "handwheel",
 }  # fmt: skip
 
 
@@ -1704,6 +1707,49 @@ def test_a_unit_behind_the_letter_of_an_axis_does_not_hide_it(tmp_path):
     assert (by_channel["ay"].column, by_channel["ay"].sign) == ("AccX_g", -1)
     assert (by_channel["ax"].column, by_channel["ax"].sign) == ("AccY_g", 1)
     assert "AccZ_g" not in {proposal.column for proposal in by_channel.values()}
+
+
+def test_axes_of_an_accelerometer_without_z_are_read_from_the_motion(tmp_path):
+    """Before, the lateral one was asked and the longitudinal one left out without a word."""
+    d = drive()
+    table = usual(d).drop(columns=["LatAcc", "LongAcc"])
+    table = table.assign(ACC_X=-d["ay"], ACC_Y=d["ax"])
+    by_channel = proposed(tmp_path, table)
+    assert (by_channel["ay"].column, by_channel["ay"].sign) == ("ACC_X", -1)
+    assert (by_channel["ax"].column, by_channel["ax"].sign) == ("ACC_Y", 1)
+    table = table.rename(columns={"ACC_X": "ACC_Y", "ACC_Y": "ACC_X"})
+    assert proposed(tmp_path, table)["ax"].column == "ACC_X"
+
+
+def test_a_yaw_rate_in_degrees_a_minute_without_a_unit_does_not_change_the_speed(tmp_path):
+    """Before, it was read in 0.01 deg/s and the speed in mph, 1.6 times too large."""
+    d = drive()
+    table = usual(d).assign(Gyro=60.0 * np.degrees(d["r"]))
+    by_channel = proposed(tmp_path, table)
+    assert {name: by_channel[name].unit for name in ("vx", "yaw_rate")} == {
+        "vx": "km/h",
+        "yaw_rate": "deg/min",
+    }
+
+
+def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path):
+    """A speed in rev/min of a motor: before, it was read in 0.01 km/h, and the yaw rate in 0.1
+    deg/s without a word.
+    """
+    d = drive()
+    table = usual(d).drop(columns=["LongAcc", "Steer", "Beta"]).assign(Speed=4300.0 * d["vx"])
+    by_channel = proposed(tmp_path, table)
+    assert all("other units explain" in by_channel[name].question for name in ("vx", "yaw_rate"))
+
+
+def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path):
+    """Where the corners do not show the ratio; before, it was a command, in rad for degrees."""
+    d = drive()
+    angle = np.degrees(4.0 * d["handwheel"])  # by a ratio that no car has
+    table = usual(d).drop(columns="Steer").assign(**{"Steered Angle [deg]": angle})
+    proposal = proposed(tmp_path, table)["handwheel"]
+    assert (proposal.column, proposal.unit) == ("Steered Angle [deg]", "deg")
+    assert proposal.question == ""
 
 
 @pytest.mark.parametrize("name", ["Lean Angle [deg]", "Neigung", "phi [deg]"])

@@ -329,6 +329,39 @@ def test_without_a_speed_no_pipeline_is_written(
     assert (err, "lacks vx, ay" in out) == ("", True)
 
 
+def test_an_answer_declares_any_column_and_the_remedies_name_it(log):
+    """A yaw rate that neither name nor unit shows was a dead end: only columns with a question
+    could be answered.
+    """
+    names = {"Gyro": "Gear ratio", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"}
+    log.write("lap.csv", usual(drive()).rename(columns=names).drop(columns="Beta"))
+    out, _ = log.new("lap.csv", "--yes")
+    remedy = '--answer "COLUMN=yaw_rate rad/s"'
+    assert f"lacks yaw_rate; if a column has it, state it and its unit: {remedy}" in out
+    code, _, err = log("estimate", "lap.csv", "dataset=my_car")
+    assert (code, "which 'self_calibrating' needs" in err, err.count("error:")) == (3, True, 1), err
+    out, _ = log.new("lap.csv", "--yes", "--force", "--answer", "Gear ratio=yaw_rate deg/s")
+    entry = segment_of_test(0)["channels"]["yaw_rate"]
+    assert entry == {"column": "Gear ratio", "unit": "deg/s"}
+    assert log(*out.splitlines()[-1].split()[1:], "--json")[0] == 0
+    log.write("lap.csv", usual(drive()).rename(columns={"LatAcc": "LatAcc [g]"}))
+    for answer, channels in (
+        ("LatAcc [g]=-", None),  # a column without a question
+        ("LatAcc [g]=ay", {"column": "LatAcc [g]", "unit": "g"}),
+        ("LatAcc [g]=ay m/s² -1", {"column": "LatAcc [g]", "unit": "m/s²", "sign": -1}),
+    ):
+        log.new("lap.csv", "--yes", "--force", "--answer", answer)
+        assert segment_of_test(0)["channels"].get("ay") == channels
+    for answer, message in (
+        ("Gyro=", "'': channel '' is not known"),
+        ("Gyro=yaw_rate furlong", "unit 'furlong' is not known"),
+        ("Gyro=yaw_rate deg/s 2", "the sign must be 1 or -1, not '2'"),
+        ("Gyro=yaw_rate deg/s 1 nan", "the factor"),
+    ):
+        _, err = log.new("lap.csv", "--yes", "--force", "--answer", answer, code=2)
+        assert (message in err, err.count("error:")) == (True, 1), err
+
+
 def test_short_recordings_stay_undivided_and_too_few_are_refused_with_a_remedy(log):
     names = [f"turn_{number}" for number in range(10)]
     for number, name in enumerate(names):

@@ -17,6 +17,7 @@ MIN_NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
 # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
 MAX_NOTED_OFFSET = 0.5
 MAX_GYRO_OFFSET = 0.05  # rad/s
+MAX_INCLINED_OFFSET = 0.5 * GRAVITY  # m/s², of a unit pitched by 30 degrees; no more is mounted so
 BLOCK_SECONDS = 2.0  # shortest block of time
 MIN_BLOCKS = 6  # fewer give no interval, and no offset
 
@@ -135,9 +136,14 @@ def _lateral_findings(motion: Motion) -> Iterator[Finding]:
 
 
 def _described(offset: Measured, expected: str, another_cause: str = "") -> str:
-    degrees = np.degrees(np.arcsin(min(abs(offset.value) / GRAVITY, 1.0)))
-    return (
+    text = (
         f"constant offset of {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) "
-        f"relative to {expected}: a sensor or road inclined by {degrees:.1f} deg{another_cause}; "
+        f"relative to {expected}"
+    )
+    if abs(offset.value) > MAX_INCLINED_OFFSET:
+        return f"{text}: too large for an inclined sensor; check the column, its unit and its axis"
+    degrees = np.degrees(np.arcsin(abs(offset.value) / GRAVITY))
+    return (
+        f"{text}: a sensor or road inclined by {degrees:.1f} deg{another_cause}; "
         "the transform offset_correction removes it"
     )

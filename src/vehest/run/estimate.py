@@ -113,6 +113,13 @@ def estimate_file(
         record = None if car is None else read_car(car)
         model, trust, of_car = adapted(model, trust, first.car, settings, record)
         remarks += of_car
+        missing = [channel for channel in model.channels if channel not in first]
+        if missing:
+            raise DataError(
+                f"recording '{first.id}' has no channel '{missing[0]}', which '{name}' needs (it "
+                f"has {', '.join(first.channels)}); declare its column in the data set, or take an "
+                "estimator that 'vehest data usable' lists as usable"
+            )
         if is_training_recording(folder, first.id):
             remarks.append(
                 f"'{name}' was trained on this recording: its errors here are no test of it"

@@ -45,7 +45,7 @@ UNITS = {  # where the header is silent, the likeliest first
 }
 RARE_UNITS = {  # of loggers that write whole numbers; tried where the others explain nothing
     "vx": ("cm/s", "mm/s", "ft/s", "0.01*km/h"),
-    "yaw_rate": ("mrad/s", "mdeg/s", "0.1*deg/s", "0.01*deg/s"),
+    "yaw_rate": ("mrad/s", "mdeg/s", "0.1*deg/s", "0.01*deg/s", "deg/min"),
     "ay": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),
     "ax": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),
 }
@@ -223,7 +223,8 @@ def candidates(
 
 
 def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
-    """Columns whose names do not decide axes: all of a family x, y and z may be along any.
+    """Columns whose names do not decide axes: all of a family x, y and z may be along any, and so
+    may the two of an accelerometer without z.
 
     A log may count y up, or name the axes otherwise. The letters stay a weak hint.
     """
@@ -236,7 +237,8 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     changed = {}
     for family in families.values():
         roles = {role for column in family for role in column.hints}
-        for column in family if len(family) == 3 else ():
+        is_plane = len(family) == 2 and {"ax", "ay"} <= roles  # an accelerometer without z
+        for column in family if len(family) == 3 or is_plane else ():
             named_roles = dict.fromkeys(set(column.hints) - ROLES_OF_AXES, HINT_OF_LETTER)
             roles_of_motion = {"yaw_rate", "ax", "ay", "vx", "vy_ref"} & roles
             changed[column.name] = replace(

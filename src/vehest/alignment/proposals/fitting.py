@@ -253,12 +253,14 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     possible = angles(search.motion, column)
     if "handwheel" in column.hints:
         possible = [angle for angle in possible if angle.channel == "handwheel"] or possible
-    if not possible and column.hints.get("handwheel") == STRONG and column.unit:
-        return Offer(
-            score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence, question)
-        )
+    spread = float(np.quantile(np.abs(column.values - straight), 0.995))
+    if not possible and column.unit:
+        size = spread * si_factor(column.unit, "handwheel")
+        has_range = MAX_ANGLES["steer"] < size <= MAX_ANGLES["handwheel"]  # of no road wheel
+        if has_range or column.hints.get("handwheel") == STRONG:
+            proposal = Proposal(column.name, "handwheel", column.unit, sign, evidence, question)
+            return Offer(score, column, proposal)
     if not possible:
-        spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         unit = next(
             (
                 unit

@@ -26,27 +26,29 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
         r"^epsi$|deltapsi|curvature|kruemm|kappa|^kpath$|crc|checksum|pruefsumme|bz$|^alive"
     ),
     "yaw_rate": (
-        r"yawra?te?|ang(ular|le)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|yawvel|"
-        r"lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|"
+        r"yawra?te?|ang(ular|le)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi.|psidot|psip|"
+        r"yawvel|lacet|gui[nñ]ada|imbardata|rateyaw|yawspeed|omegaz|angular(velocity)?z|"
         r"ang(ular|le)?ratedown|gyr(o)?z|^(imu)?[gw]z$|"
-        r"^rimu$|psistrich|vgier"
+        r"^rimu$|psistrich|vgier|rotationratez|^zrateofrotation|angvelz|^wzimu$"
     ),
     "ay": (
         r"latac|latera?lac|acclat|acc(el|eleration)?y(?!aw)|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
         r"linearaccelerationy|yacc|glat|^gy$|quera(?!bw)|accquer|accel?lat|laterala|"
-        r"ac+[eé]l\w*lat|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right"
+        r"ac+[eé]l\w*lat|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle|accel?right|"
+        r"latcomp|^aclny"
     ),
     "ax": r"longac|ac+[eé]l\w*long|inlineac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|"
     r"longitudinalac|"
     r"^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
     r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|"
-    r"lonacc|acclon|gforcelon|axvehicle|accel?forward",
+    r"lonacc|acclon|gforcelon|axvehicle|accel?forward|longcomp|^aclnx",
     "az": r"acc(el|eleration)?z|zacc|^az$|verta|accvert",
     "handwheel": (
-        r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|steersw|"
-        r"volant"
+        r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
+        r"steersw|volant|^lws?(winkel|ang)|^avlstea|^stepin"
     ),
-    "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
+    "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo|"
+    r"^strang",
     "vy_ref": (
         r"^vy|^uy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|"
         r"(vitesse|velocidad|velocità)lat|velocityy|(?<!t)yvel|linear_?y$|latspeed|"
@@ -68,7 +70,7 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
         r"speed|velocity|vitesse|velocidad|velocità|geschw|vehspd|^vx|^ux|vxc?g?$|vlong|vellong|"
         r"longvel|vfzg|tacho|velocityx|"
         r"xvel|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|"
-        r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder"
+        r"fahrzeugv|vehv|groundspd|vehicles?pd|encoder|vsignal|^vveh|^v(ref|gps|ist)$"
     ),
     "roll_rate": (
         r"rollra?te?|wankrate|ang(ular|le)?rate(x|forward)|angularvelocityx|omegax|gyr(o)?x|^[gw]x$"

@@ -56,6 +56,8 @@ NO_MOTION = (
 """Roles whose columns are no yaw rate, no acceleration and, but for the first, no speed."""
 ACCELERATIONS = {"ax", "ay", "az"}
 """Roles whose columns are no speed and no yaw rate: gravity is as even as a steady speed."""
+# of units that the header does not state, which one gain can decide; two of them fit most gains
+MAX_DECIDED_RARE_UNITS = 1
 UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
 # correlation beyond which ay was computed of vx·yaw_rate, and not measured
 MIN_COMPUTED_CORRELATION = 0.9995
@@ -406,8 +408,15 @@ def _scored(
         if rare_ranked[0][1] < MAX_EVIDENT_MISMATCH:  # raw counts have any gain
             ranked = rare_ranked
     cost, mismatch, units, gain, n_implausible = ranked[0]
-    decided = mismatch < FAR_MISMATCH and (
-        len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN
+    rare_units = [
+        unit
+        for (channel, column), unit in zip(named.items(), units, strict=True)
+        if not column.unit and unit in RARE_UNITS[channel]
+    ]
+    decided = (
+        mismatch < FAR_MISMATCH
+        and len(rare_units) <= MAX_DECIDED_RARE_UNITS
+        and (len(ranked) == 1 or ranked[1][0] - cost > MIN_COST_MARGIN)
     )
     score = 12.0 * (abs(correlation_with_ay) - MIN_CORRELATION) / (1.0 - MIN_CORRELATION)
     for channel, column in named.items():

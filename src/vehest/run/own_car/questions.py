@@ -24,6 +24,7 @@ from vehest.run.own_car.inspect import IMU_PLACE, VEHICLE, Examined, unread
 from vehest.run.printing import echo
 from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import STATED_UNITS
+from vehest.sources.unit_spellings import plain_unit
 
 LEAVE_OUT = "-"
 UNKNOWN = "unknown"
@@ -86,7 +87,7 @@ def ask(
     examined : Examined
         The logs and what is proposed for their columns, as `inspect` returns it.
     answers : sequence of str
-        ``KEY=ANSWER`` each.
+        ``KEY=ANSWER`` each; the key of a question, or any column, which is then as declared.
     interactive : bool
         Whether other questions are asked at the terminal; else the proposals are accepted.
 
@@ -111,9 +112,10 @@ def ask(
             raise ConfigurationError(
                 f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no"
             )
-        if key not in keys:
+        if key not in keys and key not in examined.log.by_name:
             raise ConfigurationError(
-                f"no question has the key '{key}'; open questions: {', '.join(keys) or 'none'}"
+                f"no question has the key '{key}', and no column that name; open questions: "
+                f"{', '.join(keys) or 'none'}"
             )
         answers_by_key[key] = answer
     if interactive:
@@ -134,6 +136,9 @@ def ask(
         else:
             left.append(question)
             examined = _answered(examined, question, question.proposed)
+    for key, answer in answers_by_key.items():
+        if key not in keys:
+            examined = _declared_unasked(examined, key, answer)
     if left and not examined.proposals.channels:
         unsure = [
             question for question in left if question.candidates and question.proposed == LEAVE_OUT
@@ -324,9 +329,25 @@ def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple
     )
 
 
+def _declared_unasked(examined: Examined, column: str, answer: str) -> Examined:
+    """The logs with a column as declared that no question is about."""
+    proposals = examined.proposals
+    channels = proposals.channels
+    if column in {proposal.column for proposal in channels}:
+        channels = _declared(channels, column, answer.strip())
+    elif answer.strip() != LEAVE_OUT:
+        unit = plain_unit(examined.log.by_name[column].unit) or ""
+        name = (*answer.split(), "")[0] if unit else ""  # the header's unit counts
+        declared = _parsed(answer, Proposal(column, name, unit))
+        others = (each for each in channels if each.channel != declared.channel)
+        channels = (*others, declared)
+    unused = tuple(name for name in proposals.unused if name != column)
+    return replace(examined, proposals=replace(proposals, channels=channels, unused=unused))
+
+
 def _parsed(answer: str, proposal: Proposal) -> Proposal:
     """A column as CHANNEL UNIT [SIGN [FACTOR]] declares it."""
-    name, unit, sign, factor = [*answer.split(), "", "", ""][:4]
+    name, unit, sign, factor = [*answer.split(), *4 * [""]][:4]
     try:
         described = channel(name)
         unit = unit or (proposal.unit if proposal.channel == name else described.unit)

@@ -495,7 +495,10 @@ def _limits(drafted: Draft) -> list[str]:
             "trained or ranked on them; " + _without_reference(drafted)
         ]
     if missing:
-        return [f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
+        return [
+            f"scores require {' and '.join(SCORED)}; {', '.join(missing)} is missing"
+            + _column_answer(missing[0])
+        ]
     if _is_too_short(drafted):
         return [
             f"{drafted.seconds:.0f} s in {number_of(len(drafted.durations), 'recording')} are too "
@@ -516,14 +519,23 @@ def _limits(drafted: Draft) -> list[str]:
 
 def _without_reference(drafted: Draft) -> str:
     """What estimates without a reference."""
-    missing = ", ".join(name for name in FILTER_CHANNELS if name not in drafted.channels)
+    missing = [name for name in FILTER_CHANNELS if name not in drafted.channels]
     if missing:
-        return f"the self-calibrating filter, which needs no reference, lacks {missing}"
+        return (
+            "the self-calibrating filter, which needs no reference, lacks "
+            f"{', '.join(missing)}{_column_answer(missing[0])}"
+        )
     wheelbase = drafted.examined.vehicle["wheelbase"]
     unknown = (
         "" if wheelbase else f", with your car's wheelbase [m] instead of {ASSUMED_WHEELBASE:g}"
     )
     return f"the self-calibrating filter needs none: use the last command below{unknown}"
+
+
+def _column_answer(channel: str) -> str:
+    """How to state the column of a channel that is missing."""
+    unit = CHANNELS[channel].unit
+    return f'; if a column has it, state it and its unit: --answer "COLUMN={channel} {unit}"'
 
 
 def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
