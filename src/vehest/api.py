@@ -44,7 +44,7 @@ from vehest.inference.models import SELF_CALIBRATING, find_model, open_model
 from vehest.inference.reading import read_checked, without_references
 from vehest.inference.tables import write_estimate_table
 from vehest.sources.named_columns import read_frame
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
@@ -192,7 +192,9 @@ def _fitted(
         for part in (train, validation)
     ]
     model.fit(FitData(*parts), settings)
-    learnt, stopped = ([Stretch(own, own.start_time, "", own.id) for own in part] for part in parts)
+    learnt, stopped = (
+        [CalibrationRange(own, own.start_time, "", own.id) for own in part] for part in parts
+    )
     model.trust = learn_trust(model, learnt, stopped)
     return model
 

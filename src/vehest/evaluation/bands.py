@@ -75,7 +75,7 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     banded_errors = {}
     for name, mask in is_scored.items():
         half_width_90 = np.concatenate([part.bands[name] for part in parts])[:, None]
-        half = scale[name] * half_width_90 * getattr(bands, name).beside(CHANNEL_LEVEL)
+        half = scale[name] * half_width_90 * getattr(bands, name).ratios_to(CHANNEL_LEVEL)
         banded_errors[name] = Banded(errors[name][mask], half[mask], mask)
     return banded_errors
 

@@ -24,7 +24,7 @@ from vehest.inference.models import CALIBRATION_STAGE as STAGE
 from vehest.inference.models import calibration_label
 from vehest.run.train import digests_of_spans, stored_recording
 from vehest.run.versions import code_of
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.record import read_trust, write_trust
 
 WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
@@ -92,12 +92,12 @@ def _write(
     Write trust.yaml into ``folder``, with the reason where bands or health are missing.
     """
 
-    def stretch(span: Span) -> Stretch:
+    def stretch(span: Span) -> CalibrationRange:
         recording = read_recording(stored_recording(data, span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
         recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))
-        return Stretch(
+        return CalibrationRange(
             recording, max(span.start, recording.start_time), span.dataset, span.describe()
         )
 
