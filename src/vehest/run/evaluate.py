@@ -31,7 +31,12 @@ from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
-from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
+from vehest.evaluation.bands import (
+    band_figures,
+    coverage_intervals,
+    figures_by_regime,
+    scored_bands,
+)
 from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
@@ -354,7 +359,7 @@ def _rows_of_parts(
         for regime, figures in errors_by_regime(scored, masks, protocol.rate_hz).items():
             rows += _rows(head, figures, subset=regime)
     if bands is not None:
-        within = banded(scored, bands)
+        within = scored_bands(scored, bands)
         intervals = coverage_intervals(within, scored, protocol.rate_hz)
         rows += _rows(head, band_figures(within, scored, turns, protocol.rate_hz), intervals)
         for regime, figures in figures_by_regime(within, masks, protocol.rate_hz).items():
