@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numba
 
-PATIENCE = 0.5  # s
+PATIENCE = 0.5  # s, time for which a measurement is refused before its gate opens
 
 
 class Gate(NamedTuple):
@@ -32,7 +32,7 @@ class Gate(NamedTuple):
 
     @classmethod
     def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:
-        """A gate that opens again after 0.5 s; none: no gate.
+        """A gate that opens again after `PATIENCE`; None without ``deviations``.
 
         Parameters
         ----------

@@ -72,12 +72,12 @@ piece = numba.njit(
 
 
 def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
-    """An array that vectors may be read beyond, not filled or as ``make`` fills it.
+    """Allocate an array followed by room for one vector, which may be read beyond its end.
 
     Parameters
     ----------
     shape : tuple[int, ...]
-        Of the array, C order.
+        Shape of the array, in C order.
     dtype : Any
         Element type.
     make : Any, default np.empty
