@@ -19,7 +19,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.estimators.base import Estimator
 from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
-from vehest.estimators.networks.sample_network import STEEPEST
+from vehest.estimators.networks.sample_network import MAX_SIDESLIP
 from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.sideslip_ffnn import SideslipFfnn
@@ -232,7 +232,7 @@ class _SampleStep(_Step):
         """Sample (C,) to vy () [m/s] and sideslip () [rad]; there is no state."""
         w1, b1, w2, b2, w3, b3 = (parameter[0] for parameter in self.network.parameters())
         hidden = torch.relu(torch.relu(self.network.scaled(sample) @ w1 + b1) @ w2 + b2)
-        sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-STEEPEST, STEEPEST)
+        sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-MAX_SIDESLIP, MAX_SIDESLIP)
         # onnxruntime has no Tan of double
         return sample[self.speed] * torch.sin(sideslip) / torch.cos(sideslip), sideslip
 

@@ -12,7 +12,7 @@ _controller = cache(ThreadpoolController)
 
 
 def single_blas_thread() -> AbstractContextManager[object]:
-    """Matrix products within stay on their thread.
+    """Context in which each matrix product of BLAS uses only the thread that calls it.
 
     Those of small blocks gain nothing from more, and several threads call them.
     """

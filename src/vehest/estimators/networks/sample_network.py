@@ -30,7 +30,7 @@ from vehest.training.robust import robust_criterion
 from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
 from vehest.training.sequences import record_of_phases, train_phases
 
-CORNERS = ("fl", "fr", "rl", "rr")
+CORNERS = ("fl", "fr", "rl", "rr")  # suffixes of the channels of the four wheels
 IMU = ("ax", "ay", "vx", "steer", "yaw_rate")  # motion and steering, without tyre forces
 INPUTS: dict[str, tuple[str, ...]] = {
     "full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)),
@@ -45,14 +45,14 @@ NORMALISATION_SUFFIXES: dict[str, str] = {"range": "", "standard": "_standard"}
 """Normalisation -> suffix of the variant's name."""
 
 SAMPLES_TOGETHER = 50_000  # samples that are estimated at a time
-STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
+MAX_SIDESLIP = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
 class SampleNetworkEstimator(Network):
     """An estimator with a `SampleNetwork`."""
 
     network: SampleNetwork
-    network_inputs: tuple[str, ...]  # measured channels that the network sees
+    network_inputs: tuple[str, ...]  # measured channels that the network reads
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
     dropout: float = setting(
         0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0
@@ -62,7 +62,9 @@ class SampleNetworkEstimator(Network):
     )
 
     def check(self) -> None:
-        """Layers have neurons, and not too many."""
+        """Check the widths of the layers; raises `ConfigurationError`: none, or too many
+        neurons.
+        """
         super().check()
         if min(self.hidden) < 1 or max(self.hidden) > MAX_WIDTH:
             raise ConfigurationError(
@@ -208,7 +210,7 @@ class SampleNetwork(nn.Module):
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
 
     def scaled(self, inputs: Tensor) -> Tensor:
-        """Inputs as the network takes them, (..., C), of measured ones in SI units.
+        """Scale measured inputs [SI], (..., C), for the network.
 
         With ``range`` those of training lie in 0 … 1. A channel that was constant in training has
         the largest float32 as its span, so that it stays near 0 whatever it becomes.
@@ -216,7 +218,7 @@ class SampleNetwork(nn.Module):
         return (inputs - self.input_low) / self.input_span
 
     def samples(self, inputs: FloatArray, sideslip: FloatArray) -> Samples:
-        """Measured inputs (N, C) and sideslip angles (N,) [rad] as the network takes them."""
+        """Scale measured inputs (N, C) and sideslip angles (N,) [rad] into samples for training."""
         measured_inputs, angles = (
             torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip)
         )
@@ -250,7 +252,7 @@ class SampleNetwork(nn.Module):
         return {
             name: tensor.detach().numpy().astype(np.float64)
             for name, tensor in self.state_dict().items()
-        } | {"steepest": STEEPEST}
+        } | {"steepest": MAX_SIDESLIP}
 
     def validation_losses(self, samples: Samples, criterion: Criterion) -> Tensor:
         """Losses on samples without dropout, (M,).
@@ -275,8 +277,8 @@ def learnt_samples(
     estimator: str,
     minimum_speed: float = -np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,)
-    [rad], recordings one after another.
+    """Inputs (N, C) and reference sideslip angles (`reference_sideslip`), (N,) [rad], to train a
+    network on, recordings one after another.
 
     Samples slower than ``minimum_speed`` [m/s] are left out.
 
@@ -306,5 +308,5 @@ def reference_sideslip(recording: Recording) -> FloatArray:
 
 
 def clip_sideslip(sideslip: FloatArray) -> FloatArray:
-    """Sideslip angles within `STEEPEST`, since the lateral velocity is vx tan β."""
-    return np.clip(sideslip, -STEEPEST, STEEPEST)
+    """Sideslip angles [rad] clipped to ±`MAX_SIDESLIP`, since the lateral velocity is vx tan β."""
+    return np.clip(sideslip, -MAX_SIDESLIP, MAX_SIDESLIP)

@@ -57,5 +57,5 @@ class StandardisedNetwork(nn.Module):
             scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
 
     def prepared(self, series: Tensor) -> Tensor:
-        """Standardised measurements."""
+        """Standardise measurements, (..., C), as ``forward`` takes them."""
         return (series - self.input_mean) / self.input_scale
