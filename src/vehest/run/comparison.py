@@ -31,7 +31,7 @@ from vehest.run.study import Job, failure_messages
 from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
 from vehest.run.training_differences import Differences, difference_text, differences_of
 from vehest.run.usable import lack
-from vehest.studies.reference_minutes import start_in_words
+from vehest.studies.reference_minutes import describe_start
 
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
 NOT_TRAINED = "not trained yet"
@@ -387,7 +387,7 @@ def label_of(training: TrainJob) -> str:
     """Name of a training in messages, with the model that it starts from, which its folder's name
     does not say.
     """
-    return training.plan.label + start_in_words(training.training)
+    return training.plan.label + describe_start(training.training)
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:

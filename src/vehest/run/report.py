@@ -64,7 +64,7 @@ from vehest.studies.artefacts import (
     write_frame,
 )
 from vehest.studies.kit.timings import timings_of_study
-from vehest.studies.reference_minutes import start_in_words
+from vehest.studies.reference_minutes import describe_start
 from vehest.studies.registry import study_module
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build
 
@@ -299,7 +299,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
                 estimator=estimator.name,
                 variant=variant,
                 title=estimator.full_title
-                + start_in_words(member.job.training)
+                + describe_start(member.job.training)
                 + difference_text(differences),
                 seed=member.job.seed,
                 model_folder=member.model.folder,
