@@ -538,10 +538,10 @@ def identify(
     estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
     require_paths(files_and_overrides(words)[0])
-    from vehest.run.identify import identify_files, in_words
+    from vehest.run.identify import identify_files, record_table
 
     record = identify_files(words, out)
-    emit(as_json, {"out": str(out), **asdict(record)}, [in_words(record), f"out: {out}"])
+    emit(as_json, {"out": str(out), **asdict(record)}, [record_table(record), f"out: {out}"])
 
 
 @app.command()
@@ -911,7 +911,7 @@ def report(
 
         messages = Messages(quiet=quiet)
         with messages.running("import", "vehest"):
-            from vehest.run.published import check_listed, check_published, in_words
+            from vehest.run.published import check_listed, check_published, describe_verdict
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         names, overrides_of_check = files_and_overrides(words)
@@ -920,7 +920,7 @@ def report(
             if names
             else check_listed(overrides_of_check, messages)
         )
-        emit(as_json, verdicts, map(in_words, verdicts))
+        emit(as_json, verdicts, map(describe_verdict, verdicts))
         failed = any(
             verdict["failure"] if "failure" in verdict else verdict["state"] != "up to date"
             for verdict in verdicts
@@ -1221,7 +1221,7 @@ def data_align(
     """
     require_dataset_or_file(source)
     from vehest.alignment.settings import AlignmentSettings
-    from vehest.run.align import align_recording, as_plain, in_words, write_alignment
+    from vehest.run.align import align_recording, alignment_lines, as_plain, write_alignment
 
     quantities = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(
@@ -1233,7 +1233,7 @@ def data_align(
     emit(
         as_json,
         {**as_plain(alignment), "out": None if out is None else str(out)},
-        in_words(alignment, out),
+        alignment_lines(alignment, out),
     )
 
 
