@@ -496,7 +496,7 @@ def _lack(
         usable = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error), ()
-    missing = [] if usable.settings_suffice else usable.missing.in_words()
+    missing = [] if usable.settings_suffice else usable.missing.describe()
     lacks = [f"requires {', '.join(missing)}"] if missing else []
     min_seconds = samples / (usable.rate_hz or math.inf)
     if min_seconds > seconds:
