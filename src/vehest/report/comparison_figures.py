@@ -117,7 +117,7 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
 
 
 def _size_with_interval(row: ForestRow, decimals: int) -> str:
-    """An RMSE with its interval in brackets, if it has one."""
+    """Text of an RMSE with its interval in brackets, if it has one."""
     size = fixed(row.rmse, decimals)
     if not math.isfinite(row.low):
         return size
@@ -128,10 +128,10 @@ def _size_with_interval(row: ForestRow, decimals: int) -> str:
 class Cloud:
     """Samples of two quantities, (K,) each, drawn as points."""
 
-    label: str
-    colour: str
-    x: FloatArray
-    y: FloatArray
+    label: str  # name in the legend or title
+    colour: str  # hexadecimal
+    x: FloatArray  # horizontal coordinates, (K,)
+    y: FloatArray  # vertical coordinates, (K,)
 
 
 def clouds_figure(
@@ -200,7 +200,7 @@ def _wrapped(label: str) -> str:
 
 
 def draw_cloud(axes: Any, cloud: Cloud, marker_size: float = MARKER_SIZE) -> None:
-    """Points of a cloud, every n-th so that a figure stays small."""
+    """Draw the points of a cloud, every n-th, so that a figure stays small."""
     step = max(len(cloud.x) // MAX_POINTS, 1)
     axes.plot(
         cloud.x[::step],

@@ -32,20 +32,23 @@ PATENT_NOTE = (
     "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product "
     "may need their licence; the licence of this software grants none."
 )
-"""What every report with a KS-NN ends with."""
+"""Section with which every report with a KS-NN ends."""
 
-REPORT = "report"  # document of a study that one starts with
+REPORT = "report"  # name of the document with which a study starts
 
 MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150  # resolution of figures as pixels, unless a caller says another
 PNG_COLOURS = 256  # colours of a PNG, the most that a palette may have
+# matches cells that a spreadsheet would read as a formula
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
-_PATH = re.compile(r'\bd="[^"]*"')
-_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
-_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
-_UNWANTED = {"html_inline", "html_block", "image"}
+_PATH = re.compile(r'\bd="[^"]*"')  # matches the path data of an SVG
+_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")  # matches numbers with three decimals or more
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")  # matches valid file names of tables and figures
+_UNWANTED = {"html_inline", "html_block", "image"}  # Markdown tokens that are shown as text
+# matches link schemes other than http, https and mailto
 _SCRIPTED = re.compile(r"(?!https?:|mailto:)[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _APPENDIX = re.compile(r"\A## Appendix: (.)")  # the page lists these under "Appendices"
+# matches links to other documents, which the page replaces
 _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 
@@ -53,7 +56,7 @@ _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 class Column:
     """How a column of a table is shown; its CSV file keeps every digit."""
 
-    header: str  # what it is called, unit included
+    header: str  # title of the column, unit included
     digits: int = (
         3  # significant digits of its typical value, from which the decimals of all follow
     )
@@ -66,10 +69,10 @@ class Column:
 
 @dataclass(frozen=True)
 class ModelLink:
-    """Where the model behind a row of a table is."""
+    """Place of the model behind a row of a table."""
 
-    folder: str  # relative to the page
-    command: str  # that runs it
+    folder: str  # folder of the model, relative to the page
+    command: str  # command that runs it
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +286,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
 
 
 def _number_cells(values: list[Any], column: Column) -> list[str]:
-    """Numbers of a column as text, whole numbers without decimals."""
+    """Texts of the numbers of a column, those of integers without decimals."""
     if all(isinstance(value, int) for value in values):
         return [fixed(value, 0) for value in values]
     numbers = [
@@ -413,7 +416,9 @@ def _markdown(document: Document) -> str:
 
 
 def _in_pipes(cell: str) -> str:
-    """A cell on one line that cannot end the table's column, or be HTML or a link."""
+    """Text of a cell for a Markdown table, on one line, that cannot end the column or be HTML or a
+    link.
+    """
     line = printable(" ".join(cell.split()))
     return (
         line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
@@ -421,7 +426,8 @@ def _in_pipes(cell: str) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files.
+    """Markdown as it is, unless it has HTML, pictures, or links with a scheme other than http,
+    https and mailto; then these, and all other links, are shown as text.
 
     What it contains of them is shown as text.
     """
@@ -440,7 +446,7 @@ def _harmless(text: str) -> str:
 
 
 def _spoken(caption: str) -> str:
-    """First sentence of a caption, without marks that mean something in Markdown."""
+    """Alternative text of a figure: first sentence of a caption, without marks of Markdown."""
     plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", caption)
     plain = re.sub(r"[*`\[\]<>|]", "", plain).replace("\n", " ").strip()
     return re.split(r"(?<=\.)\s", plain, maxsplit=1)[0]
@@ -526,7 +532,7 @@ def without_formula(cell: Any) -> Any:
 
 
 def _page_table(table: Table) -> dict[str, Any]:
-    """A table as the page's template reads it: cells with bars, links to models, and the CSV as
+    """Values of a table for the page's template: cells with bars, links to models, and the CSV as
     data.
     """
     headers, rows, numeric = formatted(table)

@@ -44,9 +44,9 @@ class Traces:
     """Time series of one source on the common grid; NaN breaks a line."""
 
     label: str  # name of the source
-    line: Line
+    line: Line  # colour, dash and marker
     vy: FloatArray  # lateral velocity [m/s], shape (K,)
-    sideslip: FloatArray  # [deg], shape (K,)
+    sideslip: FloatArray  # sideslip angle [deg], shape (K,)
 
 
 def traces_figure(
@@ -104,9 +104,9 @@ def traces_figure(
 class Band:
     """Half widths of the calibrated 90 % bands of one estimate, NaN where there is none."""
 
-    estimate: Traces
-    vy: FloatArray  # [m/s], shape (K,)
-    sideslip: FloatArray  # [deg], shape (K,)
+    estimate: Traces  # the estimate that the band belongs to
+    vy: FloatArray  # half width for v [m/s], shape (K,)
+    sideslip: FloatArray  # half width for β [deg], shape (K,)
 
 
 def zoom_figure(
@@ -161,7 +161,7 @@ def zoom_figure(
 
 
 def _looks(line: Line) -> dict[str, Any]:
-    """Colour, dash and width of an estimate's line, as matplotlib's arguments."""
+    """Arguments of matplotlib for colour, dash and width of an estimate's line."""
     return {"color": line.colour, "linestyle": line.dash, "linewidth": 1.0}
 
 
@@ -316,7 +316,7 @@ class Reliability:
     """Coverages of one estimator's bands, each of shape (L,); NaN where not known."""
 
     label: str  # name of the estimator
-    line: Line
+    line: Line  # colour and marker
     coverage: FloatArray  # fraction of errors inside
     low: FloatArray  # lower end of its interval
     high: FloatArray  # upper end
@@ -387,7 +387,9 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
 
 
 def spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
-    """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
+    """Move heights of labels down as far as needed, so that they are at least a step apart and
+    below ``top``; order is kept.
+    """
     placed = [0.0] * len(heights)
     last = top + step
     for position in np.argsort([-height for height in heights], kind="stable"):
@@ -452,7 +454,7 @@ def legend_above(figure: Any, axes: Any) -> None:
 
 
 def _legend_width(labels: Sequence[str], columns: int) -> float:
-    """About how wide a legend of 7 pt gets [in]; its entries fill one column after another."""
+    """Approximate width of a legend of 7 pt [in]; its entries fill one column after another."""
     widths = [
         max(len(label) for label in column)
         for column in np.array_split(np.array(labels, dtype=object), columns)
