@@ -49,12 +49,12 @@ class JobsFailedError(VehestError):
 
 
 def listed(words: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Words joined as text: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def counted(names: Sequence[str]) -> str:
-    """Their number, and the first of them."""
+    """Text of the number of names and, in brackets, of the first six of them."""
     return (
         f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
         if names

@@ -18,11 +18,11 @@ from vehest.data.schema import validated
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on what one input may take; an hour of 55 channels at 1 kHz stays below each."""
+    """Upper bounds of the size of one input; an hour of 55 channels at 1 kHz stays below each."""
 
     samples: PositiveInt = 20_000_000  # of one channel of a recording, also after resampling
     columns: PositiveInt = 10_000  # columns that the header of a table may name
-    # what reading one file may take beyond ten times its size [bytes]
+    # memory that reading one file may take beyond ten times its size [bytes]
     memory: PositiveInt = 1_600_000_000
     # reach of a filter, or length of an estimator's window, in samples
     filter_samples: PositiveInt = 1_000_000
@@ -32,7 +32,7 @@ class Limits:
 
 
 _DEFAULTS = Limits()
-_current: ContextVar[Limits] = ContextVar("limits", default=_DEFAULTS)
+_current: ContextVar[Limits] = ContextVar("limits", default=_DEFAULTS)  # limits in force
 
 
 def current_limits() -> Limits:
@@ -42,7 +42,7 @@ def current_limits() -> Limits:
 
 @contextmanager
 def use_limits(limits: Limits) -> Iterator[None]:
-    """Put limits in force for a while."""
+    """Context in which limits are in force."""
     token = _current.set(limits)
     try:
         yield

@@ -31,7 +31,8 @@ from vehest.data.schema import check_format, validated
 from vehest.data.text_files import first_line, parse_json
 
 _METADATA_KEY = b"vehest"  # key of vehest's description in the metadata of a Parquet file
-_FORMAT = 1
+_FORMAT = 1  # version of the layout of stored files
+# options of pyarrow for stored files
 _LAYOUT: dict[str, Any] = {
     "compression": "zstd",
     "use_dictionary": False,
@@ -45,8 +46,8 @@ _LAYOUT: dict[str, Any] = {
 class RecordingDescription:
     """Description of a recording beside its table; see `Recording`."""
 
-    format: int
-    content: Literal["recording"]
+    format: int  # version of the layout
+    content: Literal["recording"]  # kind of content
     id: str
     vehicle: str
     rate_hz: float
@@ -58,24 +59,28 @@ class RecordingDescription:
 
 @dataclass(frozen=True)
 class EstimateDescription:
-    """Description of an estimate beside its table.
+    """Description of an estimate beside its table; see `Estimate`.
 
     See `Estimate`. ``n_states`` is the side of the covariance.
     """
 
-    format: int
-    content: Literal["estimate"]
+    format: int  # version of the layout
+    content: Literal["estimate"]  # kind of content
     recording_id: str
     estimator: str
     rate_hz: float
     start_time: float
     mode: Mode = "causal"
-    n_states: int | None = None
-    covariance_of: tuple[str, ...] = ("vy", "yaw_rate")  # of files from before rows had names
-    band: str = ""  # what calibrated ``band_vy`` and ``band_sideslip``, and for which car
+    n_states: int | None = None  # side n of the covariance; None: there is none
+    # quantity behind each row of the covariance; the default is for files in which rows had no
+    # names
+    covariance_of: tuple[str, ...] = ("vy", "yaw_rate")
+    band: str = ""  # text on what calibrated ``band_vy`` and ``band_sideslip``, and for which car
 
 
+# attributes of a recording in its description
 _OF_RECORDING = ("id", "vehicle", "rate_hz", "start_time", "kind")
+# attributes of an estimate in its description
 _OF_ESTIMATE = ("recording_id", "estimator", "rate_hz", "start_time", "mode")
 
 _Description = TypeVar("_Description", RecordingDescription, EstimateDescription)

@@ -37,12 +37,12 @@ from vehest.data.schema import validated
 MAX_DIRECT_TAPS = (
     8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 )
-OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
-MOST_BRIDGED = 0.1  # of a channel's samples
+OUTPUTS_AT_ONCE = 4096  # output samples that a resampling computes together
+MOST_BRIDGED = 0.1  # largest share of a channel's samples that is bridged
 VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
 
 
-Transform = Callable[[Recording], Recording]
+Transform = Callable[[Recording], Recording]  # function from a recording to a recording
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Resample:
 
     rate_hz: float  # the new rate [Hz]
     method: Literal["polyphase", "decimate"] = "polyphase"  # ``polyphase`` or ``decimate``
-    zero_crossings: ClassVar[int] = 16
-    kaiser_beta: ClassVar[float] = 7.0
-    # of the slower Nyquist frequency, where the stop band has then begun
+    zero_crossings: ClassVar[int] = 16  # zero crossings of the filter's sinc on either side
+    kaiser_beta: ClassVar[float] = 7.0  # shape of the Kaiser window
+    # cut-off over the slower Nyquist frequency, at which the stop band has then begun
     cutoff: ClassVar[float] = 0.86
 
     def __post_init__(self) -> None:
@@ -125,8 +125,8 @@ class Resample:
 
     @classmethod
     def reach(cls, ratio: Fraction) -> int:
-        """How many samples before or after it a sample depends on at most, in whole steps of the
-        new clock.
+        """Largest distance, in input samples, of the samples on which an output depends, rounded up
+        to whole steps of the new clock.
         """
         up = ratio.numerator
         down = ratio.denominator
@@ -223,7 +223,7 @@ class LowPass:
         )
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
-        """By the ``fir``, on samples extended at both ends by odd reflection.
+        """Samples filtered by the ``fir``, with both ends extended by odd reflection.
 
         A constant stays that constant, a line that line.
         """
@@ -401,8 +401,8 @@ class DelayCorrection:
 
     delay: float  # by how much the channels are late, negative if they are early [s]
     channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
-    reach: ClassVar[int] = 16
-    kaiser_beta: ClassVar[float] = 7.0
+    reach: ClassVar[int] = 16  # samples on either side that the interpolation uses
+    kaiser_beta: ClassVar[float] = 7.0  # shape of the Kaiser window
 
     def __call__(self, recording: Recording) -> Recording:
         """Shift the channels, and cut the recording to the samples that then exist."""
@@ -447,9 +447,9 @@ class DelayCorrection:
 
 @dataclass(frozen=True)
 class OffsetCorrection:
-    """Take constant offsets off channels."""
+    """Subtract constant offsets from channels."""
 
-    # by channel, in its unit
+    # channel -> offset in its unit
     offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)
 
     def __call__(self, recording: Recording) -> Recording:
@@ -465,6 +465,7 @@ class OffsetCorrection:
         )
 
 
+# name in a configuration -> transform
 TRANSFORMS: dict[str, type[Any]] = {
     "resample": Resample,
     "low_pass": LowPass,
@@ -580,7 +581,7 @@ def _compiled_sums() -> Callable[..., None]:
 
 
 def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
-    """Add what each sample gives to the outputs.
+    """Add the contribution of each sample to the outputs.
 
     ``newest``: place of the first output's last tap on the grid of up times the rate.
     """
@@ -611,7 +612,8 @@ def _extended(samples: FloatArray, margin: int) -> FloatArray:
 
 
 def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, of none those of all measured channels.
+    """The given channels, or all measured ones where none are given; raises an error where one of
+    them has gaps.
 
     Refused where one of the channels has gaps.
     """
