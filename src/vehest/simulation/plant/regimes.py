@@ -41,8 +41,8 @@ SLOW_BELOW = 1.0
 # forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime
 # does not flutter
 ROLLING_ABOVE = 1.2
-# how far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to
-# follow; assumed
+# largest deviation of lateral velocity [m/s] and yaw rate [rad/s] from rolling without slip at
+# which SLOW follows; assumed
 SLOW_TOLERANCE = 0.5
 SPUN_SIDESLIP = math.radians(60.0)
 """Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to
@@ -222,5 +222,8 @@ def _forces_needed(x, u, inputs, p):
 
 @_kernel
 def _coulomb(limit, vx, vy):
+    """Force of sliding friction (along, across) against a velocity, of magnitude ``limit`` [N]
+    beyond SLIDING_SMOOTHING.
+    """
     scale = -limit / math.sqrt(vx**2 + vy**2 + SLIDING_SMOOTHING**2)
     return scale * vx, scale * vy

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+# length [m] of a segment along which curvature and bank are linear, then curvature [1/m] and bank
+# [rad] at its end
 Piece = tuple[
     float, float, float
     # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are
@@ -16,7 +18,7 @@ Piece = tuple[
 class Straight:
     """A straight; its length [m] is nominal, see build_course."""
 
-    length: float
+    length: float  # nominal length [m]
 
     @property
     def angle(self) -> float:
@@ -35,17 +37,17 @@ class Corner:
     radius: float  # of the arc [m]
     angle: float  # change of heading, positive to the left [rad]
     transition: float  # length of each clothoid [m]
-    # of the arc, growing along the clothoids; positive with the inner side lower [rad]
+    # bank of the arc, growing along the clothoids; positive with the inner side lower [rad]
     banking: float = 0.0
 
     @property
     def bank(self) -> float:
-        """Of the arc, positive with the left side higher [rad]."""
+        """Bank of the arc, positive with the left side higher [rad]."""
         return -math.copysign(self.banking, self.angle)
 
     @property
     def curvature(self) -> float:
-        """Of the arc, positive to the left [1/m]."""
+        """Curvature of the arc, positive to the left [1/m]."""
         return math.copysign(1.0 / self.radius, self.angle)
 
     @property
