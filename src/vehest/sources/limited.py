@@ -27,23 +27,25 @@ from vehest.data import errors
 from vehest.data.errors import DataError, MissingError, VehestError, printable
 from vehest.data.limits import Limits, current_limits, use_limits
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[Any]]  # name -> array
 
 SECONDS = 15.0  # s of processor time, to which SECONDS_PER_BYTE of the file are added
 SECONDS_PER_BYTE = 1e-6  # s of processor time more for each byte of the file
-# times the processor time that a reader may take in all: a busy machine, or one without limits of
-# its own
+# longest time a reader may take in all, over the processor time: for a busy machine, or one without
+# limits of its own
 WAITING = 8.0
 MEMORY_PER_BYTE = 10.0  # bytes of memory for each byte of the file, besides the limit `memory`
 NO_MEMORY = 77  # exit status of a reader that ran out of memory
+# command that starts the limited process
 _COMMAND = [sys.executable, "-P", "-m", "vehest.sources.limited"]
+# environment variables by which libraries use one thread
 _SINGLE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
 
 
 class Reading(NamedTuple):
-    """What a reader returned."""
+    """Result of a reader."""
 
     arrays: Arrays  # name -> samples, one-dimensional
     summary: dict[str, Any]  # everything else, as JSON holds it

@@ -28,7 +28,7 @@ Requests = Mapping[str, tuple[str, int | str | None]]
 class MdfOptions(SignalOptions):
     """Options of the source, by type; None leaves an option open."""
 
-    files: str = "*.mf4"
+    files: str = "*.mf4"  # pattern of the measurements in ``path``
 
 
 @dataclass(frozen=True)

@@ -46,12 +46,13 @@ class Laps(Manoeuvre):
 
     name: ClassVar[str] = "laps"
     course: str = "handling"  # name of the course
-    duration: float | None = None  # length of the recording [s]; None where ``laps`` is given
+    duration: float | None = None  # length of the recording [s], where ``laps`` is not given
     laps: int | None = None  # number of whole laps to record
     severity: Range = (0.65, 0.9)  # mean share of the grip
     ripple: float = 0.05  # amplitude by which the share of the grip varies along the way
     line_offset: float = 0.5  # amplitude by which the line varies about the road's middle [m]
-    top_speed: float | None = None  # speed that the driver does not exceed [m/s]; None: the car's
+    # speed that the driver does not exceed [m/s]; by default the car's
+    top_speed: float | None = None
     flat: bool = False  # whether the course's bank and grade are left out
     half_width: float = 5.0  # half width of the road, beyond which the car has left it [m]
     corrections: Range = 0.0  # size of the corrections of the driver's hands, see `Hands` [m/s²]

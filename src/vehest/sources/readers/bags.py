@@ -34,9 +34,9 @@ apsw.connection_hooks.append(
     lambda connection: connection.pragma("temp_store", "memory")
 )  # SQLite may write no file
 
-TEXTS = frozenset({"string", "wstring", "byte", "char"})
-ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
-LATEST = 2**62  # ns of unix time: 146 years
+TEXTS = frozenset({"string", "wstring", "byte", "char"})  # types of fields that are no numbers
+ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)  # types of nodes of arrays
+LATEST = 2**62  # latest time, ns of unix time: 146 years
 
 Topic = Sequence[Any]  # name, message type, paths of fields
 
@@ -146,6 +146,7 @@ class _UriPath(type(Path())):  # type: ignore[misc]
     """A path that rosbags can write into the URI of a SQLite database."""
 
     def __format__(self, _: str) -> str:
+        """The path, percent-encoded."""
         return quote(os.fsencode(self), safe="/:\\")
 
 
