@@ -32,24 +32,24 @@ TILT = {"roll": "ax", "roll_rate": "ax", "pitch": "ay", "pitch_rate": "ay"}
 
 @dataclass(frozen=True)
 class Proposal:
-    """Channel of a column."""
+    """Proposal that a column is a channel."""
 
-    column: str  # its name in the log
-    channel: str  # as `vehest data channels` lists it
-    unit: str  # of the column, as vehest spells it
+    column: str  # name of the column in the log
+    channel: str  # channel, as `vehest data channels` lists it
+    unit: str  # unit of the column, as vehest spells it
     sign: int = 1  # -1 where its positive direction is opposite to ISO 8855
-    evidence: tuple[str, ...] = ()  # for people
-    question: str = ""  # that the log leaves open; empty where it decides all
-    factor: float = 1.0  # by which the column is multiplied to be in ``unit``
+    evidence: tuple[str, ...] = ()  # pieces of evidence, for people
+    question: str = ""  # question that the log leaves open; empty where it decides all
+    factor: float = 1.0  # factor that brings the column to ``unit``
     offset: float = 0.0  # value of the column at zero, in its own unit
     alternatives: tuple[str, ...] = ()  # channels, units or columns that fit equally well
-    delay: float = 0.0  # by which it is late, as far as it is known [s]
+    delay: float = 0.0  # time by which the column is late, as far as it is known [s]
     is_weak: bool = False  # whether it is left out unless an answer confirms it
     is_by_name: bool = False  # whether its name is all that supports it, and no relation to others
     is_repeated: bool = False  # whether another column measures the same
 
     def describe(self) -> str:
-        """For example ``yaw_rate: column 'Gyro', deg/s, sign -1: name and unit``."""
+        """Text such as ``yaw_rate: column 'Gyro', deg/s, sign -1: name and unit``."""
         parts = [f"column '{self.column}'", self.unit]
         parts += [f"sign {self.sign}"] if self.sign != 1 else []
         parts += [f"factor {self.factor:.5g}"] if self.factor != 1.0 else []
@@ -57,7 +57,7 @@ class Proposal:
         return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence)}"
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON.
+        """Fields as plain values, for JSON.
 
         Returns
         -------
@@ -92,7 +92,7 @@ class Proposal:
         return replace(self, evidence=(*self.evidence, *evidence))
 
     def questioned(self, question: str) -> Proposal:
-        """The same with a question, unless it has one."""
+        """The same with a question, unless it has one already."""
         return replace(self, question=self.question or question)
 
     def merged_with(self, earlier: Proposal | None) -> Proposal:
@@ -111,10 +111,13 @@ class Proposal:
 class Proposals:
     """Proposals for a log."""
 
-    channels: tuple[Proposal, ...]
-    left_right: str = ""  # evidence of which way is left; empty where the log has none
-    wheel_radius: float | None = None  # for vx from the wheels [m]; None where vx has a column
-    rate_hz: float | None = None  # of a log without times, by the accelerations; else None
+    channels: tuple[Proposal, ...]  # proposals of channels
+    # evidence by which left and right are told apart; empty where the log has none
+    left_right: str = ""
+    # rolling radius by which vx is made from the wheels [m]; None where vx has a column
+    wheel_radius: float | None = None
+    # rate of a log without times, by the accelerations [Hz]; else None
+    rate_hz: float | None = None
     unused: tuple[str, ...] = ()  # columns that belong to no channel
     pose: tuple[tuple[str, str, str], ...] = ()  # part (``x``, ``y``, ``yaw``), column and unit
     notes: tuple[str, ...] = ()  # further remarks
