@@ -375,6 +375,7 @@ def estimate(
 
 
 def _fields_of(series: PlainRecording | PlainEstimate) -> dict[str, Any]:
+    """Name -> value of each field of a recording or an estimate."""
     return {field.name: getattr(series, field.name) for field in fields(series)}
 
 
@@ -398,14 +399,15 @@ def _for_car(
 
 
 class OnlineEstimate(NamedTuple):
-    """What an estimator returns after a sample."""
+    """Estimate of a model after a sample."""
 
     vy: float  # lateral velocity [m/s]; NaN only before the first estimate
-    sideslip: float  # [rad]
-    health: float  # 0 valid, 1 degraded, 2 invalid
-    health_reason: float  # for `reason_in_words`
-    band_vy: float = math.nan  # half widths of the 90 % band, NaN without a calibration [m/s]
-    band_sideslip: float = math.nan  # [rad]
+    sideslip: float  # sideslip angle [rad]
+    health: float  # 0: valid, 1: degraded, 2: invalid
+    health_reason: float  # number of the reasons, for `reason_in_words`
+    band_vy: float = math.nan  # half width of the 90 % band of vy [m/s]; NaN without a calibration
+    # half width of the 90 % band of the sideslip angle [rad]; NaN likewise
+    band_sideslip: float = math.nan
 
 
 class OnlineEstimator:
@@ -462,7 +464,9 @@ class OnlineEstimator:
 
     @property
     def lead_seconds(self) -> float:
-        """How long after its sample an estimate applies [s]; negative behind a slow low-pass."""
+        """Time from a sample to the instant for which its estimate holds [s]; negative behind a
+        slow low-pass.
+        """
         rate = self.stepper.estimator.settings.rate_hz
         return float(self.stepper.horizon_steps / rate - self.stepper.delay)
 

@@ -49,13 +49,16 @@ app = typer.Typer(
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
-ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-MAX_ERROR_CHARACTERS = 4_000  # of an error message; the rest is cut off
-NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"  # of Typer
-STAGES = "Single stages, all of which `run` includes"
-CLUSTER = "On a cluster"
+ROOT_KEYS = ("root", "output", "seed", "rate_hz")  # keys of the configuration outside groups
+# largest number of characters of an error message; the rest is cut off
+MAX_ERROR_CHARACTERS = 4_000
+# message of Typer that is replaced
+NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"
+STAGES = "Single stages, all of which `run` includes"  # title of a panel of the help
+CLUSTER = "On a cluster"  # title of a panel of the help
+# commands whose configuration can be shown
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
-OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")
+OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")  # default output root
 
 
 def _offered(*groups: str) -> str:
@@ -1279,12 +1282,13 @@ def main() -> None:
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
-"""What Typer raises for options, arguments and commands that it does not know; newer ones carry
-their own copy of Click.
+"""Base of the exceptions of Typer for options, arguments and commands that it does not know; newer
+ones carry their own copy of Click.
 """
 
 
 def _fail_usage(error: Any) -> None:
+    """End with exit code 2 and one line on a wrong usage."""
     context = error.ctx
     if type(error).__name__ == "NoArgsIsHelpError":  # the help is on the screen
         sys.exit(error.exit_code)
@@ -1305,6 +1309,7 @@ def _fail_usage(error: Any) -> None:
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
+    """End with a message of one line and an exit code."""
     line = printable(" ".join(message.split()))
     try:
         sys.stdout.flush()
@@ -1363,6 +1368,7 @@ def _run_study(
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
+    """The resolved configuration of a command."""
     from vehest.configuration.composition import compose_config
 
     return compose_config(command, overrides)
