@@ -101,7 +101,7 @@ class Group:
         A value is out of its bounds.
     """
 
-    group: ClassVar[str] = "estimator"
+    group: ClassVar[str] = "estimator"  # name of the group in a configuration, for messages
 
     def __post_init__(self) -> None:
         for name, declared in self.declarations().items():

@@ -273,6 +273,7 @@ class _Own(AbstractTemplate):  # type: ignore[misc]
     """Typing of operations on one vector, whose result is a vector of the same type."""
 
     def generic(self, args: Any, kws: Any) -> Any:
+        """Signature for one argument of the type `Lanes`; None for any other."""
         return signature(args[0], *args) if isinstance(args[0], Lanes) else None
 
 

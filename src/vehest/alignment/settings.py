@@ -46,9 +46,7 @@ class AlignmentSettings:
     tilt: float = 0.001
     wheelbase: float | None = None  # distance between the axles, needed for the steering ratio [m]
     # channel of the steering ratio; None: ``handwheel``, or ``steer`` where there is none
-    steering_channel: str | None = (
-        None  # of the steering ratio; by default ``handwheel``, or ``steer`` where there is none
-    )
+    steering_channel: str | None = None
     max_ay: float = 3.0  # lateral acceleration up to which steering is taken as linear [m/s²]
     min_speed: float = 5.0  # speed from which the steering relation is used [m/s]
 

@@ -38,7 +38,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]  # root of the repository, if veh
 MANIFEST = "manifest.json"  # name of the file that describes a folder and its files
 TIMINGS = "timings.csv"  # durations, which differ each time and are no part of the content
 FORMAT = 1  # version of the manifest
-Status = Literal["complete", "interrupted"]
+Status = Literal["complete", "interrupted"]  # whether a stage ran to its end
 Write = Callable[[Path], Status | None]
 """Fills an empty folder, which then becomes an artefact; ``interrupted`` if it was stopped."""
 
@@ -105,7 +105,7 @@ class StagePlan:
 class Artefact:
     """A folder that a stage has made from its `StagePlan`."""
 
-    folder: Path  # where its files are
+    folder: Path  # folder of its files
     stage: str  # name of the stage
     label: str  # start of the folder's name
     key: str  # hash of what determines the content
@@ -114,7 +114,7 @@ class Artefact:
     config: Mapping[str, Any]  # the part of the configuration that determines the content
     inputs: Mapping[str, str]  # name -> digest
     provenance: Mapping[str, Any] = field(default_factory=dict)  # time, seconds, versions, machine
-    skipped: bool = False  # whether it existed already
+    skipped: bool = False  # whether it existed already, so that the stage was not run
     code: str = ""  # version of the stage's code
 
     @property
@@ -128,7 +128,7 @@ class Artefact:
 class Output:
     """Digest and length of a file's bytes."""
 
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # in hexadecimal digits
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # digest in hexadecimal digits
     bytes: int  # length of the file
 
 
@@ -139,15 +139,15 @@ class Manifest:
     A manifest that states no format has format 0, which is otherwise the same as 1.
     """
 
-    stage: str
-    label: str
-    key: str
-    status: Status
-    config: dict[str, Any]
-    inputs: dict[str, str]
-    outputs: dict[str, Output]
-    provenance: dict[str, Any]
-    code: str = ""
+    stage: str  # name of the stage
+    label: str  # start of the folder's name
+    key: str  # hash of what determines the content
+    status: Status  # ``interrupted`` where a fit was stopped with its best so far
+    config: dict[str, Any]  # the part of the configuration that determines the content
+    inputs: dict[str, str]  # name of an input -> digest
+    outputs: dict[str, Output]  # file -> its digest and length
+    provenance: dict[str, Any]  # time, seconds, versions and machine
+    code: str = ""  # version of the stage's code
 
 
 def find(plan: StagePlan, warn: Callable[[str], None] = lambda text: None) -> Artefact | None:

@@ -28,7 +28,7 @@ class Waiting:
     """Description of the lock for which a process waits, since another one makes the artefact."""
 
     stage: str  # name of the stage
-    label: str  # of the artefact
+    label: str  # label of the artefact
     holder: str  # text on the process that has the lock, for messages
 
 

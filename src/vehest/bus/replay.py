@@ -34,7 +34,7 @@ from vehest.trust.clock import RESET_SECONDS, STOPPED, SampleClock
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0  # s of a log that are read for its timing; more until each signal came twice
-LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
+LEAD_SECONDS = 0.5  # s from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, interval at which a thread looks whether it is to stop
 # s, longest time for which another Python thread goes on when the receiver has something to do
 SWITCH_SECONDS = 2e-4

@@ -20,10 +20,10 @@ class Figures:
 
     seconds: float = 0.0  # time from the first sample to the last, on the bus's clock
     frames_sent: int = 0  # frames of the log that were put on the bus
-    frames_received: int = 0  # of them, frames that carry signals that the model reads
-    frames_too_short: int = 0  # of these, frames that are shorter than the DBC says
+    frames_received: int = 0  # frames with signals that the model reads, among those sent
+    frames_too_short: int = 0  # frames that are shorter than the DBC says, among those received
     samples: int = 0  # samples that were formed
-    samples_lost: int = 0  # of them, those at which a channel was missing: lost, late or invalid
+    samples_lost: int = 0  # samples at which a channel was missing: lost, late or invalid
     # channel -> number of samples at which it was missing
     missing: dict[str, int] = field(default_factory=dict)
     estimates: int = 0  # estimates that were sent

@@ -83,7 +83,7 @@ class Tracking:
     ``uri`` is that of a server or a store; None is a local store in the output root.
     """
 
-    name: Literal["mlflow", "none"]  # where runs are recorded
+    name: Literal["mlflow", "none"]  # kind of the store of runs
     uri: str | None = None  # address of the store; None: a local store in the output root
     experiment: str = "vehest"  # name of the experiment in the store
 
@@ -103,7 +103,7 @@ class Root:
     __pydantic_config__ = FURTHER_KEYS
     output: str  # folder in which artefacts are written
     limits: dict[str, Any]  # upper bounds of the size of inputs
-    downsample: Preparation  # how recordings are brought to a lower rate
+    downsample: Preparation  # options of the resampling to a lower rate
     root: str | None = None  # folder of a data set's raw files
     tracking: Tracking | None = None  # store of runs
     estimator: Named | None = None  # estimator and its options

@@ -17,7 +17,7 @@ from vehest.data.limits import Limits, limits_from_config
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """How a recording is read, and what is changed of the model."""
+    """Options by which a recording is read, and by which the model is changed."""
 
     output: Path  # root in which models are looked for by name
     dataset: dict[str, Any]  # options of the recording's data set

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
+PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]  # number above 0
 
 SAME_CAR_RANGES = {"wheelbase": (1.05, "m"), "mass": (1.25, "kg")}
 """Value -> factor by which it may differ for one car, and its unit.

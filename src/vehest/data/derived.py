@@ -42,7 +42,7 @@ class SteeringRatio:
     """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio."""
 
     ratio: float  # angle for a unit of ``steer``; negative if it counts the other way
-    offset: float = 0.0  # what it shows going straight ahead [rad]
+    offset: float = 0.0  # angle that is shown straight ahead [rad]
     channel: ChannelName = "handwheel"  # the angle; ``steer`` itself may be it
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class SteeringCurve:
     inputs: tuple[float, ...]  # values of the channel at the corners, increasing
     # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
     angles: tuple[float, ...]
-    channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
+    channel: ChannelName = "steer"  # channel to which the curve is applied; it may be ``steer``
 
     def __post_init__(self) -> None:
         if (
@@ -217,7 +217,7 @@ class AccelerationFromSpeed:
     """
 
     channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
-    cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
+    cutoff_hz: PositiveFloat = 5.0  # cut-off of a Butterworth filter of second order [Hz]
     # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
     direction: Literal["causal", "zero_phase"] = "causal"
 

@@ -79,7 +79,7 @@ def closest(name: str, choices: Iterable[str]) -> str:
 
 
 def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
-    """What was probably meant by an unknown name, to append to a message.
+    """Text with what was probably meant by an unknown name, to append to a message.
 
     Empty if no choice is close.
     """

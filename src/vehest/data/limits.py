@@ -20,7 +20,8 @@ from vehest.data.schema import validated
 class Limits:
     """Upper bounds of the size of one input; an hour of 55 channels at 1 kHz stays below each."""
 
-    samples: PositiveInt = 20_000_000  # of one channel of a recording, also after resampling
+    # samples of one channel of a recording, also after resampling
+    samples: PositiveInt = 20_000_000
     columns: PositiveInt = 10_000  # columns that the header of a table may name
     # memory that reading one file may take beyond ten times its size [bytes]
     memory: PositiveInt = 1_600_000_000
@@ -31,7 +32,7 @@ class Limits:
     text_bytes: PositiveInt = 16 * 2**20
 
 
-_DEFAULTS = Limits()
+_DEFAULTS = Limits()  # limits where none are set
 _current: ContextVar[Limits] = ContextVar("limits", default=_DEFAULTS)  # limits in force
 
 

@@ -14,7 +14,8 @@ MAX_DEPTH = 8  # largest nesting of structures in a header
 PADDING = 100  # bytes; what old writers left out of a column's size (PARQUET-816)
 STOP, TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, _, STRUCT = range(13)
 FIXED_BYTES = {BYTE: 1, DOUBLE: 8}  # type of a field -> its length, where that is fixed
-DATA_PAGE_FIELDS = (5, 8)  # of a page's header: that of a data page of version 1 or 2
+# numbers of the fields of a page's header that hold that of a data page, of version 1 or 2
+DATA_PAGE_FIELDS = (5, 8)
 
 
 def largest_page(stream: BinaryIO, column: Any) -> int:

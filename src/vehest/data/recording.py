@@ -16,7 +16,7 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.time_series import TimeSeries
 
-Kind = Literal["real", "simulated"]
+Kind = Literal["real", "simulated"]  # whether a drive was real or simulated
 
 MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
 PART = "part"  # key in the provenance of a part of a drive: its number and the number of parts
@@ -48,7 +48,7 @@ class Recording(TimeSeries):
     kind: Kind = "real"  # ``real`` or ``simulated``
     # channels in which NaN means "not measured"; everywhere else NaN is an error
     gappy: frozenset[str] = frozenset()
-    # where samples come from (JSON values only); not part of the data
+    # origin of the samples (JSON values only); not part of the data
     provenance: Mapping[str, Any] = field(default_factory=dict)
     car: CarValues = UNKNOWN_CAR  # values of its data set; a stored recording has none
 

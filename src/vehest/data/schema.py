@@ -22,6 +22,7 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError, sugge
 
 Schema = TypeVar("Schema")  # dataclass that is built
 
+# configuration of pydantic for dataclasses that take further keys
 FURTHER_KEYS = ConfigDict(
     extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
 )

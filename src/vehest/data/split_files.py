@@ -29,7 +29,7 @@ Catalogue = Callable[[str], Mapping[str, Reader]]
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")  # matches a percentage
 # matches laps, such as ``last lap`` or ``2 to 5``
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
-# what a start or stop may be, for messages
+# text on what a start or stop may be, for messages
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
 # s, shortest segment of limited minutes; a shorter one holds no window after the start that is not
 # scored

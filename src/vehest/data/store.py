@@ -48,13 +48,13 @@ class RecordingDescription:
 
     format: int  # version of the layout
     content: Literal["recording"]  # kind of content
-    id: str
-    vehicle: str
-    rate_hz: float
-    start_time: float
-    kind: Kind = "real"
-    gappy: frozenset[str] = frozenset()
-    provenance: dict[str, Any] = field(default_factory=dict)
+    id: str  # name of the recording
+    vehicle: str  # name of the vehicle
+    rate_hz: float  # sampling rate [Hz]
+    start_time: float  # time of the first sample [s]
+    kind: Kind = "real"  # whether it was real or simulated
+    gappy: frozenset[str] = frozenset()  # channels in which NaN means that nothing was measured
+    provenance: dict[str, Any] = field(default_factory=dict)  # origin of the samples
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class EstimateDescription:
 
     format: int  # version of the layout
     content: Literal["estimate"]  # kind of content
-    recording_id: str
-    estimator: str
-    rate_hz: float
-    start_time: float
-    mode: Mode = "causal"
+    recording_id: str  # name of the recording
+    estimator: str  # name of the estimator
+    rate_hz: float  # rate of the estimate [Hz]
+    start_time: float  # time of the first sample [s]
+    mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
     n_states: int | None = None  # side n of the covariance; None: there is none
     # quantity behind each row of the covariance; the default is for files in which rows had no
     # names
@@ -147,7 +147,7 @@ def is_stored_estimate(path: Path) -> bool:
 
 
 def _content_of(path: Path) -> str:
-    """What vehest wrote into a Parquet file: ``recording`` or ``estimate``.
+    """Kind of content that vehest wrote into a Parquet file: ``recording`` or ``estimate``.
 
     Empty for a file of another tool, whatever it is.
     """

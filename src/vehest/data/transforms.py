@@ -174,10 +174,11 @@ class LowPass:
     """
 
     cutoff_hz: float  # -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz]
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
     direction: Literal["causal", "zero_phase"] = "zero_phase"  # ``causal`` or ``zero_phase``
     design: Literal["butterworth", "fir"] = "butterworth"  # ``butterworth`` or ``fir``
-    # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
+    # length of a ``fir`` into past and future [s]; the longer, the sharper its cut-off
     reach: PositiveFloat = 0.3
 
     def __post_init__(self) -> None:
@@ -241,8 +242,10 @@ class RemoveOutliers:
     """
 
     half_window: PositiveInt = 5  # samples on either side that count as neighbours
-    threshold: PositiveFloat = 6.0  # how many scaled median absolute deviations make an outlier
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    # number of scaled median absolute deviations beyond which a sample is an outlier
+    threshold: PositiveFloat = 6.0
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -400,7 +403,8 @@ class DelayCorrection:
     """
 
     delay: float  # by how much the channels are late, negative if they are early [s]
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
     reach: ClassVar[int] = 16  # samples on either side that the interpolation uses
     kaiser_beta: ClassVar[float] = 7.0  # shape of the Kaiser window
 
@@ -493,11 +497,11 @@ without them.
 
 @dataclass(frozen=True)
 class Preparation:
-    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a
+    """Resampling of recordings to an estimator's rate: ``downsample`` of a configuration or of a
     model.
     """
 
-    method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
+    method: Literal["polyphase", "decimate"] = "polyphase"  # method of `Resample`
     # applied before, at the native rate, each by its ``name`` and its arguments
     transforms: tuple[dict[str, Any], ...] = ()
 
@@ -506,7 +510,7 @@ class Preparation:
             transform_from_config(entry)
 
     def as_plain(self) -> dict[str, Any]:
-        """As files hold it."""
+        """Plain values, as files hold them."""
         return {"method": self.method, "transforms": [dict(entry) for entry in self.transforms]}
 
 

@@ -35,7 +35,8 @@ class ScoredBand(NamedTuple):
 
     errors: FloatArray  # estimate - reference, (N,) [deg for β, m/s for v]
     half: FloatArray  # half widths in the same unit, (N, L), a column for each of `LEVELS`
-    is_scored: BoolArray  # which of the K samples of all ranges these are, (K,), N of them True
+    # whether each of the K samples of all ranges is scored, (K,); N of them are
+    is_scored: BoolArray
 
     @property
     def half_width_90(self) -> FloatArray:

@@ -23,7 +23,7 @@ from vehest.evaluation.significance import root_intervals, unexplained_interval
 SEGMENT_SECONDS = 1.0  # s, length of the segments over which errors are summed
 # ranges or sequences from which on each is a block; of fewer, each is cut into blocks
 MIN_PIECES_AS_BLOCKS = 8
-MIN_BLOCKS = 3  # with fewer blocks no interval is given
+MIN_BLOCKS = 3  # smallest number of blocks with which an interval is given
 
 
 @dataclass(frozen=True, eq=False)

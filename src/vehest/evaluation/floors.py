@@ -111,8 +111,10 @@ class Floor:
     set.
     """
 
-    vy: float  # of lateral velocity [m/s]
-    sideslip: float  # of the sideslip angle, where it is scored [deg]; NaN where it is at no sample
+    vy: float  # floor of the error of lateral velocity [m/s]
+    # floor of the error of the sideslip angle, where it is scored [deg]; NaN where it is at no
+    # sample
+    sideslip: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +308,7 @@ class Noise(NamedTuple):
     # density of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
     density: float
     deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
-    time_constant: float  # of the slow part [s]
+    time_constant: float  # time constant of the slow part [s]
 
 
 class Axle(NamedTuple):

@@ -53,6 +53,7 @@ WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 code).
 """
 
+# unit -> names of metrics in it
 _METRICS = {
     "1": (
         *(
@@ -84,6 +85,7 @@ _METRICS = {
     "m": ("lever_arm",),
     "s": ("train_seconds", "step_seconds"),
 }
+# unit, with a place for that of the quantity -> names of metrics of bands
 _BAND_METRICS = {
     "1": (
         "coverage_50",
@@ -97,6 +99,7 @@ _BAND_METRICS = {
     ),
     "{}": ("width_90", "interval_score", "crps"),  # in the unit of the quantity
 }
+# name of a metric -> its unit
 UNITS: dict[str, str] = {name: unit for unit, names in _METRICS.items() for name in names}
 UNITS |= {
     f"{name}{suffix}": unit.format(of)
@@ -112,7 +115,7 @@ class Protocol:
 
     # rate of the times at which errors are taken [Hz]; an estimate is held, never interpolated
     rate_hz: float = 20.0
-    # how long before a range, or before each sequence, an estimator may start [s]
+    # time before a range, or before each sequence, at which an estimator starts at the earliest [s]
     warm_up_seconds: float = 10.0
     # time from the start of each range, or of each sequence, that is not scored [s]
     skip_seconds: float = 1.5
@@ -226,7 +229,7 @@ class Scored:
     is_sideslip_scored: BoolArray  # whether the car is fast enough (`Protocol.min_sideslip_speed`)
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     other_states: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    # covariance of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
     covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
     # normalised innovation squared of the filter's update, where the method gives it

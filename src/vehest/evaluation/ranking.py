@@ -36,7 +36,7 @@ class Comparison:
 
     difference: float  # first - second, in the unit of the RMSE
     low: float  # lower end of its interval, corrected by Holm over all comparisons of the table
-    high: float  # its upper end
+    high: float  # upper end of the interval
     p_value: float  # two-sided, corrected likewise
     verdict: Verdict  # whether the first lies significantly lower or higher than the second
 
@@ -57,9 +57,10 @@ class Comparison:
 class Ranking:
     """Order of several estimators on a test set by RMSE(β) [deg], with the comparisons of pairs."""
 
-    order: Sequence[Name]  # by RMSE over all seeds, the lowest first
+    order: Sequence[Name]  # names by RMSE over all seeds, the lowest first
     rmse: Mapping[Name, float]  # RMSE(β) over all seeds of each [deg]
-    intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval over blocks and seeds [deg]
+    # 95 % interval of the RMSE over blocks and seeds [deg]
+    intervals: Mapping[Name, tuple[float, float]]
     # (first, second) -> comparison, of every pair that was compared, either way round
     pairs: Mapping[tuple[Name, Name], Comparison]
     n_blocks: int  # number of blocks; below `MIN_BLOCKS` there are no intervals and comparisons

@@ -46,7 +46,8 @@ AY_BANDS = {
 [m/s²].
 """
 
-REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
+# names of the regimes, in the order of tables
+REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
 
 
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:

@@ -33,7 +33,7 @@ class Interval:
 
     value: float  # the figure; of a difference, negative where the first has the lower loss
     low: float  # lower end of the 95 % interval
-    high: float  # its upper end
+    high: float  # upper end
     p_value: float  # two-sided, of no difference; below 0.05 where the interval excludes 0
     error: float = 0.0  # standard error
     dof: float = np.inf  # degrees of freedom of Student's t
@@ -378,7 +378,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:
-    """How often each block is drawn, (n, n_blocks): n_blocks - 1 draws with replacement."""
+    """Number of times that each block is drawn, (n, n_blocks): n_blocks - 1 draws with
+    replacement.
+    """
     counts: FloatArray = generator.multinomial(
         n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n
     ).astype(np.float64)

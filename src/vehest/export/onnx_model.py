@@ -172,7 +172,7 @@ class _VelocityStep(_Step):
 class _GruStep(_VelocityStep):
     """Step of `VelocityGruNetwork`, with the hidden state ``h`` (H,)."""
 
-    slope: Tensor
+    slope: Tensor  # slope of the velocities' activation (PReLU) below zero, (1,)
 
     def __init__(self, estimator: VelocityGru) -> None:
         super().__init__(estimator, h=estimator.settings.n_states)
@@ -195,7 +195,7 @@ class _LstmStep(_VelocityStep):
     measured, 0 for the lateral one.
     """
 
-    is_measured: Tensor
+    is_measured: Tensor  # 1 for each output that is a measured channel, else 0
 
     def __init__(self, estimator: VelocityLstm) -> None:
         s = estimator.settings

@@ -46,7 +46,7 @@ DEFAULT_WHEELBASES = {
     family.name: family.settings_type().wheelbase for family in (SelfCalibrating, PriorMap)
 }
 """Estimator that assumes a typical wheelbase where none is given -> that wheelbase [m]."""
-Positive = Annotated[float, Field(gt=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]  # number above 0
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,8 @@ class CarRecord:
     """
 
     wheelbase: Annotated[float, Field(ge=0.05, le=20.0)]  # [m]
-    cg_to_rear_axle: Positive | None  # as given [m]
+    # distance of the centre of gravity from the rear axle, as given [m]
+    cg_to_rear_axle: Positive | None
     # κ: share of the measured ay that is none, because the body rolls or the sensor's gain errs
     leakage: Number
     rear_axle: Number  # distance of the inertial unit from the rear axle, negative behind it [m]

@@ -23,12 +23,12 @@ from vehest.report.style import (
     new_figure,
 )
 
-FOREST_WIDTH = 4.4  # in, narrow enough for a phone
+FOREST_WIDTH = 4.4  # width of the figure, in, narrow enough for a phone
 FOREST_FONT = 8.5  # pt
 MIN_RATIO_FOR_LOG = 8.0  # highest over lowest RMSE, from which the axis is logarithmic
 MAX_POINTS = 500  # points of a cloud of samples, about; of a longer one every n-th is drawn
 AGREEMENT_COLUMNS = 4  # clouds side by side at most; further ones begin a row
-TITLE_CHARACTERS = 25  # of an estimator's name in a line
+TITLE_CHARACTERS = 25  # largest number of characters of an estimator's name in a line
 MARKER_SIZE = 2.2  # pt, of a sample
 FIRST_MARKER_SIZE = 3.6  # pt, of a sample of the cloud that is drawn first
 

@@ -54,7 +54,7 @@ _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 @dataclass(frozen=True)
 class Column:
-    """How a column of a table is shown; its CSV file keeps every digit."""
+    """Column of a table and the format of its numbers; its CSV file keeps every digit."""
 
     header: str  # title of the column, unit included
     digits: int = (
@@ -98,7 +98,7 @@ class Figure:
     interactive: str = ""  # `explorer_json` of what the page draws in its place
 
 
-Block: TypeAlias = "str | Table | Figure"
+Block: TypeAlias = "str | Table | Figure"  # part of a document: Markdown, a table or a figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +118,8 @@ class Document:
     # name -> table that is written beside the others without being shown; text may link to
     # ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # how many of the first blocks the page shows, the sections after them being folded appendices;
-    # None: all
-    # up to the first heading that begins with "Appendix"
+    # number of first blocks that the page shows, the sections after them being folded appendices;
+    # None: all up to the first appendix
     open_blocks: int | None = None
 
     def __post_init__(self) -> None:
@@ -510,7 +509,7 @@ def _page(document: Document, images: Mapping[str, bytes]) -> str:
 
 
 def _open_blocks(document: Document) -> int | None:
-    """How many blocks the page shows before its appendices.
+    """Number of blocks that the page shows before its appendices.
 
     Those of `Document.open_blocks`, else all up to the first appendix.
     """
@@ -561,8 +560,8 @@ def _page_table(table: Table) -> dict[str, Any]:
 def bars_of(
     values: Sequence[float], lows: Sequence[float], highs: Sequence[float]
 ) -> list[dict[str, Any] | None]:
-    """Where values and the ends of their intervals lie on one axis from zero, in per cent of its
-    length; none where a value is missing.
+    """Positions of values and of the ends of their intervals on one axis from zero, in per cent of
+    its length; None where a value is missing.
 
     The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
     beyond; what is longer is ``cut``.

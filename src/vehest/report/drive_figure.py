@@ -66,9 +66,10 @@ HEALTH = {1: ("degraded", "#e69f00"), 2: ("invalid", "#6b1414")}
 VALID_COLOUR = "#dfe4e8"  # colour of valid samples in the panel of health
 CHANNEL_COLOUR = "#33373b"  # colour of measured channels
 COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to the left
-HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}  # in
+# kind of panel -> its height, in
+HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}
 
-DASHES = ("solid", "dashed", "dotted", "dashdot")  # of estimates by the same estimator
+DASHES = ("solid", "dashed", "dotted", "dashdot")  # dashes of estimates by the same estimator
 NOTEBOOK_DPI = 110  # resolution of the figure in a notebook
 MIN_AXIS = 0.1  # deg, smallest half width of the axes of estimate over reference
 Draw = Callable[[Axes], None]  # draws a panel into axes

@@ -91,8 +91,8 @@ def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
 def reckoned_course(
     vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading
-    along x; after NaN it starts anew.
+    """Course of the car, x and y (K,) [m], by integrating velocities from the origin, heading along
+    x; after NaN it starts anew.
 
     ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two
     samples.

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 STATIC_POINTS = 500  # points of a line in `traces_figure`, about
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 MAX_POINTS = 2000  # points of a line over a whole drive, about
-MIN_SAMPLES_IN_BIN = 20  # of lateral acceleration; a bin with fewer shows no error
+# smallest number of samples in a bin of lateral acceleration with which it shows an error
+MIN_SAMPLES_IN_BIN = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a share of the axis
 SIDESTEP = 0.005  # shift of intervals that would cover each other, as a share of the axis
 # the reference under the estimates: wide enough to show on both sides of a line

@@ -17,16 +17,17 @@ if TYPE_CHECKING:
 
 MatplotlibFigure: TypeAlias = "Figure"
 
-SINGLE_COLUMN = 3.5  # in, one column of a two-column journal
-DOUBLE_COLUMN = 7.16  # in, both columns
+SINGLE_COLUMN = 3.5  # width of one column of a two-column journal, in
+DOUBLE_COLUMN = 7.16  # width of both columns, in
 MISSING = "–"  # text of a missing value
 
-REFERENCE_COLOUR = "#000000"  # of a line of the reference
-REFERENCE_GREY = "#8c9096"  # of a wide line of the reference below estimates, 3:1 on white
-LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # of KS-NN with linear feedback, without and with bias
-# of KS-NN with nonlinear feedback, without and with bias
+REFERENCE_COLOUR = "#000000"  # colour of a line of the reference
+REFERENCE_GREY = "#8c9096"  # colour of a wide line of the reference below estimates, 3:1 on white
+# colours of KS-NN with linear feedback, without and with bias
+LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")
+# colours of KS-NN with nonlinear feedback, without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
-# of estimators whose family declares no line
+# colours of estimators whose family declares no line
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
 
 _DARK_PAPER = 0x1A  # grey of the page in its dark scheme, as in templates/page.css

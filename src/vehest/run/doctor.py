@@ -32,7 +32,7 @@ class Item:
     """Result of one check of the environment."""
 
     level: Literal["ok", "warning", "error"]  # severity
-    name: str  # what was checked
+    name: str  # name of the part that was checked
     message: str  # the result, with the remedy where something is wrong
 
 

@@ -17,7 +17,7 @@ from vehest.data.recording import Recording
 from vehest.sources.limited import read_limited
 from vehest.trust.health import reason_in_words
 
-PREFIX = "vehest_"  # of the names of the channels that are added to a log
+PREFIX = "vehest_"  # start of the names of the channels that are added to a log
 HEALTH = ("valid", "degraded", "invalid")  # texts of the codes 0, 1 and 2 of health
 
 

@@ -156,7 +156,7 @@ class Evaluation:
     data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
     references: Mapping[str, Artefact]  # data set -> recordings at the evaluation rate
     kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
-    protocol: Protocol  # how estimates are scored
+    protocol: Protocol  # protocol by which estimates are scored
     output: Path  # output root
     faults: tuple[FaultSettings, ...] = ()  # faults under which tests are scored, too
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car

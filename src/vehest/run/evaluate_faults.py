@@ -41,11 +41,12 @@ class FaultSettings:
 
     name: str  # kind of fault, one of `vehest.trust.faults.KINDS`
     channel: str  # channel that it affects
-    severity: Annotated[Severity, "mild, medium or severe"]  # which of the kind's sizes
+    # severity, by which one of the kind's sizes is chosen
+    severity: Annotated[Severity, "mild, medium or severe"]
     size: float | None = None  # size that replaces the severity's
     # time of its start after the start of each range [s]; None: drawn, within `DRAWN_START`
     start: float | None = None
-    duration: float | None = None  # how long it lasts [s]; None: to the end of the range
+    duration: float | None = None  # length of the fault [s]; None: to the end of the range
     seed: int = 0  # seed of all random draws
 
     def __post_init__(self) -> None:

@@ -60,7 +60,7 @@ class Group:
 
     jobs: Sequence[TrainJob]  # the trainings
     split: Split  # split on whose validation range the models are calibrated
-    evaluation: Evaluation | None = None  # how models are evaluated; None: they are only trained
+    evaluation: Evaluation | None = None  # evaluation of the models; None: they are only trained
     force: frozenset[str] = frozenset()  # stages that are run although their artefacts exist
     label: str = ""  # name in messages; if empty, the estimator and its variant
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car

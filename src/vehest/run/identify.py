@@ -40,9 +40,7 @@ from vehest.run.printing import TerminalTable, complain, describe_finding, note
 from vehest.sources.base import car_of
 
 # share of the prior's variance; a parameter is identified on a drive after which less remains
-IDENTIFIED_SHARE = (
-    0.5  # of the prior's variance: a number is identified on a drive that leaves less
-)
+IDENTIFIED_SHARE = 0.5
 # parameter -> index of its state in the filter
 STATE_ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 # channel -> index of the state that is its offset

@@ -34,7 +34,7 @@ from vehest.sources.base import SIMULATED, Source, open_source
 from vehest.trust.health import SLOW_KERNEL, compile_health
 
 STAGE = "ingest"  # name of the stage
-PARTS_PREFIX = ".parts-"  # of the name of a folder with recordings of an unfinished ingest
+PARTS_PREFIX = ".parts-"  # start of the name of a folder with recordings of an unfinished ingest
 MAX_ID_BYTES = 200  # bytes of a recording's id, at most, since it is the name of a file
 MAX_NAMES = 6  # recordings that an error names, at most
 Report = Callable[

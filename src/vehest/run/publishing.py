@@ -33,7 +33,7 @@ DIGITS = 6  # significant digits of numbers in published tables
 
 @dataclass(frozen=True)
 class Publication:
-    """What is recorded with a study's report in results/STUDY."""
+    """Record of a study's report in results/STUDY."""
 
     study: str  # name of the study
     # name of a part or data set that the study went on without -> the same for people
@@ -44,12 +44,12 @@ class Publication:
 
 @dataclass(frozen=True)
 class TableRecord:
-    """How a table that no pipeline publishes was made (`vehest.run.table_records`)."""
+    """Record of how a table that no pipeline publishes was made (`vehest.run.table_records`)."""
 
     __pydantic_config__ = FURTHER_KEYS
     command: str  # command that makes the table
     commit: str  # commit of the repository at which it was made
-    without_keys: str = ""  # what of the table was made before keys were recorded; empty: nothing
+    without_keys: str = ""  # part of the table that was made before keys were recorded; empty: none
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Published:
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
     keys: Keys = field(default_factory=dict)  # empty where they were not recorded yet
     n_not_trained: int = 0  # trainings that the report names as missing
-    tables: dict[str, TableRecord] = field(default_factory=dict)  # of a folder without a pipeline
+    # records of the tables of a folder without a pipeline
+    tables: dict[str, TableRecord] = field(default_factory=dict)
 
 
 def published_in(folder: Path) -> Published | None:

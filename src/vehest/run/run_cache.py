@@ -53,7 +53,7 @@ _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 class Ran:
     """Outcome of a study or sweep that was run."""
 
-    summary: TerminalSummary  # what is printed
+    summary: TerminalSummary  # text that is printed
     folder: Path  # folder of its report
     skipped: bool  # whether the report existed already
     published: Path | None = None  # folder in results/
@@ -66,12 +66,12 @@ class Record:
 
     inputs: str  # hash of what determines its keys, `RunCache.inputs`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
-    # for each artefact its folder in the output root, its key and its digest; the report last
+    # folder in the output root, key and digest of each artefact; the report last
     made: tuple[tuple[str, str, str], ...]
     # lines that a run in full would print too: status, stage, label, detail
     notes: tuple[tuple[str, str, str, str], ...]
-    summary: TerminalSummary  # what is printed
-    publication: Publication | None  # how it is published; None: it is not
+    summary: TerminalSummary  # text that is printed
+    publication: Publication | None  # publication of the report; None: it is not published
     store: str  # MLflow's local store in the output root; empty where there is none
 
 

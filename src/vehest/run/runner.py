@@ -67,7 +67,7 @@ class Stages:
     stop: StopSignals  # signals that ask to stop
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
-    dry_run: bool = False
+    dry_run: bool = False  # whether stages are only listed
     # artefacts that were used so far, by folder
     artefacts: dict[Path, Artefact] = field(default_factory=dict)
     # results of `_once`, by kind and argument
@@ -313,7 +313,7 @@ class Runner(Stages):
     """Trains, calibrates and evaluates groups by a launcher, and tracks what was made."""
 
     tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # logs nothing
-    launcher: Launcher = field(default_factory=LocalLauncher)
+    launcher: Launcher = field(default_factory=LocalLauncher)  # launcher by which trainings run
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
     weights: PublishedWeights | None = None  # published weights that are used instead of training
     # published weights to which finished trainings are added

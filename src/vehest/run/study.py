@@ -44,7 +44,7 @@ from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, override_text, short_names
 
-# what a pipeline's file must have, for messages
+# text on what a pipeline's file must have, for messages
 FORMS = (
     "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; "
     "datasets, each once"
@@ -54,11 +54,13 @@ SHARED_KEYS = ("split", "evaluation", "downsample")
 # groups of the configuration that cannot be swept
 SINGLE_VALUED = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
+# sweeps, each a list of overrides
 Sweeps = Annotated[
     tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"
 ]
+# settings of faults that are evaluated
 Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
-Names = Annotated[tuple[str, ...], "a list of names"]
+Names = Annotated[tuple[str, ...], "a list of names"]  # list of names
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class Study(PipelineFile):
 
     file: Path = Path()  # path of its pipeline file
     command: str = ""  # command that makes it, without locations of data and results
-    words: tuple[str, ...] = ()  # all words of the command that runs it here
+    words: tuple[str, ...] = ()  # words of the command that runs it here
     # part of the file with a search -> its trials, each a part here
     searches: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -142,14 +144,14 @@ class Study(PipelineFile):
 class Job:
     """One training and its evaluation."""
 
-    # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
+    # configuration as composed for ``train`` or ``eval``; rates may be lowered to those of
+    # recordings
     config: Config
-    # its settings as a sweep names them; empty for the estimator's name and variant
-    label: str = ""
+    label: str = ""  # settings as a sweep names them; empty for the estimator's name and variant
     # keys that a sweep varies -> the job's values
     values: Mapping[str, Value] = field(default_factory=dict)
     combination: int = 0  # index of the combination of these values in the sweep
-    failure: Failure | None = None  # why it cannot be done, or failed
+    failure: Failure | None = None  # reason why it cannot be done, or failed
     training: TrainJob | None = None  # the planned training; None before it is planned
 
 

@@ -172,7 +172,7 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str],
 ) -> tuple[list[tuple[str, str]], str]:
-    """What differs from when tables were made, as pairs with its cause, and a note on what was not
+    """Differences from when tables were made, as pairs with their cause, and a note on what was not
     compared.
 
     Parameters

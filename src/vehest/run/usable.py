@@ -78,7 +78,7 @@ class Usability:
 
     @property
     def usable(self) -> str:
-        """Whether it can be used.
+        """Whether the estimator can be used with these recordings.
 
         ``yes`` as it is; ``with settings`` if overrides make it usable, those in ``settings`` and
         ``patterns`` or values of the car, as `vehest new` writes them; ``not to train`` if only a

@@ -43,7 +43,7 @@ earlier versions have plain text.
 """
 # files of a model that are published beside its weights
 FILES = (DESCRIPTION, FIT_METRICS, HISTORY)
-FORMAT = 4  # in the key of a report that has weights: 3 has compressed files, 4 origins
+FORMAT = 4  # version in the key of a report that has weights: 3 has compressed files, 4 origins
 # MB of a study's weights, at most, since every clone of the repository downloads them
 MAX_MEGABYTES = 25
 MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
@@ -55,13 +55,14 @@ class WeightsTooLargeError(VehestError):
 
 @dataclass(frozen=True)
 class PublishedModel:
-    """What a training wrote beside its weights, which are the tensors ``KEY/NAME`` of the file."""
+    """Record of a training beside its weights, which are the tensors ``KEY/NAME`` of the file."""
 
     label: str  # name of the training
     code: str  # version of the training
-    digest: str  # of the training's artefact
+    digest: str  # digest of the training's artefact
     origin: str = ""  # the training's key with the origins of its recordings; empty: not known
-    files: dict[str, str] = field(default_factory=dict)  # of `FILES` -> content, `compressed`
+    # file of `FILES` -> its content, `compressed`
+    files: dict[str, str] = field(default_factory=dict)
 
 
 class PublishedWeights:

@@ -32,7 +32,6 @@ ENTRY_POINTS = "vehest.sources"  # group of the entry points by which other pack
 # endings of files that are no tables
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")  # endings of files of spreadsheets
-# key of a recording's provenance: transforms of its data set, and where its channels were measured
 SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
@@ -183,9 +182,7 @@ class Source(ABC):
     options: Any
     version: ClassVar[str] = "1"
     # whether a recording takes so long that each is kept as soon as it is made
-    slow: ClassVar[bool] = (
-        False  # whether a recording takes so long that each is kept as soon as it is made
-    )
+    slow: ClassVar[bool] = False
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)

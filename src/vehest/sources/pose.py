@@ -25,9 +25,7 @@ class PoseOptions:
     window: int = 9  # length of the Savitzky-Golay filter [samples]
     order: int = 2  # order of its polynomial
     # distance from the rigid body's origin forward to the reference point, in the car's axes [m]
-    lever_x: float = (
-        0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
-    )
+    lever_x: float = 0.0
     lever_y: float = 0.0  # distance to the left [m]
     channels: tuple[PoseChannel, ...] = POSE_CHANNELS  # reference channels that are made
 

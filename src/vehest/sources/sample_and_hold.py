@@ -30,11 +30,7 @@ class SampleAndHold:
     )
     # time by which a sample first stands in a row later than it was taken [s], of all channels, or
     # by channel
-    delay: float | dict[str, float] = (
-        # how much later than it was taken a sample first stands in a row [s], of all channels or
-        # some
-        0.0
-    )
+    delay: float | dict[str, float] = 0.0
 
     @property
     def delays(self) -> dict[str, float]:

@@ -28,9 +28,7 @@ class TablePose(PoseOptions):
     y: Column  # likewise for y
     yaw: Column  # column of the yaw angle and its unit
     # angle from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
-    yaw_offset: float = (
-        0.0  # from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
-    )
+    yaw_offset: float = 0.0
 
     @property
     def columns(self) -> dict[str, Column]:

@@ -21,8 +21,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
 OUTLIER = 8.0  # robust standard deviations of a residual beyond which its row is left out
-# of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no
-# noise
+# smallest standard deviation of a channel's innovation, over that of the channel; it keeps S
+# regular where a simulation has no noise
 MIN_DEVIATION = 1e-7
 # smallest and largest noise at a speed over that of all speeds
 NOISE_FACTORS = (0.2, 5.0)

@@ -54,7 +54,7 @@ MIN_BLOCK_SECONDS = 2.0  # s; a turn that starts sooner after the last one belon
 DOMAIN_QUANTILE = 0.999  # quantile of a term's size in training, beyond which bands widen
 OTHER_VEHICLE = 2.0  # factor by which a band is wider on another car or tyre
 LOWEST_SPEED = 1.0  # m/s, below which β is not resolved
-MIN_RELATIVE_SCALE = 0.1  # of the root mean square error in training: the scale's floor
+MIN_RELATIVE_SCALE = 0.1  # smallest scale over the root mean square error in training
 N_FITS = 20  # iterations of the scale's reweighted least squares, at most
 
 COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")  # input channels of which terms are formed
@@ -63,13 +63,14 @@ TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
 vx². ``variance`` is P.
 """
 
-MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
+MAX_FACTOR = 1e6  # largest factor and floor; beyond it a band says nothing
 MIN_TERM = 1e-30  # smallest size of a term in training that is not 0, in a file
 MAX_TERM = 1e12  # largest size or weight of a term, in a file
-FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
+FIRST_FEATURE = TERMS.index("vx")  # index of the first term that has a domain
 HEAD_LENGTH = 7  # numbers before the weights in a `PackedBands`
 
-Blocks = Literal["range", "turn"]  # what counts as one block of dependent scores
+# kind of blocks of dependent scores: ranges, or segments from turn to turn
+Blocks = Literal["range", "turn"]
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,7 @@ class Quantity:
     weights: dict[str, float]
     floor: float  # smallest s [m/s, or rad]
     factors: tuple[float, ...]  # q of each level, in the order of `LEVELS`
-    # of each level, whether there are too few blocks for it (`pooled_quantile`)
-    beyond: tuple[bool, ...]
+    beyond: tuple[bool, ...]  # whether there are too few blocks for each level (`pooled_quantile`)
     effective_blocks: float  # Kish's effective number of blocks, by the squared scores
 
     def __post_init__(self) -> None:
@@ -128,7 +128,8 @@ class Bands:
     vy: Quantity  # band of v
     sideslip: Quantity  # band of β
     cars: tuple[CarValues, ...] = ()  # values of the vehicles, as far as their data sets have any
-    tyre_check: TyreCheck | None = None  # of the estimator's tyre model; None: it has none
+    # tyre check of the estimator's tyre model; None: it has none
+    tyre_check: TyreCheck | None = None
 
     def __post_init__(self) -> None:
         """Raise `DataError` for unknown channels or numbers out of range."""
@@ -377,13 +378,14 @@ class Piece:
 
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]
-    variance: FloatArray  # of its error, (T,) [m²/s²], NaN where there is none
+    variance: FloatArray  # variance of the estimate's error, (T,) [m²/s²], NaN where there is none
     # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, which leaves the sample
     # out of the calibration
     errors: FloatArray
     yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
-    rate_hz: float  # of the samples [Hz]
-    tyre_error: FloatArray | None = None  # of the tyre check, (T,) [m²/s²]; None without one
+    rate_hz: float  # sampling rate [Hz]
+    # squared error by the tyre check, (T,) [m²/s²]; None without one
+    tyre_error: FloatArray | None = None
 
     @property
     def has_error(self) -> NDArray[np.bool_]:

@@ -22,14 +22,15 @@ from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
 from vehest.trust.tyre_check import tyre_check_of
 
-SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
+SKIP_SECONDS = 1.5  # s at the start of each range that are not scored, as in evaluations
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRange:
     """A range of a recording that calibrates a model, with the part of the recording before it."""
 
-    # at the model's rate, with references, and with a warm-up before the range where it has one
+    # recording at the model's rate, with references, and with a warm-up before the range where it
+    # has one
     recording: Recording
     start: float  # time at which the range starts [s]
     dataset: str  # data set of the recording; may be empty

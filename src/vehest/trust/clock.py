@@ -16,10 +16,10 @@ import numpy as np
 
 from vehest.trust.guard import BRIDGED_SECONDS
 
-# of stamps that do not advance or are uneven, after which the clock is not trusted
+# s of stamps that do not advance or are uneven, after which the clock is not trusted
 FAULT_SECONDS = 0.2
-RECOVERY_SECONDS = 1.0  # of even stamps, after which it is trusted again
-RESET_SECONDS = 1.0  # by which a stamp lies before the last one where the clock has been set back
+RECOVERY_SECONDS = 1.0  # s of even stamps after which the clock is trusted again
+RESET_SECONDS = 1.0  # s by which a stamp lies before the last one where the clock was set back
 MIN_ADVANCE = 0.5  # sampling intervals; a stamp that is ahead by less repeats the last sample
 EVEN_INTERVALS = (0.6, 1.6)  # sampling intervals from one stamp to the next that jitter explains
 RATE_INTERVALS = 20  # first intervals, whose median is compared with the expected interval

@@ -192,6 +192,10 @@ class GuardedRun:
             reach = min(start + 2 * (reach - start), end)
 
     def _watched(self, start: int, end: int, raw: FloatArray) -> tuple[int, bool]:
+        """Judge raw estimates of the rows ``start`` to ``end`` by the watch and keep what it
+        leaves; returns the end of the rows that were judged, and whether the estimator was lost
+        there.
+        """
         motion = self.motion[start:end]
         motion = np.where(
             np.isnan(motion),

@@ -25,16 +25,16 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import CHANNELS, Channel
 from vehest.data.errors import ConfigurationError
 
-Severity = Literal["mild", "medium", "severe"]
-SEVERITIES: tuple[Severity, ...] = get_args(Severity)
+Severity = Literal["mild", "medium", "severe"]  # severity of a fault, by which its size is chosen
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # severities in ascending order
 
-Sizes = tuple[float, float, float]  # of a mild, a medium and a severe fault
+Sizes = tuple[float, float, float]  # sizes of a mild, a medium and a severe fault
 
 DEGREE = math.pi / 180.0  # rad
 PIECE_SECONDS = 0.2  # s, length of the pieces in which samples are lost
 LOSS_SECONDS = 0.2  # s until a wheel is locked or spins
-SPIKE_SHARE = 0.02  # of the samples, which are spikes
-HUGE_SHARE = 0.05  # of the samples, which are huge
+SPIKE_SHARE = 0.02  # share of the samples that are spikes
+HUGE_SHARE = 0.05  # share of the samples that are huge
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {
@@ -96,7 +96,7 @@ class Fault:
 
     kind: str  # one of `KINDS`
     channel: str  # never a reference
-    severity: Severity = "medium"  # which of the sizes in this module
+    severity: Severity = "medium"  # severity, by which one of the sizes in this module is chosen
     onset: float = 0.0  # time from the first sample to its start [s]
     duration: float = math.inf  # [s]; ``inf``: to the end
     seed: int = 0  # seed of all random draws of the fault
@@ -351,15 +351,15 @@ class Kind(NamedTuple):
     # mild, medium and severe size; or the factor that multiplies the channel's offsets; None: the
     # factors of a wrong unit
     sizes: Sizes | float | None
-    size_rule: str  # what a size of one's own must be, a key of `SIZE_RULES`
+    size_rule: str  # requirement of a size of one's own, a key of `SIZE_RULES`
     effect: Callable[[FaultedChannel], FloatArray]  # returns the values that replace ``inside``
 
 
 # requirements of a size of one's own, as messages state them
 ANY = "a number other than 0"
-SHARE = "a share above 0, up to 1"
-POSITIVE = "a positive number"
-FACTOR = "a factor from 0 on"
+SHARE = "a share above 0, up to 1"  # requirement of a size that is a share
+POSITIVE = "a positive number"  # requirement of a size that is positive
+FACTOR = "a factor from 0 on"  # requirement of a size that is a factor
 SIZE_RULES: dict[str, Callable[[float], bool]] = {
     ANY: lambda size: math.isfinite(size) and size != 0,
     SHARE: lambda size: 0 < size <= 1,

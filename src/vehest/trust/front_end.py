@@ -21,10 +21,11 @@ from vehest.data.recording import HIGHEST_RATE
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
-FILTER_ORDER = 4  # of the Butterworth low-pass
+FILTER_ORDER = 4  # order of the Butterworth low-pass
 CUTOFF = 0.4  # cut-off as a share of the estimator's rate, below its Nyquist frequency
-NOISE_BAND = (0.3, 0.4)  # of the model's rate, where the density of a channel's noise is taken
-TYPICAL_RATE_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
+# band in which the density of a channel's noise is taken, over the model's rate
+NOISE_BAND = (0.3, 0.4)
+TYPICAL_RATE_RATIO = 5  # rate of a bus over that of a model, as 100 to 20 Hz
 SLACK = 1e-9  # relative; within it rates are equal, and a sample is due
 
 

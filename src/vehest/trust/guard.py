@@ -33,8 +33,9 @@ PERSISTS_SECONDS = 0.1  # a jump is accepted once its new level has lasted this 
 MAX_OVER_TRAINING = 3.0  # times the largest value in training that counts as plausible
 MAX_RUN_SECONDS = 5.0  # s; a channel that stood still for longer in training has no limit
 MIN_RUN_SECONDS = 0.3  # s, smallest limit of the time for which a channel may stand still
-STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
-NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
+# largest change of a steering angle that stays where it is, over the largest angle
+STOP_TOLERANCE = 2e-3
+NEAR_STOP = 0.9  # smallest angle at which the steering may be at its stop, over the largest angle
 
 CAR_LIMITS = {
     "m/s²": (25.0, 200.0, 6.0),
@@ -59,16 +60,17 @@ STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steerin
 ENDLESS = 1e300  # absolute value of the stops of channels that have none
 
 MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that calibration allows
-TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
-MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that calibration allows
+TAN_MARGIN = 1.2  # largest |v|/max(u, 1 m/s) over that in training
+# largest limit of |v|/max(u, 1 m/s) that a calibration may have
+MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high
 
 STANDSTILL_SPEED = 0.5  # m/s
 STANDSTILL_YAW_RATE = 0.05  # rad/s; below both, nothing is expected to move
 
 # What an estimator does with a row (`Cleaned.flow`).
-USE = 0  # it continues with the row
-WAIT = 1  # it skips the row, since too much is missing
-RESTART = 2  # it starts anew with the row
+USE = 0  # flow of a row with which the estimator continues
+WAIT = 1  # flow of a row that the estimator skips, since too much is missing
+RESTART = 2  # flow of a row with which the estimator starts anew
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class GuardLimits:
     """Limits of plausible values of each channel, for `Guard`, and of the estimate, for `Watch`."""
 
     channels: Mapping[str, ChannelLimits] = field(default_factory=dict)  # name -> limits
-    top_speed: float = 140.0  # that the car reaches [m/s]
+    top_speed: float = 140.0  # largest speed that the car reaches [m/s]
     # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
     largest_tan_sideslip: float = 1.0
 
@@ -287,7 +289,7 @@ class Cleaned(NamedTuple):
     # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is
     # `WAIT`
     rows: FloatArray
-    measured: NDArray[np.bool_]  # which values were accepted, (T, C)
+    measured: NDArray[np.bool_]  # whether values were accepted, (T, C)
     flow: NDArray[np.int8]  # `USE`, `WAIT` or `RESTART` at each row, (T,)
 
 

@@ -53,8 +53,8 @@ from vehest.trust.relations import (
 
 # status of an estimate, as the channel ``health`` has it
 VALID = 0
-DEGRADED = 1
-INVALID = 2
+DEGRADED = 1  # code of health of a degraded sample
+INVALID = 2  # code of health of an invalid sample
 
 HOLD_SECONDS = 1.0  # s for which a flag is held after the last statistic fell below its limit
 BRIDGED_SECONDS = 0.5  # s; a channel that is missing for longer makes the estimate invalid
@@ -67,27 +67,32 @@ BRAKING_SECONDS = 0.2  # ax, by which a wheel that stands is locked or lost
 ENERGY_SECONDS = 0.5  # energy of the innovations before a jump
 OFFSET_SECONDS = 4.0  # evidence of an offset in a channel
 RELATION_SECONDS = 1.0  # residual of a relation
-SHORT_SECONDS = 0.25  # both sides of a relation, before their signs and sizes are compared
+# time constant of the means of both sides of a relation, before their signs and sizes are compared
+SHORT_SECONDS = 0.25
 
 # Limits from healthy drives.
 BLOCK_SECONDS = 5.0  # limits are set by the largest value in each block of this length
 HOURS_BETWEEN_FALSE_ALARMS = 100.0  # healthy driving in which a limit is exceeded about once
 DAY_TO_DAY_FACTOR = 1.25  # tyres, track and wind of another day may raise a statistic by this
-MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, that a drive of any length counts for
+# smallest number of independent values of a statistic for which a drive counts
+MIN_INDEPENDENT_VALUES = 10.0
 MIN_RUN_SAMPLES = 4.0  # equal samples in a row: smallest limit
 MIN_REPEATED_SHARE = 0.3  # share of equal samples: smallest limit
 MIN_LIMITS = {"normal": 4.5, "slip": 0.3, "largest": 0.0}
 """`Statistic.rule` -> smallest limit; statistics of ``normal`` are N(0, 1) without a fault."""
 OUTLIER_FACTOR = 2.0  # a block that exceeds the next largest by this is a fault of the recording
-MAX_OUTLIER_SHARE = 0.01  # of the blocks, which are set aside as such faults at most
+MAX_OUTLIER_SHARE = 0.01  # largest share of the blocks that are set aside as such faults
 # yaw rate and vx·yaw_rate over their largest values in training, beyond which a car spins
 SPIN_MARGIN = 1.3
-MAX_RELATIVE_WEIGHT = 5.0  # of one sample in a likelihood ratio, over the mean weight
+# largest weight of one sample in a likelihood ratio, over the mean weight
+MAX_RELATIVE_WEIGHT = 5.0
 STANDSTILL_LIMITS = {"yaw_rate": 0.05, "ay": 0.5}
 """Channel -> value below which the car may be at standstill [rad/s, m/s²]."""
 
 MAX_ORDER = 10  # samples that the autoregression looks back at most
-MAX_COEFFICIENTS = 700  # of the autoregression, which limits its order for the time of a step
+# largest number of coefficients of the autoregression, which limits its order for the time of a
+# step
+MAX_COEFFICIENTS = 700
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 """Channels of the autoregression, besides wheel speeds.
@@ -177,7 +182,7 @@ class HealthModel:
     Numbers of channels are in the channels' units.
     """
 
-    channels: tuple[str, ...]  # in the order of the rows' columns
+    channels: tuple[str, ...]  # names of the channels, in the order of the rows' columns
     rate_hz: float  # sampling rate of the rows [Hz]
     relations: tuple[Relation, ...]  # relations between channels that were fitted
     constant: tuple[float, ...]  # constant c of the autoregression, (C,)
@@ -447,7 +452,7 @@ def health_rows(
     return Health(*out)
 
 
-_NO_STATISTICS = np.empty((0, 0))  # for `health_kernel` where statistics are not needed
+_NO_STATISTICS = np.empty((0, 0))  # empty statistics, for `health_kernel` where they are not needed
 
 
 def compile_health(*_: object) -> None:

@@ -54,12 +54,13 @@ SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
 REVERSED = -0.5  # correlation below which a relation has the wrong sign
 HOLDS = 0.7  # correlation above which a relation holds
-SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
+SLIDE_SECONDS = 4.0  # s for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
-INSTANT_FEATURES = 6  # that relations which hold for each sample may use
-FIRST_SMALL = 9  # of features: those of drag, which say nothing of signs and units
-N_FEATURES = 13  # this and the next two stand as digits in the shapes below
+INSTANT_FEATURES = 6  # number of first features that relations which hold for each sample may use
+# index of the first small feature: those of drag, which say nothing of signs and units
+FIRST_SMALL = 9
+N_FEATURES = 13  # number of features; this and the next two stand as digits in the shapes below
 N_LEVELS = 5  # speeds at which the noise is known
 
 (
@@ -113,12 +114,13 @@ class Settings(NamedTuple):
     step: float  # sampling interval [s]
     spin_yaw_rate: float  # yaw rate beyond which the car may spin [rad/s]
     spin_turning: float  # yaw rate times speed beyond which it may spin
-    forget_share: float  # of the share of equal samples
-    forget_ax: float  # of ax
-    forget_energy: float  # of the innovations' energy
-    forget_offset: float  # of the likelihood ratio of an offset; 0: it does not forget
-    forget_short: float  # of relations, for signs and units
-    forget_relation: float  # of the residuals of relations
+    forget_share: float  # forgetting factor of the share of equal samples
+    forget_ax: float  # forgetting factor of the mean of ax
+    forget_energy: float  # forgetting factor of the innovations' energy
+    # forgetting factor of the likelihood ratio of an offset; 0: it does not forget
+    forget_offset: float
+    forget_short: float  # forgetting factor of the sides of relations, for signs and units
+    forget_relation: float  # forgetting factor of the residuals of relations
 
 
 class Statistics(NamedTuple):
@@ -132,7 +134,7 @@ class Statistics(NamedTuple):
     step: Annotated[FloatArray, "channels"]  # likelihood ratio of a step that began p samples ago
     offset: Annotated[FloatArray, "channels"]  # likelihood ratio
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
-    share: Annotated[FloatArray, "channels"]  # of equal samples
+    share: Annotated[FloatArray, "channels"]  # share of equal samples
     domain: Annotated[FloatArray, "channels"]  # size over the largest in training
     slip: Annotated[FloatArray, "channels"]  # |slip| of a wheel; 0 for other channels
     relation: Annotated[FloatArray, "relations"]  # |mean residual| of a relation
@@ -152,10 +154,10 @@ class Model(NamedTuple):
     deviation: Annotated[FloatArray, "channels"]  # standard deviation of the innovations
     instant: Annotated[FloatArray, "channels 13"]  # W
     average: Annotated[FloatArray, "relations 13"]  # coefficients of relations
-    rate_gain: Annotated[FloatArray, "relations"]  # of du/dt in them
+    rate_gain: Annotated[FloatArray, "relations"]  # gain of du/dt in each relation
     usual: Annotated[FloatArray, "channels"]  # medians
     largest: Annotated[FloatArray, "channels"]  # largest absolute value in training
-    speeds: Annotated[FloatArray, "5"]  # at which noise levels are given, rising
+    speeds: Annotated[FloatArray, "5"]  # speeds at which noise levels are given, ascending
     levels: Annotated[FloatArray, "5 channels"]  # noise at these speeds
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
     # weight of a former innovation in q on a step in m [lag, m, q]
@@ -169,9 +171,9 @@ class Model(NamedTuple):
     limits: Statistics  # limit of each statistic
     inverse: Statistics  # 1 over the limit
     modelled: Annotated[IntArray, "channels"]  # whether the autoregression holds the channel
-    rests: Annotated[IntArray, "channels"]  # whether it may stand still while the car moves
+    rests: Annotated[IntArray, "channels"]  # whether a channel may stand still while the car moves
     gap_limit: Annotated[IntArray, "channels"]  # longest gap in training [rows]
-    wheel: Annotated[IntArray, "channels"]  # whether it is a wheel's speed
+    wheel: Annotated[IntArray, "channels"]  # whether a channel is a wheel's speed
     code: Annotated[IntArray, "channels"]  # number of the channel in a reason's code
     target: Annotated[IntArray, "relations"]  # column that a relation explains
     versus: Annotated[IntArray, "relations"]  # column that it is held against
@@ -198,7 +200,7 @@ class State(NamedTuple):
     # rows without a sample; below zero while predictions settle again
     gap: Annotated[FloatArray, "channels"]
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
-    share: Annotated[FloatArray, "channels"]  # of equal samples
+    share: Annotated[FloatArray, "channels"]  # share of equal samples
     past_y: Annotated[FloatArray, "order channels"]  # y of the last p rows, the latest first
     innovation: Annotated[FloatArray, "order channels"]  # clipped ε of the last p rows
     energy: Annotated[FloatArray, "channels"]  # mean square of the innovations over deviation²
@@ -210,8 +212,8 @@ class State(NamedTuple):
     smooth: Annotated[FloatArray, "relations"]  # short mean of the target
     # long means of observed target times expected target, and of the squares of both
     product: Annotated[FloatArray, "relations"]
-    expected_power: Annotated[FloatArray, "relations"]
-    observed_power: Annotated[FloatArray, "relations"]
+    expected_power: Annotated[FloatArray, "relations"]  # mean square of the expected side
+    observed_power: Annotated[FloatArray, "relations"]  # mean square of the observed side
     x: Annotated[FloatArray, "channels"]  # present values, of which the last replaces a missing one
     y: Annotated[FloatArray, "channels"]  # x - W φ(x)
     error: Annotated[FloatArray, "channels"]  # ε

@@ -29,7 +29,7 @@ class About:
 
     estimator: str  # name in the registry
     variant: str = ""  # the paper's name of the configuration
-    note: str = ""  # why something is missing, for people; empty where nothing is
+    note: str = ""  # text on why something is missing; empty where nothing is
     model: str = ""  # digest of the model beside which it is kept; empty in a folder of its own
 
 

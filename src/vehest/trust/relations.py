@@ -43,6 +43,7 @@ SPEEDS = (
 )
 """Channels that can serve as the speed u; the first that is there does."""
 
+# names of the terms of relations
 FEATURES = (
     "1",
     "r",
@@ -61,6 +62,7 @@ FEATURES = (
 RATE = "du/dt"  # term that is a rate of change, and no feature of one sample
 SIDESLIP_DRAG = "v r"  # feature: ax by the lateral velocity in a turn
 DRAG = ("r²", "u²", SIDESLIP_DRAG)  # small features of ax, which say nothing of its sign and unit
+# term -> symbols of the quantities in it
 _SYMBOLS = dict(
     zip(
         FEATURES,
@@ -86,7 +88,7 @@ _SYMBOLS[RATE] = "u"
 
 LOW_PASS_SECONDS = 0.5  # s, time constant of the low-pass of both sides of a relation
 HUBER = 1.5  # robust standard deviations, beyond which a residual weighs less
-MIN_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
+MIN_SPEED_SHARE = 0.1  # speed over the median speed below which angles say little
 MIN_ROWS = 50  # samples; with fewer a relation is left out, and glitches are not looked for
 
 
@@ -100,7 +102,7 @@ class Relation:
     partner: str  # channel that is named as the other side in messages
     # feature, or `RATE`, -> coefficient; the target's units over the feature's
     terms: dict[str, float] = field(default_factory=dict)
-    instant: bool = False  # whether it holds for each sample and not only on average
+    instant: bool = False  # whether the relation holds for each sample, not only on average
 
     def __post_init__(self) -> None:
         """Raise `DataError` for a term that is unknown, or not available at each instant."""

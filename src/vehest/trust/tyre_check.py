@@ -29,7 +29,8 @@ FRICTION_SLIP = 0.05
 Chosen on simulated tyres (docs/learned_ukf.md, "Bands on other tyres").
 """
 GAUSSIAN_90 = 1.6448536269514722  # half width of 90 % of a Gaussian, in standard deviations
-# of the tyre term in the squared scales; larger ones are cut off, or refused in a file
+# largest weight of the tyre term in the squared scales; larger ones are cut off, or refused in a
+# file
 MAX_WEIGHT = 1e12
 
 

@@ -109,7 +109,7 @@ SIDESLIP_RANGE = (0.01, 1.0)  # rad, smallest and largest width of 96 % of a sid
 # largest share of samples outside the possible range that may be spikes
 MAX_IMPOSSIBLE_SHARE = 0.002
 # channel -> range of its 99th percentile in cars, SI units
-USUAL_MAGNITUDES = {  # 99th percentile, SI units
+USUAL_MAGNITUDES = {
     "vx": (1.0, 90.0),
     "yaw_rate": (0.03, 3.0),
     "ay": (0.5, 25.0),

@@ -40,7 +40,7 @@ _LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz](?= \w+$|$)")
 MIN_LEVELS = 9  # smallest number of values that a motion takes; a gear or a flag takes fewer
 
 # channel -> units that are tried where the header states none, the likeliest first
-UNITS = {  # where the header is silent, the likeliest first
+UNITS = {
     "vx": ("m/s", "km/h", "mph", "knots"),
     "yaw_rate": ("rad/s", "deg/s"),
     "ay": ("m/s²", "g"),
@@ -51,7 +51,7 @@ UNITS = {  # where the header is silent, the likeliest first
     "sideslip_ref": ("rad", "deg"),
 }
 # channel -> units of loggers that write whole numbers, tried where the others explain nothing
-RARE_UNITS = {  # of loggers that write whole numbers; tried where the others explain nothing
+RARE_UNITS = {
     "vx": ("cm/s", "mm/s", "ft/s", "0.01*km/h"),
     "yaw_rate": ("mrad/s", "mdeg/s", "0.1*deg/s", "0.01*deg/s"),
     "ay": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),

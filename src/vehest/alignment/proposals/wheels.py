@@ -33,7 +33,7 @@ MAX_MODEL_SPEED = 20.0  # m/s, highest speed of the wheels of a model
 MAX_SPEED = 110.0  # m/s, highest top speed; a unit that gives a higher one is implausible
 MIN_TOP_SPEED = 1.0  # m/s, lowest top speed; a unit that gives a lower one is implausible
 # unit that is tried where the header states none -> its cost; a rare one only if no other fits
-UNIT_PENALTIES = {  # of units tried where the header is silent; a rare one only if no other fits
+UNIT_PENALTIES = {
     **dict.fromkeys(("km/h", "m/s", "rpm", "rad/s"), 0.0),
     "mph": 0.2,
     **dict.fromkeys(("cm/s", "mm/s", "ft/s", "0.01*km/h", "rev/s", "deg/s"), 1.0),

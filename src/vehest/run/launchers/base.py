@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher
     from vehest.run.launchers.local import LocalLauncher
 
-    Launcher = LocalLauncher | RayLauncher | SlurmLauncher
+    Launcher = LocalLauncher | RayLauncher | SlurmLauncher  # any of the launchers
 
 LAUNCHERS = ("local", "ray", "slurm")  # names of the launchers
 
@@ -28,7 +28,7 @@ class RunOptions:
     """Options of a command that runs stages, as `vehest run --help` describes them."""
 
     force: bool = False  # run stages although their artefacts exist
-    dry_run: bool = False  # only print what would be done
+    dry_run: bool = False  # whether what would be done is only printed
     quiet: bool = False  # print warnings alone
     jobs: int | None = None  # processes; None: one for each core
     track: bool = False  # log runs to MLflow

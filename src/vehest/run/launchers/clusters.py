@@ -39,6 +39,7 @@ from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
 MAX_ATTEMPTS = 3  # attempts at a group whose tasks end without a report
+# environment variables of Ray -> values that hold unless the user sets others
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",

@@ -48,7 +48,7 @@ class Done:
     """Outcome of a task, and the artefacts that it made which are not in the output root yet."""
 
     position: int  # index of the task
-    outcome: Any  # what the task returned, or a `Failure`
+    outcome: Any  # result of the task, or a `Failure`
     # folder of an artefact -> its files, where machines do not share the output root
     made: Files = field(default_factory=dict)
 

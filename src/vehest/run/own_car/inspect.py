@@ -84,7 +84,7 @@ class Examined:
     name: str  # name of the data set
     files: tuple[Path, ...]  # files, in the order of the command
     logs: tuple[Log, ...]  # the longest first; its layout is that of all
-    proposals: Proposals  # for all logs
+    proposals: Proposals  # proposals for all logs
     place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
     rate_hz: float | None  # sampling rate of logs without times; else None
     vehicle: Mapping[str, float | None]  # values of `VEHICLE` and `IMU_PLACE`, None where unknown

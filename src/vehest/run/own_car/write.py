@@ -152,9 +152,7 @@ def registered(word: str) -> str:
 
 
 def _without_settings_file(name: str) -> str:
-    """What an estimator of another package lacks if it has no file in conf/estimator; else
-    empty.
-    """
+    """Text on an estimator of another package that has no file in conf/estimator; else empty."""
     return (
         f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a "
         "line a setting"
@@ -482,7 +480,9 @@ def _lack(
     samples: int,
     seconds: float,
 ) -> tuple[str, tuple[str, ...]]:
-    """What an estimator lacks, empty if nothing, and overrides with which it lacks no channel."""
+    """Text on what an estimator lacks, empty if nothing, and overrides with which it lacks no
+    channel.
+    """
     if name not in choices("estimator"):
         config: Config = {"estimator": {"name": name}, "training": {}}
         reason = usability(name, config, contents).to_give or _without_settings_file(name)

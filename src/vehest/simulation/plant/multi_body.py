@@ -70,8 +70,6 @@ MIRRORED = (
     0,
     3,
     2,
-    # the library's left front, right front, left rear and right rear wheel in the order of
-    # motion.WHEELS
 )
 
 # quantity -> its index in the state vector

@@ -7,11 +7,7 @@ from dataclasses import dataclass
 
 # length [m] of a segment along which curvature and bank are linear, then curvature [1/m] and bank
 # [rad] at its end
-Piece = tuple[
-    float, float, float
-    # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are
-    # linear
-]
+Piece = tuple[float, float, float]
 
 
 @dataclass(frozen=True)

@@ -22,20 +22,14 @@ class Topic:
     # whose time stamps are used: those of the messages' headers, or those of the bag
     stamps: Literal["header", "received"] = "header"
     # whether the stamps are the times, or the even clock behind them
-    clock: Literal["stamps", "uniform"] = (
-        "stamps"  # the stamps themselves, or the even clock behind them
-    )
+    clock: Literal["stamps", "uniform"] = "stamps"
     rate_hz: Positive | None = None  # nominal rate of a uniform clock [Hz]
     max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
     delay: float = 0.0  # time by which the stamps are later than the samples [s]
     # whether samples are interpolated, or hold until the next one, as commands do
-    interpolation: Literal["linear", "hold"] = (
-        "linear"  # hold: for commands that stand until the next one
-    )
+    interpolation: Literal["linear", "hold"] = "linear"
     # width of a centred moving average before interpolation [s]; 0: none
-    average: Annotated[float, Field(ge=0.0, le=10.0)] = (
-        0.0  # width of a centred moving average before interpolation [s]; 0 for none
-    )
+    average: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:

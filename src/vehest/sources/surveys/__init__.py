@@ -42,7 +42,7 @@ IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")
 MOST_FIELDS = 60  # largest number of numbers in a message
 MAX_LATENESS = 5.0  # s, longest time from a header's stamp to the message's reception
 # type of message -> field -> unit, of ROS's own types by REP 103
-UNITS = {  # of ROS's own types, REP 103
+UNITS = {
     "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
     "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
     "geometry_msgs/msg/TwistStamped": {"twist.linear": "m/s", "twist.angular": "rad/s"},

@@ -53,7 +53,7 @@ SPELLINGS = {
     spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
 # name of a column of parts of seconds, beside one of whole seconds -> their unit
-PARTS_OF_SECONDS = {  # names of columns that hold them, beside columns of whole seconds
+PARTS_OF_SECONDS = {
     name: unit
     for unit, names in {
         "ms": "ms msec millis millisec millisecond milliseconds millisekunden",
@@ -73,12 +73,12 @@ FEWEST_STEPS = 5.0  # smallest length of such a gap, in typical steps
 FARTHEST_ROW = 100  # largest number of rows by which one may be out of order, to be sorted
 TIME_FACTORS = (1, 1e3, 1e6, 1e9)  # units per second of times
 # possible periods of times that begin anew: of a minute … a GPS week
-PERIODS = {  # of a minute … a GPS week
+PERIODS = {
     period * factor for period in (60.0, 3600.0, 86_400.0, 604_800.0) for factor in TIME_FACTORS
 }
 # counts at which counters may wrap, also as fractions of a second; of a second, a minute … a GPS
 # week
-MODULI = (  # of counters, also as fractions of a second; of a second, a minute … a GPS week
+MODULI = (
     *(2.0**bits * factor for bits in (*range(8, 17), 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
     *TIME_FACTORS,
     *sorted(PERIODS),

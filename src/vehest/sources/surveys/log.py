@@ -21,9 +21,7 @@ class RawColumn:
     # entry by which a data set names it, such as ``{"column": "Gyro"}``
     place: Mapping[str, Any]
     # times of its samples [s], (N,); None where the log has one clock for all
-    stamps: FloatArray | None = (
-        None  # its own times [s], (N,); None where the log has one clock for all
-    )
+    stamps: FloatArray | None = None
     # whether the file says that the car measured it, on its bus, or the reference did; empty where
     # it does not
     device: Literal["", "car", "reference"] = ""
@@ -60,10 +58,7 @@ class Log:
     # options of the source, such as delimiter and decimal mark
     options: Mapping[str, Any] = field(default_factory=dict)
     # column of times; None where there is none, or where the format has times of its own
-    clock: Stamps | None = (
-        # column of its times; None where there is none, or where the format has times of its own
-        None
-    )
+    clock: Stamps | None = None
     seconds: FloatArray | None = (
         # times of the rows [s], (N,), from the clock; None where columns have their own or there is
         # no clock
