@@ -496,4 +496,4 @@ class EndToEnd:
         return f"{time:.2f} s of recording '{recording.id}'"
 
 
-ESTIMATOR = CnnUkf
+ESTIMATOR = CnnUkf  # class by which the registry finds the family

@@ -85,4 +85,4 @@ class DataSheet(Recursive):
         }
 
 
-ESTIMATOR = DataSheet
+ESTIMATOR = DataSheet  # class by which the registry finds the family

@@ -29,7 +29,7 @@ def rate(default: float) -> Any:
 class EstimatorSettings(Group):
     """Settings of every estimator."""
 
-    rate_hz: float = rate(100.0)
+    rate_hz: float = rate(100.0)  # rate of the estimates [Hz]
 
 
 class Trial(NamedTuple):
@@ -78,11 +78,12 @@ class Description(ABC):
     slow_kernel: ClassVar[str] = ""
     # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    # what is tried in the first comparison on a new car; none: the family is left out
+    # trials in the first comparison on a new car; none: the family is left out
     trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
     trace_note: ClassVar[str] = ""  # explains a conspicuous course of its traces, below figures
-    style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
+    # colour, dash and marker of its lines, see `line_style`; None: by its name
+    style: ClassVar[tuple[str, str, str] | None] = None
     # C template of a step, in ``export/templates/methods`` or beside the family's module; or empty
     template: ClassVar[str] = ""
     # raised when weights or estimates change; a version of ``training_type`` alone when the fit

@@ -370,4 +370,4 @@ class DugoffUkf(DugoffFilter):
         return {"network": False, **super().c_values(), **track_c_values(self)}
 
 
-ESTIMATOR = DugoffUkf
+ESTIMATOR = DugoffUkf  # class by which the registry finds the family

@@ -26,7 +26,7 @@ from vehest.training.sequences import PhaseSettings
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
 STARTS = ((-2.0, 2.0), (0.5, 1.5))  # ranges of p₁ and p₂ from which searches start
-ROUNDING = 1e-9  # by which a search may end beyond the box
+ROUNDING = 1e-9  # largest distance beyond the box at which a search may end
 MIN_SPREAD = 1e-12  # rad², of models that agree to the last digit
 VARIANCE_POWER_RANGE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
 
@@ -253,4 +253,4 @@ def scaled_variance(
     return least_variance + 10.0 ** np.clip(size, *VARIANCE_POWER_RANGE)
 
 
-ESTIMATOR = EnsembleUkf
+ESTIMATOR = EnsembleUkf  # class by which the registry finds the family

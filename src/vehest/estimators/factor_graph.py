@@ -245,4 +245,4 @@ class FactorGraph(SideslipFilter):
         return {}
 
 
-ESTIMATOR = FactorGraph
+ESTIMATOR = FactorGraph  # class by which the registry finds the family

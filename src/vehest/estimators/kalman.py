@@ -310,4 +310,4 @@ class KalmanFilter(SideslipFilter):
         }
 
 
-ESTIMATOR = KalmanFilter
+ESTIMATOR = KalmanFilter  # class by which the registry finds the family

@@ -98,4 +98,4 @@ class Kinematic(Recursive):
         }
 
 
-ESTIMATOR = Kinematic
+ESTIMATOR = Kinematic  # class by which the registry finds the family

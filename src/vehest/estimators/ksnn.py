@@ -163,4 +163,4 @@ class Ksnn(WindowedEstimator):
         )
 
 
-ESTIMATOR = Ksnn
+ESTIMATOR = Ksnn  # class by which the registry finds the family

@@ -137,6 +137,7 @@ class LearnedUkf(CarFilterEstimator):
     slow_kernel = "vehest.estimators.kernels.planar_car:_transition"
     template = "learned_ukf"
     training_type = ThroughFilterSettings
+    # kind of the car's dynamics
     dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = (
         setting(
             "friction_tyre_network",
@@ -327,6 +328,7 @@ class LearnedUkf(CarFilterEstimator):
         )
 
     def _new_dynamics(self) -> Dynamics:
+        """New dynamics of the kind that the settings name, with initial values."""
         s = self.settings
         car = vars(s.car)
         width = s.width or (64 if "tyre" in s.dynamics else 256)
@@ -360,4 +362,4 @@ class LearnedUkf(CarFilterEstimator):
         }
 
 
-ESTIMATOR = LearnedUkf
+ESTIMATOR = LearnedUkf  # class by which the registry finds the family

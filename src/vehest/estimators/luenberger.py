@@ -165,4 +165,4 @@ class Luenberger(Recursive):
         return {**self.values, "step": 1.0 / self.rate_hz}
 
 
-ESTIMATOR = Luenberger
+ESTIMATOR = Luenberger  # class by which the registry finds the family

@@ -57,7 +57,7 @@ class About:
     trained_on: tuple[str, ...] = ()  # ranges of recordings that it was trained on
     validated_on: tuple[str, ...] = ()  # ranges on which the training was stopped early
     n_parameters: int | None = None  # number of fitted values; None: not stated
-    # how recordings were resampled to the model's rate
+    # resampling by which recordings were brought to the model's rate
     downsample: Preparation = field(default_factory=Preparation)
     interrupted: bool = False  # whether the training was stopped before its end
     note: str = ""  # remark for users on the model's estimates

@@ -88,4 +88,4 @@ class PriorMap(Recursive):
         return {"about": about, "b": self.b, "k": self.k}
 
 
-ESTIMATOR = PriorMap
+ESTIMATOR = PriorMap  # class by which the registry finds the family

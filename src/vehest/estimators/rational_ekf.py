@@ -64,7 +64,7 @@ from vehest.vehicle.tyre_track import TyreTrack
 
 # Noise levels where nothing is tuned (method=data): steer [rad/√s], tyres [1/√s].
 ASSUMED_LEVELS = {"steer": 0.02, "tyres": 0.003}
-NOISE_CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
+NOISE_CUTOFF = 0.2  # frequency above which signals count as noise, over the Nyquist frequency
 # Standard deviation of the logarithms of curves that are given, where no other is.
 DEFAULT_CURVE_DEVIATION = 0.1
 # Rounding of a covariance in a file, relative to its largest entry.
@@ -527,4 +527,4 @@ def _require_covariance(name: str, values: FloatArray) -> None:
         raise DataError(f"'{name}' is no covariance: it has the eigenvalue {lowest:g}")
 
 
-ESTIMATOR = RationalFilter
+ESTIMATOR = RationalFilter  # class by which the registry finds the family

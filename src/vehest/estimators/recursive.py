@@ -59,11 +59,11 @@ class Recursive(Estimator):
     returns the state after a sample, or its own `run`.
     """
 
-    training_type: ClassVar[type] = NoTraining
+    training_type: ClassVar[type] = NoTraining  # settings of the fit
     # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
     states: ClassVar[tuple[str, ...]] = ("vy",)
-    refuses: ClassVar[tuple[str, ...]] = ("NaN",)
-    step: ClassVar[Any]
+    refuses: ClassVar[tuple[str, ...]] = ("NaN",)  # measurements of a sample that are errors
+    step: ClassVar[Any]  # compiled step: numbers, state, sample -> state after the sample
     values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -40,7 +40,7 @@ from vehest.estimators.model_files import load_model
 
 WINDOW = 30  # samples in the window that the network reads
 NETWORK_HZ = 20.0  # Hz, rate of these samples
-NEGLIGIBLE_ODDS = 1e-300  # of a candidate that does not count
+NEGLIGIBLE_ODDS = 1e-300  # prior odds of a candidate that does not count
 UNMEASURED_AX_NOISE = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 
@@ -309,4 +309,4 @@ def _shipped_network() -> tuple[FloatArray, float]:
     return rows, float(weights["yaw_rate_max"])
 
 
-ESTIMATOR = SelfCalibrating
+ESTIMATOR = SelfCalibrating  # class by which the registry finds the family

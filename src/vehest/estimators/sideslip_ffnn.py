@@ -95,4 +95,4 @@ class SideslipFfnn(SampleNetworkEstimator):
         return self.network.c_values()
 
 
-ESTIMATOR = SideslipFfnn
+ESTIMATOR = SideslipFfnn  # class by which the registry finds the family

@@ -14,8 +14,8 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the regressors of the least squares; beyond it, speed hardly changes and the two numbers cannot
-# be identified separately
+# largest condition number of the regressors; beyond it, speed hardly changes and the two numbers
+# cannot be identified
 MAX_CONDITION_NUMBER = 1e8
 
 
@@ -81,4 +81,4 @@ class StaticMap(Recursive):
         }
 
 
-ESTIMATOR = StaticMap
+ESTIMATOR = StaticMap  # class by which the registry finds the family

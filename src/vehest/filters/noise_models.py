@@ -42,8 +42,8 @@ class ConstantNoise(nn.Module):
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
 
-    unit: Tensor
-    learnt: Tensor
+    unit: Tensor  # unit in which the entries of each row of the factor are learnt, (n,)
+    learnt: Tensor  # whether each entry of the factor is learnt, row by row
 
     def __init__(self, variances: Sequence[float], correlated: bool = True) -> None:
         super().__init__()
@@ -102,8 +102,8 @@ class StateDependentNoise(nn.Module):
     code.
     """
 
-    unit: Tensor
-    state_unit: Tensor
+    unit: Tensor  # unit in which the entries of each row of the factor are learnt, (n,)
+    state_unit: Tensor  # number by which each state is divided, (k,)
 
     def __init__(self, variances: Sequence[float], n_states: int, correlated: bool = True) -> None:
         super().__init__()

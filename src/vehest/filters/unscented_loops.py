@@ -53,9 +53,9 @@ class Tape(NamedTuple):
     """
 
     prior_mean: Any  # state before the measurement, (T, n, B)
-    prior_covariance: Any  # its covariance, (T, n, n, B)
+    prior_covariance: Any  # covariance of the prior, (T, n, n, B)
     post_mean: Any  # state after the measurement, (T, n, B)
-    post_covariance: Any  # its covariance, (T, n, n, B)
+    post_covariance: Any  # covariance of the posterior, (T, n, n, B)
     moved: Any  # sigma points after the transition, (T, S, n, B)
     expected: Any  # measurements expected at the points, (T, S, m, B)
     innovation: Any  # (T, m, B)

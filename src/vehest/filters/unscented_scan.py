@@ -51,7 +51,7 @@ from vehest.filters.unscented_steps import room
 
 MIN_EIGENVALUE_SHARE = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
-Array = NDArray[Any]
+Array = NDArray[Any]  # array of numbers of either precision
 Function = Callable[[Tensor, Tensor], Tensor]
 """Function of states (..., n) and inputs (..., p), whose leading dimensions are equal or broadcast:
 the transition f or the observation h.
@@ -338,7 +338,7 @@ def unscented_scan(
 
 
 class UnscentedStepper:
-    """The same filter of one sequence, one sample at a time.
+    """The unscented filter of one sequence, one sample at a time.
 
     Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
 

@@ -183,7 +183,7 @@ class PartArtefacts:
     about: str  # a paragraph on what is compared, from the pipeline file
     command: str  # the command that makes this report
     split: Split  # training, validation and test ranges
-    protocol: Protocol  # how estimates are scored
+    protocol: Protocol  # protocol by which estimates are scored
     kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
     data_titles: Mapping[str, str]  # data set -> title in the report
     # long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are
@@ -275,10 +275,10 @@ class StoredDataset:
     name: str  # name in conf/dataset
     title: str  # title in reports
     kind: str  # ``real`` or ``simulated``
-    config: Mapping[str, Any]  # its configuration, without texts
+    config: Mapping[str, Any]  # configuration of the data set, without texts
     files: Mapping[str, Path]  # recording -> Parquet file at the native rate
     licence: str = ""  # licence of the recordings
-    citation: str = ""  # what to cite
+    citation: str = ""  # work to cite
 
     def recordings(self) -> Iterator[Recording]:
         """All recordings, one at a time.
@@ -298,7 +298,7 @@ class AbsentDataset:
     name: str  # name in conf/dataset
     title: str  # title in reports
     licence: str  # licence of the recordings
-    citation: str  # what to cite
+    citation: str  # work to cite
 
 
 @dataclass(frozen=True)

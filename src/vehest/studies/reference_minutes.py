@@ -40,7 +40,7 @@ from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
 TAKES = "parts"  # what pipelines of this study name (`vehest.studies.registry`)
 VERSION = "2"  # raised where tables or figures change
-TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")  # of the report
+TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")  # file of the report's template
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")  # those of metrics.csv
 SCRATCH = "from scratch"  # start of a training that starts from no model
 COLUMNS = {
@@ -58,12 +58,14 @@ COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 
 The error with the most minutes, and their number, follow.
 """
+# caption of a figure, with places
 FIGURE_CAPTION = "{title}, test set `{test_set}`: RMSE(β) over the minutes of reference."
 FIGURE_NOTE = (
     "Minutes are those of recording with a reference for training and validation; bars are 95 % "
     "intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
 )
 """Note below every figure of a curve."""
+# caption of the overview
 OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
@@ -201,7 +203,7 @@ class Point:
     estimator: str  # name in the registry
     variant: str  # identifier of its configuration
     title: str  # name in tables and figures
-    start: str  # what its training starts from; `SCRATCH` for nothing
+    start: str  # start of its training; `SCRATCH` for nothing
     minutes: float  # recording time with reference for training and validation [min]
     n_trainings: int  # number of trainings: segments of the drive times seeds
 

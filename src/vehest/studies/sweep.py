@@ -37,8 +37,8 @@ DONE = "done"  # status of a job
 FAILED = "failed"  # status of a job
 MIN_RATIO_FOR_LOG = 20.0  # highest over lowest value, above which colours are logarithmic
 MAX_COLUMNS_SIDE_BY_SIDE = 6  # columns of a heat map; those with more are drawn below one another
-CELL_HEIGHT = 0.42  # in, height of a cell of a heat map
-NO_VALUE_COLOUR = "#ececec"  # of a cell without a value
+CELL_HEIGHT = 0.42  # height of a cell of a heat map, in
+NO_VALUE_COLOUR = "#ececec"  # colour of a cell without a value
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in the relative luminance
 Value = bool | int | float | str  # value of a setting
 Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
@@ -249,6 +249,7 @@ def override_text(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
+    """Whether a value is a number, and no truth value."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(
         value, bool | np.bool_
     )
@@ -380,6 +381,7 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
 
 
 def _kinds(artefacts: SweepArtefacts, name: str) -> str:
+    """Text on the kinds of the recordings of a test set, or of the validation range."""
     part = artefacts.part
     return part.kinds_of(part.split.validation if name == VALIDATION else part.split.tests[name])
 
@@ -423,6 +425,7 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
 
 
 def _describe_set(name: str) -> str:
+    """Text that names a test set."""
     return "the validation range" if name == VALIDATION else f"test set `{name}`"
 
 

@@ -43,23 +43,26 @@ from vehest.studies.kit.runs import titles_of
 from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 
 VERSION = "4"  # raised where tables or figures change
-TEMPLATE = Path(__file__).with_name("transfer.md.j2")  # of the report
+TEMPLATE = Path(__file__).with_name("transfer.md.j2")  # file of the report's template
 TAKES = "parts"  # what pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 MAX_PANEL_COLUMNS = 4  # panels side by side at most; further ones begin a row
 TITLE_WIDTH = 24  # characters of a line of a panel's title
-ROW_HEIGHT = 0.16  # in, height of an estimator
+ROW_HEIGHT = 0.16  # height of an estimator's row, in
 REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
 """Baselines, in the order in which tables list them first."""
+# caption of a figure, with places
 FIGURE_CAPTION = (
     "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an "
     "estimator is better than it. The vertical line in each row is the static map, whose two "
     "numbers are fitted on the same ranges."
 )
+# caption of the overview
 OVERVIEW_CAPTION = (
     "Number of tests on which an estimator is significantly better than each baseline, and its "
     "RMSE(β) over that of zero: median and highest over tests."
 )
+# caption of the table of errors
 ERRORS_CAPTION = (
     "RMSE(β) [deg] over all seeds. * significantly better than zero and the static map, corrected "
     "by Holm within the test. – lacks a channel, failed or has no finite error."

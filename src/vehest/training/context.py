@@ -10,7 +10,9 @@ from pathlib import Path
 
 from vehest.data.errors import DataError
 
-MAX_HALVINGS = 3  # of the step size, each after a divergence; then the training ends with its best
+# largest number of halvings of the step size, each after a divergence; then the training ends with
+# its best
+MAX_HALVINGS = 3
 
 
 @dataclass(frozen=True)

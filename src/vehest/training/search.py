@@ -45,9 +45,9 @@ class SearchRecord(NamedTuple):
     """Outcome of a direct search."""
 
     best: FloatArray  # parameters with the smallest cost, shape (K,)
-    cost: float  # that cost
+    cost: float  # cost at these values
     starts: FloatArray  # each start with the parameters and the cost it led to, shape (S, 2K + 1)
-    evaluations: int  # of the cost, in all
+    evaluations: int  # number of evaluations of the cost in all
     interrupted: bool  # before the last start
 
     def history(self, names: Sequence[str]) -> dict[str, list[float]]:

@@ -73,15 +73,15 @@ class Phase:
     epoch (order, offsets, masks of dropout) is drawn by ``batches``.
     """
 
-    name: str  # in messages and in the checkpoint; unique among the phases of a training
+    name: str  # name in messages and in the checkpoint; unique among the phases of a training
     settings: PhaseSettings  # step size, epochs, patience, clipping
-    module: nn.Module  # its parameters are changed in place
+    module: nn.Module  # module whose parameters are changed in place
     # returns the batches of one epoch; draws random numbers from the generator and from no other
     batches: Callable[[torch.Generator], Iterable[Any]]
     loss: Callable[[Any], Tensor]  # returns the loss of a batch, a scalar with a gradient
     # returns the loss on the validation data with the present parameters, without gradients
     validation: Callable[[], float]
-    # which parameters learn, by name, while the others are frozen; all if None
+    # whether a parameter of this name learns, while the others are frozen; None: all learn
     trainable: Callable[[str], bool] | None = None
     # called once before the first validation; may set parameters that this phase starts from
     prepare: Callable[[], None] | None = None
@@ -105,11 +105,12 @@ class PhaseRecord:
     skipped_steps: int = 0  # batches whose loss or gradient was not finite
     skipped_in_a_row: int = 0  # consecutive batches that were skipped, up to the last one
     validated: bool = False  # whether the validation before the first epoch is done
-    interrupted: bool = False  # whether it was stopped before it was over
+    interrupted: bool = False  # whether the phase was stopped before it was over
     # number of divergences after which it continued from its best with half the step size
     halvings: int = 0
     returned_at: int = 0  # epochs finished at the last of these, from which its patience counts
-    has_diverged: bool = False  # whether it ended because the smallest step size diverged too
+    # whether the phase ended because the smallest step size diverged too
+    has_diverged: bool = False
     problem: str = ""  # error message of the last divergence; empty: it never diverged
 
     @property
@@ -232,11 +233,12 @@ class PhaseTraining:
     (``state``), the best of them, Adam's moments and the random generator.
     """
 
-    phases: Sequence[Phase]
-    seed: int
-    context: FitContext
-    folder_index: int
-    checkpoint_seconds: float
+    phases: Sequence[Phase]  # phases of the training, in order
+    seed: int  # seed of its random numbers
+    context: FitContext  # checkpoints, stop request and progress
+    folder_index: int  # index of its folder of checkpoints in the context
+    checkpoint_seconds: float  # shortest time between two checkpoints [s]
+    # folders in which the checkpoint is kept: the member's own and those of its twins
     folders: Sequence[Path]
 
     def __post_init__(self) -> None:
@@ -271,6 +273,7 @@ class PhaseTraining:
         self.adam = self._new_adam()
 
     def _new_adam(self) -> Adam:
+        """Adam for the parameters that the current phase learns, without moments yet."""
         return Adam(self.learning.values(), self._step_size(), self.phase.settings.weight_decay)
 
     def _step_size(self) -> float:

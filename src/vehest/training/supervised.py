@@ -111,13 +111,13 @@ class _Member:
     """Best weights, losses and random numbers of one member, over all batches of a training."""
 
     best: Tensor  # weights with the lowest validation loss so far, (K,)
-    generator: torch.Generator  # of the order of windows, and of seeds of dropout
+    generator: torch.Generator  # random generator of the order of windows, and of seeds of dropout
     best_loss: float = math.inf  # validation loss of the best weights
-    best_epoch: int = 0  # from 1; 0: no epoch was better than the start
-    halvings: int = 0  # of the step size, one at each divergence
+    best_epoch: int = 0  # number of the best epoch, from 1; 0: no epoch was better than the start
+    halvings: int = 0  # number of halvings of the step size, one at each divergence
     returned_at: int = 0  # epoch of the last divergence
     has_diverged: bool = False  # whether the smallest step size diverged too
-    train_loss: list[float] = field(default_factory=list)  # of each epoch [m²/s²]
+    train_loss: list[float] = field(default_factory=list)  # training loss of each epoch [m²/s²]
     validation_loss: list[float] = field(default_factory=list)  # after each epoch [m²/s²]
 
     def patience_start(self) -> int:
@@ -354,12 +354,12 @@ class MemberTraining:
         Finished epochs of the active members.
     """
 
-    networks: Sequence[nn.Module]
-    seeds: Sequence[int]
-    train_windows: WindowSet
-    validation_windows: WindowSet
-    settings: SupervisedSettings
-    context: FitContext
+    networks: Sequence[nn.Module]  # networks of the members
+    seeds: Sequence[int]  # seed of each member
+    train_windows: WindowSet  # windows to learn from
+    validation_windows: WindowSet  # windows for early stopping
+    settings: SupervisedSettings  # settings of the training
+    context: FitContext  # checkpoints, stop request and progress
 
     def __post_init__(self) -> None:
         """Prepare both window sets, and activate all members with the networks' present weights."""

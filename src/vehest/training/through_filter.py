@@ -126,9 +126,9 @@ class Weights(NamedTuple):
     and when judging epochs.
     """
 
-    one_step: Tensor
-    training: Tensor
-    validation: Tensor
+    one_step: Tensor  # weights of the one-step prediction, (n,)
+    training: Tensor  # weights of the estimate through the filter, (n,)
+    validation: Tensor  # weights of the estimate when epochs are judged, (n,)
 
 
 def one_step_phase(

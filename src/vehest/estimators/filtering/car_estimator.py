@@ -53,10 +53,9 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
     learns_from = REFERENCES
     states = STATES
     adapts = True  # friction is a state
-    network: CarFilter
-    # settings
-    car: Any
-    friction: float
+    network: CarFilter  # filter with its learnt dynamics and noise
+    car: Any  # parameters of the car
+    friction: float  # friction at the start [1]
 
     @property
     def filter(self) -> CarFilter:

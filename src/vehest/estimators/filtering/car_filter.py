@@ -39,12 +39,16 @@ from vehest.filters.unscented_scan import (
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
-NoiseKind = Literal["constant", "state_dependent"]  # of the covariances of process and measurement
+# kind of the covariances of process and measurement
+NoiseKind = Literal["constant", "state_dependent"]
 # initial variances, before training: of vx, vy, yaw rate and rim speed over one sample's step
 PROCESS = (1e-3, 1e-3, 1e-2, 1e-2)
-FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}  # of the friction's step, by `NoiseKind`
-OBSERVATION = (50.0, 50.0, 0.1, 0.1)  # of ax, ay, yaw rate and rim speed as measurements
-INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)  # of vx, vy, yaw rate and rim speed at a known first state
+# `NoiseKind` -> variance of the friction's step [1]
+FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
+# initial variances of ax, ay [m²/s⁴], yaw rate [rad²/s²] and rim speed [m²/s²] as measurements
+OBSERVATION = (50.0, 50.0, 0.1, 0.1)
+# variances of vx, vy, yaw rate and rim speed at a known first state
+INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
 PACE = 10.0  # factor by which noise learns faster than in units of its deviations
 # added to variances: the rim speed is measured, and is its own reference
 OBSERVED_EXACTLY = (
@@ -67,8 +71,8 @@ class CarFilter(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
-    process_noise: Any
-    observation_noise: Any
+    process_noise: Any  # model of the covariance of the process noise
+    observation_noise: Any  # model of the covariance of the measurements
     mirror = (  # signs of states, inputs and measurements, left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),

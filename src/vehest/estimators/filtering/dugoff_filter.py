@@ -49,7 +49,7 @@ from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.robust import robust_squares_of_array
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
-Inputs = Literal["full", "imu"]  # with and without measured tyre forces
+Inputs = Literal["full", "imu"]  # channels that are read: with or without measured tyre forces
 Curve = Literal["plain", "smooth"]  # Dugoff's tyres by Eq. 9 or Eq. 10
 
 WHEEL_FORCES = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
@@ -68,7 +68,7 @@ class PseudoMeasurement:
     """Sideslip angles that a network adds to T samples."""
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
-    variance: FloatArray  # of the angle as the filter's measurement, (T,) [rad²]
+    variance: FloatArray  # variance of the angle as the filter's measurement, (T,) [rad²]
     # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
     # filter's
     process: FloatArray | None = None
@@ -94,14 +94,16 @@ class DugoffFilter(SigmaPointEstimator):
     covariance_of = TRACK_STATES
     axle_tyres: FloatArray
     levels: dict[str, float]
-    # settings
-    inputs: Inputs
-    curve: Curve
-    minimum_speed: float
+    inputs: Inputs  # channels that are read
+    curve: Curve  # Dugoff's tyres by Eq. 9 or Eq. 10
+    minimum_speed: float  # speed below which wheels roll without slip [m/s]
+    # lateral acceleration from which on forces are trusted, see `in_nonlinear_range` [m/s²]
     nonlinear_from: float
-    linear_below: float
+    linear_below: float  # lateral acceleration below which they are not trusted any more [m/s²]
+    # number of samples over which errors are correlated, by which variances of measurements are
+    # multiplied
     correlated_samples: float
-    car: LoadedCar
+    car: LoadedCar  # parameters of the car
 
     def require_fitted(self) -> None:
         """Check that tyres and noise levels have values.

@@ -46,7 +46,8 @@ SLIP_OFFSET_DEVIATION = math.radians(0.15)
 BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}
 # Powers of ten from which searches start.
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
-LIMIT_MARGIN = 0.01  # of a box's width: a search that ends nearer to a limit ended on it
+# largest distance from a limit at which a search ended on it, over the width of the box
+LIMIT_MARGIN = 0.01
 START_YAW_RATE_LEVEL = 0.01  # rad/s, level of the yaw rate before it is scaled
 N_CALIBRATIONS = 2  # number of times that the level of the yaw rate is scaled
 
@@ -58,7 +59,7 @@ class CurveFit(NamedTuple):
     """Fitted force curves of both axles."""
 
     curves: FloatArray  # parameters, (4,), in the order of `CURVES`; c₁ = ∞ where tyres are linear
-    covariance: FloatArray  # of their logarithms, (4, 4)
+    covariance: FloatArray  # covariance of the logarithms of the parameters, (4, 4)
     metrics: dict[str, float]  # curves, halves of their 95 % intervals, rms of residual forces [N]
 
 
@@ -145,7 +146,7 @@ class LevelSearch:
     """Search for the noise levels with the smallest error of sideslip on drives."""
 
     names: tuple[str, ...]  # searched levels
-    levels: Mapping[str, float]  # all levels, `LEVELS`; NaN where they are not given
+    levels: Mapping[str, float]  # levels by name, `LEVELS`; NaN where they are not given
     tyre_level: float  # drift of tyre parameters where it is not searched [1/√s]
     # filters samples (T, 4) with given noise levels
     filter_samples: Callable[[FloatArray, Mapping[str, float]], FilteredStates]

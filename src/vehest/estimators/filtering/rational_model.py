@@ -74,6 +74,7 @@ class TyreKind(NamedTuple):
 
 
 STIFFNESSES = ("c2_front", "c2_rear")  # parameters of linear tyres
+# setting ``tyres`` -> kind of tyres
 KINDS: dict[str, TyreKind] = {
     "linear": TyreKind("lint", "LINT", STIFFNESSES, STIFFNESSES),
     "rational": TyreKind("ratt", "RATT", CURVES, ()),
@@ -86,7 +87,7 @@ KINDS: dict[str, TyreKind] = {
 class RationalModel:
     """A single track on rational tyres, with the limits and the start of its filter."""
 
-    car: SingleTrackParameters  # its cornering stiffnesses are not used
+    car: SingleTrackParameters  # parameters of the car; its cornering stiffnesses are not used
     curves: FloatArray  # axle curves at friction 1, (4,), in the order of `CURVES`; c₁ = ∞: linear
     curve_covariance: FloatArray  # covariance of the curves' logarithms at the start, (4, 4)
     adapted: tuple[str, ...]  # tyre parameters that are states

@@ -21,7 +21,7 @@ class FilterPass(NamedTuple):
 
     samples: FloatArray  # yaw rate [rad/s], u [m/s], ay, ax [m/s²] as the filter used them, (T, 4)
     means: FloatArray  # filtered means of the states, (T, 8)
-    covariances: FloatArray  # their covariances, (T, 8, 8)
+    covariances: FloatArray  # covariances of the states, (T, 8, 8)
     network: FloatArray  # v of the network [m/s], (T,)
     turning: FloatArray  # change of the low-passed yaw rate in each sample [rad/s], (T,)
     lateral: FloatArray  # size of the low-passed ay [m/s²], (T,)

@@ -40,12 +40,12 @@ class FilteredStates(NamedTuple):
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
     # standard deviations of all states, (T, n), where the filter gives them
     deviation: FloatArray | None
-    covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
-    # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T,
-    # 2)
+    covariance: FloatArray  # covariance of sideslip angle and yaw rate, (T, 2, 2)
+    # innovation of yaw rate and lateral acceleration in the filter's order, (T, 2), 0 where nothing
+    # was measured
     innovation: FloatArray
     innovation_covariance: FloatArray  # covariance of the innovations, (T, 2, 2)
-    measured: NDArray[np.bool_]  # which of both were measured and not refused, (T, 2)
+    measured: NDArray[np.bool_]  # whether each of both was measured and not refused, (T, 2)
     last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:

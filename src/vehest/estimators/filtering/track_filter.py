@@ -24,7 +24,9 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
-Over = Literal["samples", "recordings"]  # how `error_over` combines the errors of recordings
+# how `error_over` combines errors: mean square over all samples, or squared mean of the recordings'
+# root mean squares
+Over = Literal["samples", "recordings"]
 # m/s, rad/s: standard deviations of v and r where they are not given, and of a car that rolls
 UNKNOWN_MOTION = (
     0.5,

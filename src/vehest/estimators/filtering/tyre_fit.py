@@ -28,7 +28,7 @@ from vehest.vehicle.dugoff import LoadedCar
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.rational_tyres import rational_axle
 
-Kind = Literal["linear", "rational"]  # of an axle's curve, see `axle_force`
+Kind = Literal["linear", "rational"]  # kind of an axle's curve, see `axle_force`
 
 PARAMETERS: dict[str, tuple[str, ...]] = {
     "linear": ("cornering_stiffness",),
@@ -52,7 +52,7 @@ MIN_SPREAD = 1e-6
 PASSES = 3  # fits, each of which weighs the prior of c₁ against the residuals of the last one
 # s, window of the polynomial (Savitzky & Golay) by which forces and slips are smoothed
 SMOOTHING_SECONDS = 0.5
-SMOOTHING_ORDER = 2  # its degree; a window of as few samples is refused
+SMOOTHING_ORDER = 2  # degree of the smoothing polynomial; a window of as few samples is refused
 BLOCK_SECONDS = 10.0  # s; residuals further apart than this count as independent
 MIN_SAMPLES = 100  # samples fast enough in all recordings together; fewer are refused
 NORMAL_95 = 1.959964  # half width of the 95 % interval of a Gaussian, in standard deviations
@@ -76,7 +76,7 @@ class AxleMotion:
 class TyreFit:
     """Fitted force curves of both axles, and the samples that they were fitted to."""
 
-    kind: Kind  # of both curves
+    kind: Kind  # kind of both curves
     front: FloatArray  # parameters of the front axle in the order of `PARAMETERS`, (P,)
     rear: FloatArray  # those of the rear axle
     covariance: FloatArray  # covariance of the front and of the rear parameters, (2, P, P)

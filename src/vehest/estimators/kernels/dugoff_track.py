@@ -52,7 +52,7 @@ class CompiledDugoffTrack(PointModel):
     """
 
     is_compiled = True
-    scratch_rows = 4
+    scratch_rows = 4  # rows of inputs for each point in which entries store numbers
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car

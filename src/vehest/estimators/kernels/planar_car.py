@@ -56,8 +56,8 @@ BLOCK = 110  # largest number of sigma points that are computed together
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
 
 _FAST = {"nogil": True, "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"}}
-compiled = entry(**_FAST)
-piece = part(**_FAST)
+compiled = entry(**_FAST)  # decorator of functions that Python calls
+piece = part(**_FAST)  # decorator of functions that only compiled ones call
 
 
 @piece

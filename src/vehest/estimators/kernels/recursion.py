@@ -20,7 +20,7 @@ from vehest.estimators.kernels.compiling import part
 from vehest.estimators.kernels.threads import over_members
 from vehest.lanes import load, store
 
-Floats = NDArray[Any]
+Floats = NDArray[Any]  # array of numbers of either precision
 
 DECAYS = (0.9, 0.999)  # β₁ and β₂ of Adam
 EPSILON = 1e-8  # ε of Adam

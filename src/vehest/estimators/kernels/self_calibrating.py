@@ -30,7 +30,9 @@ from vehest.lanes import VECTOR_BYTES, choose, least, load, most, root, store, t
 
 STATES = 8  # states of a filter, which the next line names
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
-CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
+# number of candidates for v: this bank, the network that comes with vehest, steady cornering with
+# the priors
+CANDIDATES = 3
 BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, those of the candidates' residuals, the mean
 # square of the axle's error s e over the last moments, and the lateral acceleration that the drive
@@ -38,8 +40,8 @@ BANK, NETWORK, STEADY = range(CANDIDATES)
 LAGGED = 17  # number of lagged signals
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
 SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE, REACHED = range(10, LAGGED)
-# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals,
-# and last v
+# number of moments of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments
+# of the residuals, and last v
 MOMENTS = 8
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(MOMENTS)
 # Rows of the bank, with a filter in each lane: states, the upper triangle of the covariances, then
@@ -61,9 +63,10 @@ AT = np.array(
 )
 # as an index of float64 values: VECTOR_BYTES // 8 lanes in each row
 AT = (STATES + AT) * (VECTOR_BYTES // 8)
-MIN_GRIP_SHARE = 0.3  # of a grip limit that remains at any longitudinal acceleration
+MIN_GRIP_SHARE = 0.3  # smallest share of a grip limit that remains at any longitudinal acceleration
 ROLLING_DEVIATION = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
-# of |e|, in deviations of its prior, above which b stays: a slide does not show the unit's place
+# largest |e|, in deviations of its prior, at which b is estimated; beyond it b stays: a slide does
+# not show the unit's place
 MAX_ERROR_OF_PLACE = 1.0
 LEAST_AY = 1e-9  # m/s²: avoids a division by zero
 
@@ -72,7 +75,7 @@ class State(NamedTuple):
     """State of the recursion between samples, with J filters and a window of N samples."""
 
     means: FloatArray  # means of the filters' states, (J, 8)
-    covariances: FloatArray  # their covariances, (J, 8, 8)
+    covariances: FloatArray  # covariances of the filters' states, (J, 8, 8)
     log_weights: FloatArray  # logarithms of the filters' weights, (J,)
     lags: FloatArray  # lagged signals, (17,)
     candidates: FloatArray  # low-passed values and moments of the candidates, (3, `MOMENTS`)

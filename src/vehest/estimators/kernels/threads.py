@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 
-PIECES = 4  # for each thread, so that a delayed thread leaves its share to the others
+# pieces of work for each thread, so that a delayed thread leaves its share to the others
+PIECES = 4
 _allowed = ContextVar("_allowed", default=0)  # threads for members; 0: as many as torch's
 
 

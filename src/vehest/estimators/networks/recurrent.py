@@ -27,8 +27,8 @@ TRIAL = Trial(
 class HiddenStateEstimator(Network):
     """A family that is named by the size of its hidden state."""
 
-    n_states: int
-    network_type: ClassVar[Any]
+    n_states: int  # length of the hidden state
+    network_type: ClassVar[Any]  # class of the network
 
     def new_network(self) -> Any:
         """An untrained network of the settings' sizes."""
@@ -52,7 +52,7 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     (...).
     """
 
-    n_gates: ClassVar[int]  # of the cell
+    n_gates: ClassVar[int]  # number of gates of the cell
 
     def __init__(self, settings: Any) -> None:
         channels = len(RecurrentEstimator.channels)

@@ -40,6 +40,7 @@ INPUTS: dict[str, tuple[str, ...]] = {
 without.
 """
 
+# scaling of inputs: to [0, 1], or to mean 0 and standard deviation 1
 Normalisation = Literal["range", "standard"]
 NORMALISATION_SUFFIXES: dict[str, str] = {"range": "", "standard": "_standard"}
 """Normalisation -> suffix of the variant's name."""
@@ -51,7 +52,7 @@ MAX_SIDESLIP = 1.5  # rad, beyond which sideslip angles of a network are clipped
 class SampleNetworkEstimator(Network):
     """An estimator with a `SampleNetwork`."""
 
-    network: SampleNetwork
+    network: SampleNetwork  # the networks
     network_inputs: tuple[str, ...]  # measured channels that the network reads
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
     dropout: float = setting(
@@ -161,9 +162,9 @@ class SampleNetwork(nn.Module):
     Source: Bertipaglia et al. 2024, Section III-A.
     """
 
-    input_low: Tensor
-    input_span: Tensor
-    unit: Tensor
+    input_low: Tensor  # offset of each input, (C,) [SI]: its smallest value or its mean
+    input_span: Tensor  # scale of each input, (C,) [SI]: its range or its standard deviation
+    unit: Tensor  # root mean square of the targets [rad], a scalar
 
     def __init__(
         self, n_inputs: int, hidden: tuple[int, int], n_outputs: int, members: int = 1

@@ -48,6 +48,7 @@ ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
 """Channels and outputs that change sign in a mirror, left for right; the others stay."""
 SAMPLES_TOGETHER = 10_000  # samples that are estimated at a time
 
+# trial of both networks in the first comparison on a new car
 TRIAL = Trial(
     11,
     "recurrent networks over all samples so far; minutes",
@@ -218,7 +219,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SequenceSettings
     template = "velocity_recurrent"
-    network: VelocityNetwork
+    network: VelocityNetwork  # the network
     inputs: tuple[str, ...] = setting(
         ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"),
         "measured channels that the network reads",

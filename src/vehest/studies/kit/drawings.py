@@ -25,7 +25,7 @@ from vehest.studies.kit.runs import Name
 
 ZOOM_SECONDS = 20.0  # s, length of the busiest part, which has a figure of its own
 MAX_IN_ZOOM = 4  # estimates in the figure of the busiest seconds
-TEST_COLOUR = "#0b4f9c"  # of the test set beside the training ranges in the g-g diagram
+TEST_COLOUR = "#0b4f9c"  # colour of the test set besides the training ranges in the g-g diagram
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class DriveSignals:
     test_set: str  # name of the test set
     # (estimator, variant) -> model, title and line, in the order in which they are drawn
     candidates: Mapping[Name, tuple[EvaluatedModel, str, Line]]
-    ranges: Mapping[Name, Sequence[Scored]]  # of each candidate, one a range
+    ranges: Mapping[Name, Sequence[Scored]]  # signals of each candidate, one for each range
     joined: Mapping[Name, Scored]  # the ranges of each candidate end to end
 
     @property

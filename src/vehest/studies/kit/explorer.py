@@ -36,7 +36,7 @@ def explorer_of(
     scored: Mapping[Name, Sequence[Scored]],
     axis: tuple[float, str, int, tuple[float, float]],
 ) -> str:
-    """What the page draws of a test set, as `explorer_json`.
+    """Content that the page draws of a test set, as `explorer_json`.
 
     Parameters
     ----------

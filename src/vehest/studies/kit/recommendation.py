@@ -94,7 +94,7 @@ class Recommendation:
 
 
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
-    """Which estimator to recommend, decided by one test set.
+    """Recommendation of an estimator, decided by one test set.
 
     Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
     without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.
