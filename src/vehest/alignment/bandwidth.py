@@ -249,7 +249,7 @@ def coarse_cutoff_hz(rate_hz: float) -> float:
 
 
 def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:
-    """How often a held channel, (T,), really changes [1/s]; None if it is not held.
+    """Rate at which a held channel, (T,), really changes [1/s]; None if it is not held.
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does
     so too while it moves slowly, but by one quantum at a time.

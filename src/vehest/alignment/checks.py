@@ -389,8 +389,9 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 
 def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolArray:
-    """Which runs of equal values (N, 2) a coarse channel enters and leaves by its smallest step, as
-    a sensor that was stuck does not; none where it takes few values, as a command does.
+    """Whether a coarse channel enters and leaves each of the runs of equal values (N, 2) by its
+    smallest step, as a sensor that was stuck does not; none where it takes few values, as a command
+    does.
     """
     if len(np.unique(samples)) < MIN_COARSE_LEVELS:
         return np.zeros(len(runs), bool)

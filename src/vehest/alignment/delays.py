@@ -62,7 +62,7 @@ class Late:
 
 
 def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
-    """All signals that delays and low-passes are found from, under names of their own.
+    """Signals by which delays and low-passes are found, under names of their own.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]  # array of complex numbers in double precision
 
 IMU_CHANNELS = ("ax", "ay", "yaw_rate")  # channels of the inertial unit
 # names of the parameters of the unit

@@ -28,7 +28,7 @@ class Motion:
     # slip; empty if there is none
     speed: str
     velocity: str  # name of the channel of the lateral velocity; empty if there is none
-    moving: BoolArray  # where the car does not stand, (T,)
+    moving: BoolArray  # whether the car does not stand, (T,)
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels

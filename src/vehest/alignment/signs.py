@@ -27,9 +27,9 @@ FILTER_END_SECONDS = 2.0  # s at either end, which the band-pass distorts and wh
 MIN_SAMPLES = 100
 MIN_SETTLED_SECONDS = 10.0  # s, shortest settled time behind the band-pass with which it is used
 MIN_STEADY_CORRELATION = 0.7  # smallest |correlation| of a relation
-MIN_SIGN_CORRELATION = 0.3  # the same for d(vy)/dt against ay - vx·yaw_rate
+MIN_SIGN_CORRELATION = 0.3  # smallest |correlation| of d(vy)/dt with ay - vx·yaw_rate
 MIN_SCALE_CORRELATION = 0.8  # smallest |correlation| of a relation whose scale is checked
-MIN_ANGLE_CORRELATION = 0.95  # the same for sideslip_ref against atan2(vy_ref, vx)
+MIN_ANGLE_CORRELATION = 0.95  # smallest |correlation| of sideslip_ref with atan2(vy_ref, vx)
 # m/s², smallest standard deviation of ay with which there is a lateral relation
 MIN_ACCELERATION = 0.2
 MIN_SLIDING = 1e-3  # m/s², smallest standard deviation of d(vy)/dt that is compared
@@ -41,10 +41,11 @@ MIN_STEERED_SECONDS = 5.0
 # largest number of channels that are reversed together to explain the signs
 MAX_REVERSED_CHANNELS = 4
 KILOMETRES_AN_HOUR = 3.6  # km/h in 1 m/s
-DEGREES_PER_RADIAN = 180.0 / np.pi
+DEGREES_PER_RADIAN = 180.0 / np.pi  # degrees in 1 rad
 # largest factor of a right scale, either way from 1; the smallest factor of a wrong unit is 3.6
 SCALE_TOLERANCE = 1.7
-# the same for ax, which pitch, grade and slip change; the factor of ax in g is 9.8
+# largest factor of a right scale of ax, which pitch, grade and slip change; the factor of ax in g
+# is 9.8
 LONGITUDINAL_TOLERANCE = 3.0
 UNIT_TOLERANCE = 1.25  # largest factor of a wrong scale from 1 once a unit is corrected
 ALTERNATIVE_UNITS = {
@@ -306,8 +307,8 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:
-    """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or
-    the rate too low.
+    """Samples at which a band-pass has forgotten the ends and the car moves; None if they are too
+    few, or the rate too low.
 
     Returns
     -------
@@ -450,7 +451,7 @@ class UnitMistake(NamedTuple):
 
 
 def unit_mistakes() -> Iterator[UnitMistake]:
-    """All mistakes that are looked for.
+    """Mistakes of units that are looked for.
 
     Yields
     ------

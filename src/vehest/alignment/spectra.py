@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]  # array of complex numbers in double precision
 
 BAND_HZ = (0.1, 3.0)  # Hz, where cars move and references can be differentiated
 SEGMENT_SECONDS = (4.0, 16.0)  # s, length of the shortest and longest segment
@@ -217,7 +217,7 @@ class Lag:
 
     delay: Measured  # delay [s]
     time_constant: Measured  # time constant of the low-pass [s]
-    together: Measured  # their sum, which is the delay of slow motion [s]
+    together: Measured  # sum of both, which is the delay of slow motion [s]
     fit: float  # share of the phase that is explained
 
 

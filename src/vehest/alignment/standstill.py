@@ -10,7 +10,7 @@ from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.recording import Recording
 from vehest.data.runs import equal_runs
 
-BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]  # array of truth values
 
 MAX_STANDSTILL_YAW_RATE = 0.05  # rad/s, largest magnitude of the yaw rate of a standing car
 # m/s², largest standard deviation of an acceleration of a standing car

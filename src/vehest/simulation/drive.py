@@ -48,9 +48,9 @@ class Flags:
     """Outcome of a drive."""
 
     spun: bool  # whether the car slid beyond the validity of its equations of rolling
-    # whether it was farther beside its line than the manoeuvre's half_width
+    # whether the car was farther beside its line than the manoeuvre's half_width
     left_road: bool = False
-    stood: bool = False  # whether it stands at the end
+    stood: bool = False  # whether the car stands at the end
     # whether the manoeuvre came to its own end, and was not cut off because it took too long
     completed: bool
     # time at which the driver began to stop because of a spin or beside the road [s]; None: never

@@ -40,8 +40,8 @@ class Variation:
     # names of the parameters in the library, ``tire.p_dy1`` for one of a group
     parameters: tuple[str, ...]
     factor: Scales  # lowest and highest scale, drawn uniformly for every drive
-    # whether it is drawn uniformly over the logarithm, so that half as much is as likely as twice
-    # as much
+    # whether the scale is drawn uniformly over its logarithm, so that half as much is as likely as
+    # twice as much
     log: bool = False
 
     def __post_init__(self) -> None:

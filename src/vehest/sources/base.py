@@ -78,8 +78,8 @@ class CommonOptions:
     ) = None
     # transforms that are applied to each recording, in order
     transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
-    reference_point: Place | None = None  # where the reference was measured
-    imu_point: Place | None = None  # where the inertial unit sits
+    reference_point: Place | None = None  # position at which the reference was measured
+    imu_point: Place | None = None  # position of the inertial unit
 
 
 # names of the options of every data set
@@ -87,7 +87,8 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 
 def origin_in_words(recording: Recording) -> list[str]:
-    """Where a recording's channels were measured and which were derived, by its data set.
+    """Lines of text on where a recording's channels were measured and which were derived, by its
+    data set.
 
     Returns
     -------
@@ -349,7 +350,7 @@ class Source(ABC):
         return []
 
     def recordings(self) -> Iterator[Recording]:
-        """All recordings, one after another."""
+        """Recordings of the data set, one after another."""
         for recording_id in self.ids():
             yield self.read(recording_id)
 

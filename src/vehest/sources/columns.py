@@ -27,7 +27,7 @@ ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column a
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]  # names of channels
 # name of a column; YAML reads 3 as a number
 ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0)]  # number above 0
 Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]  # sampling rate [Hz]
 RunNumber = Annotated[int, Field(ge=0)]  # number of a run
 
@@ -68,6 +68,7 @@ class SampledColumn(Column):
     another one holds the sign.
     """
 
+    # numbers, in the file's unit, that mean that nothing was measured
     invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
     sign_column: ColumnName | None = None  # 0 where values are positive, 1 where negative
 

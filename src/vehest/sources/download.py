@@ -71,7 +71,7 @@ class Outcome:
     what: Literal[
         "fetched", "matched", "recorded"
     ]  # matched its known checksum; was there and its checksum is recorded on first sight
-    sha256: str  # its checksum
+    sha256: str  # checksum of the file
     size: int  # bytes
 
 

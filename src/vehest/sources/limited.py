@@ -123,7 +123,7 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
 
 
 def require_package(module: str, extra: str, purpose: str) -> None:
-    """See that an optional package is installed, without importing it.
+    """Raise an error unless an optional package is installed, without importing it.
 
     Parameters
     ----------
@@ -169,8 +169,8 @@ def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
 
 
 def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
-    """What the reader returns within memory and processor time, without writing a file, or the
-    error that it raises.
+    """Result of the reader within memory and processor time, without writing a file, or the error
+    that it raises.
     """
     module, _, name = order["reader"].partition(":")
     file = Path(order["file"])

@@ -35,6 +35,7 @@ class MdfOptions(SignalOptions):
 class MdfChannel(SignalChannel, SampledColumn):
     """A channel's signal, with the number or name of its group where its name occurs in several."""
 
+    # number or name of the signal's group
     group: Annotated[int | str | None, "the number or name of a group"] = None
 
 

@@ -68,7 +68,7 @@ _WORDED_MARKS = """
     ueberlauf überlauf unterlauf
     initialisierung nichtinitialisiert initwert initialwert initialisierungswert
 """
-_PHRASES = frozenset(_WORDED_MARKS.split())  # the same as a set
+_PHRASES = frozenset(_WORDED_MARKS.split())  # words of `_WORDED_MARKS` as a set
 
 
 def marks_not_measured(text: str, signal: str = "") -> bool:

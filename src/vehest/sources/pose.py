@@ -20,7 +20,7 @@ POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)  # channels that 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions:
-    """How reference channels are made of poses."""
+    """Options by which reference channels are made from poses."""
 
     window: int = 9  # length of the Savitzky-Golay filter [samples]
     order: int = 2  # order of its polynomial

@@ -62,7 +62,7 @@ class SignalChannel(Column):
 class Signal:
     """Samples of one signal with their times."""
 
-    origin: str  # its channel group or message, for messages: group 3 (Gateway)
+    origin: str  # channel group or message of the signal, for messages: group 3 (Gateway)
     stamps: FloatArray  # times of the samples [s], strictly increasing, shape (T,)
     # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
     values: FloatArray

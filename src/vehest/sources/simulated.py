@@ -51,7 +51,8 @@ class Drive:
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
     # number of drives, called ID_001, ID_002 and so on
     count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None
-    seed: Natural | None = None  # None: one that follows from the data set's and the drive's name
+    # seed of the drive; None: one that follows from the data set's and the drive's name
+    seed: Natural | None = None
     # name of one of the vehicles
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None  # surface of the road

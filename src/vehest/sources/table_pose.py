@@ -24,8 +24,8 @@ UNITS = {"x": "m", "y": "m", "yaw": "rad"}  # coordinate of a pose -> its SI uni
 class TablePose(PoseOptions):
     """Declaration of columns of poses."""
 
-    x: Column  # column of the position and its unit, z up
-    y: Column  # likewise for y
+    x: Column  # column of the position x and its unit, z up
+    y: Column  # column of the position y and its unit
     yaw: Column  # column of the yaw angle and its unit
     # angle from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
     yaw_offset: float = 0.0

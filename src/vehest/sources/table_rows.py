@@ -149,7 +149,7 @@ def remaining_files(
 
 
 def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
-    """Which rows of a table count.
+    """Whether each row of a table counts.
 
     Parameters
     ----------

@@ -165,7 +165,7 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
 
 
 def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -> None:
-    """See that a table has every wanted column once.
+    """Raise an error unless a table has every wanted column once.
 
     Parameters
     ----------

@@ -278,7 +278,8 @@ def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
 
 
 def require_slip_offsets(log: Log, location: str) -> None:
-    """See that slip at two wheels of one side differs by what the yaw rate makes between the axles.
+    """Raise an error unless slip at two wheels of one side differs by what the yaw rate makes
+    between the axles.
 
     The logger computes slip at points whose offsets from the antenna were entered as {lateral,
     longitudinal}. Where the two change places, front and rear wheel of a side have the same

@@ -82,7 +82,8 @@ GRAVITY_WEIGHT = 4.0  # weight of the correlation of a roll angle with ay beyond
 MAX_LISTED = 8  # largest number of columns that a note names; further ones are counted
 # range of ay over d(vy)/dt + vx·yaw_rate outside which the speed is questioned
 SPEED_GAIN_RANGE = (0.97, 1.08)
-SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # the same where d(vy)/dt is not known
+# range of ay over vx·yaw_rate outside which the speed is questioned, where d(vy)/dt is not known
+SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)
 # range of the same outside which a unit may be wrong instead (`scales`)
 MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)
 # largest difference between the gains by wheel speeds and by ay/yaw_rate with which the speed is

@@ -68,7 +68,7 @@ class Candidate:
     values: FloatArray  # samples in the file's unit, without gaps, (T,)
     slow: FloatArray  # low-passed samples, at `SLOW_RATE_HZ` or less, (S,)
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
-    is_wheel_mean: bool = False  # whether it is the mean of wheels, and no column of the log
+    is_wheel_mean: bool = False  # whether this is the mean of wheels, and no column of the log
     device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
 
     @cached_property

@@ -32,7 +32,8 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
 CLEAR_CORRELATION = 0.6  # smallest correlation that decides where nothing else comes near
-CLEAR_LATERAL_CORRELATION = 0.45  # the same of relations with derivatives of noisy channels
+# smallest correlation that decides, of relations with derivatives of noisy channels
+CLEAR_LATERAL_CORRELATION = 0.45
 # smallest correlation of a lateral velocity that decides where its name agrees, and where its score
 # starts
 MIN_STRENGTH = 0.3
@@ -41,7 +42,8 @@ RIVAL_MARGIN = 2.0  # largest difference of the score of a rival from that of th
 MAX_AX_MISMATCH = 1.1
 # penalty on the score of a reference's column as a channel that the car measures itself
 REFERENCE_PENALTY = 2.5
-REFERENCE_PENALTY_WITH_BUS = 8.0  # the same where the car's bus has a column of that name
+# penalty on that score where the car's bus has a column of that name
+REFERENCE_PENALTY_WITH_BUS = 8.0
 MIN_SECOND_SCORE = 3.0 + STRONG  # smallest score of a sideslip angle besides a lateral velocity
 MAX_CENTRE_SHARE = 0.1  # largest distance of straight ahead from zero, over a command's range
 CRAWL_SHARE = 0.05  # speed over the top speed below which a sideslip angle has no meaning
@@ -88,7 +90,7 @@ class Offer(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """How a column in some unit agrees with a motion."""
+    """Agreement of a column, as a channel in some unit, with a motion."""
 
     channel: str  # channel that the column would be
     unit: str  # unit of the column

@@ -44,7 +44,7 @@ class Proposal:
     offset: float = 0.0  # value of the column at zero, in its own unit
     alternatives: tuple[str, ...] = ()  # channels, units or columns that fit equally well
     delay: float = 0.0  # time by which the column is late, as far as it is known [s]
-    is_weak: bool = False  # whether it is left out unless an answer confirms it
+    is_weak: bool = False  # whether this proposal is left out unless an answer confirms it
     is_by_name: bool = False  # whether its name is all that supports it, and no relation to others
     is_repeated: bool = False  # whether another column measures the same
 
@@ -71,7 +71,7 @@ class Proposal:
         return plain
 
     def is_impossible(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Which values of the column no vehicle can have, (T,).
+        """Whether values of the column are such as no vehicle can have, (T,).
 
         Parameters
         ----------
@@ -88,15 +88,15 @@ class Proposal:
         return np.asarray(factor * (values - self.offset))
 
     def with_evidence(self, *evidence: str) -> Proposal:
-        """The same with further evidence."""
+        """The proposal with further evidence."""
         return replace(self, evidence=(*self.evidence, *evidence))
 
     def questioned(self, question: str) -> Proposal:
-        """The same with a question, unless it has one already."""
+        """The proposal with a question, unless it has one already."""
         return replace(self, question=self.question or question)
 
     def merged_with(self, earlier: Proposal | None) -> Proposal:
-        """The same with the evidence and questions of an earlier proposal for this column."""
+        """The proposal with the evidence and questions of an earlier one for this column."""
         if earlier is None or earlier.column != self.column:
             return self
         return replace(
@@ -128,16 +128,16 @@ class Proposals:
         return {proposal.channel: proposal for proposal in self.channels}
 
     def with_notes(self, *notes: str) -> Proposals:
-        """The same with further remarks."""
+        """The proposals with further remarks."""
         return replace(self, notes=(*self.notes, *notes))
 
     def changed(self, changes: Mapping[str, Proposal]) -> Proposals:
-        """The same with other proposals for some channels."""
+        """The proposals with others for some channels."""
         channels = tuple(changes.get(proposal.channel, proposal) for proposal in self.channels)
         return replace(self, channels=channels)
 
     def keeping(self, channels: Sequence[Proposal], notes: Sequence[str] = ()) -> Proposals:
-        """The same with these of its channels and further remarks.
+        """Only these of the proposals, with further remarks.
 
         A radius stays only with a wheel's speed.
         """
@@ -146,7 +146,7 @@ class Proposals:
         return replace(self, channels=tuple(channels), wheel_radius=radius).with_notes(*notes)
 
     def mirrored(self) -> Proposals:
-        """The same for a mirrored car: signs of `LATERAL` channels and of pitch reversed.
+        """The proposals for a mirrored car: signs of `LATERAL` channels and of pitch reversed.
 
         A log alone cannot tell a car from its mirror image: all relations between its channels stay
         true if every lateral sign is reversed.
@@ -160,7 +160,7 @@ class Proposals:
         )
 
     def with_tilt_signs(self) -> Proposals:
-        """The same with the signs of roll and pitch by the axes that other channels reveal.
+        """The proposals with the signs of roll and pitch by the axes that other channels reveal.
 
         Roll counts about the axis of ax, pitch about that of ay; a question unless ax, ay and the
         yaw rate are along the axes of one right-handed set, as forward-left-up or

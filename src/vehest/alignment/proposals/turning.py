@@ -69,7 +69,7 @@ MIN_NAMED_REPEAT_CORRELATION = {
     "vx": 0.7,
     "yaw_rate": 0.9,
 }
-# the same of a column with ay; one with more repeats ay, or is an angle of lean
+# correlation with ay above which a column repeats ay, or is an angle of lean
 MIN_AY_REPEAT_CORRELATION = 0.99
 # correlation of ay with another column named so above which the user is asked which one has gravity
 MIN_AY_RIVAL_CORRELATION = 0.7

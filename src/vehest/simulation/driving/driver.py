@@ -38,8 +38,8 @@ WAVELENGTHS = (
 
 @dataclass(frozen=True)
 class Driver:
-    """How a person drives; all values are assumed, chosen so that the shipped cars follow the
-    shipped courses.
+    """Parameters of a person's driving; all values are assumed, chosen so that the shipped cars
+    follow the shipped courses.
     """
 
     preview_time: float = 0.7  # time ahead at which the driver looks for lateral errors [s]

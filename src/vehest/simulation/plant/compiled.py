@@ -61,7 +61,7 @@ from vehest.simulation.plant.regimes import (
 if numba.config.DISABLE_JIT:
 
     def to_fixed_tuple(values, length):
-        """As numba's, which runs compiled only."""
+        """The first values as a tuple, in place of numba's function, which runs compiled only."""
         return tuple(values[:length])
 
 
@@ -98,14 +98,14 @@ _kernel = numba.njit(
 )
 
 
-# Places of the groups in a parameter vector.
-_N_STEERING = len(STEERING_NAMES)
-_N_LONGITUDINAL = len(LONGITUDINAL_NAMES)
-_N_TYRE = len(TYRE_NAMES)
-_STEERING = len(BODY_NAMES)
-_LONGITUDINAL = _STEERING + _N_STEERING
-_FRONT = _LONGITUDINAL + _N_LONGITUDINAL
-_REAR = _FRONT + _N_TYRE
+_N_STEERING = len(STEERING_NAMES)  # number of parameters of the steering
+_N_LONGITUDINAL = len(LONGITUDINAL_NAMES)  # number of parameters of the longitudinal dynamics
+_N_TYRE = len(TYRE_NAMES)  # number of parameters of a tyre
+_STEERING = len(BODY_NAMES)  # index of the first parameter of the steering in a parameter vector
+_LONGITUDINAL = _STEERING + _N_STEERING  # index of the first parameter of the longitudinal dynamics
+_FRONT = _LONGITUDINAL + _N_LONGITUDINAL  # index of the first parameter of the front tyres
+_REAR = _FRONT + _N_TYRE  # index of the first parameter of the rear tyres
+# indices of the friction coefficients of both tyres
 _FRICTIONS = tuple(
     tyre + TYRE_NAMES.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1")
 )

@@ -51,7 +51,8 @@ SMALLEST_WHEEL_VELOCITY = 0.5
 stays finite.
 """
 
-SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
+# smallest load of a wheel, also in the air [N]: tyre formulas divide by the load
+SMALLEST_LOAD = 1.0
 
 HEAVE_RATE = 12  # index of the heave rate in the state vector, besides those of `regimes`
 JOINT_FRONT = 27  # index of the lateral play of the front axle's joint

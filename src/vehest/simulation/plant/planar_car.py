@@ -11,9 +11,9 @@ from pydantic import Field
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
 
-Positive = Annotated[float, Field(gt=0.0)]
-ZeroOrPositive = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]  # number above 0
+ZeroOrPositive = Annotated[float, Field(ge=0.0)]  # number of 0 or above
+Share = Annotated[float, Field(ge=0.0, le=1.0)]  # number from 0 to 1
 
 PLANAR = "planar"
 """Value of ``plant`` in a vehicle's configuration that selects this plant; without it the vehicle
@@ -37,7 +37,8 @@ class PlanarCar:
     motor_inertia: Positive  # inertia of the motor and the gears, referred to the wheels [kg m²]
     torque_constant: Positive  # torque at the wheels, all four together, per motor current [N m/A]
     coulomb_torque: ZeroOrPositive  # friction of motor and gears, referred to the wheels [N m]
-    viscous_torque: ZeroOrPositive  # the same, proportional to the speed of the wheels [N m s/rad]
+    # friction of motor and gears that is proportional to the speed of the wheels [N m s/rad]
+    viscous_torque: ZeroOrPositive
     # lock of the front and of the rear differential: torque per difference of a wheel's speed to
     # its axle's mean [N m s/rad]
     axle_lock: ZeroOrPositive

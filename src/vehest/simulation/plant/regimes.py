@@ -26,11 +26,11 @@ from vehest.constants import GRAVITY
 
 
 class Regime(IntEnum):
-    """Which equations of planar motion hold."""
+    """Regime of the plant, by which equations of planar motion are chosen."""
 
-    ROLLING = 0
-    SLOW = 1
-    SLIDING = 2
+    ROLLING = 0  # multi-body equations with tyre formulas
+    SLOW = 1  # wheels roll without slip
+    SLIDING = 2  # locked wheels slide
 
 
 ROLLING, SLOW, SLIDING = (int(regime) for regime in Regime)
@@ -56,11 +56,12 @@ WHEEL_RELAXATION = 0.02  # time constant of wheels that start to roll freely, or
 SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes use of; assumed
 
 
+# indices in the library's state vector
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
-# places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear,
-# right rear by its names
-VY_FRONT = 15
-VY_REAR = 20
+VY_FRONT = 15  # index of the front axle's lateral velocity in the library's state vector
+VY_REAR = 20  # index of the rear axle's lateral velocity in it
+# index of the first wheel's speed; left front, right front, left rear, right rear by the library's
+# names
 FIRST_WHEEL = 23
 
 _kernel = numba.njit(

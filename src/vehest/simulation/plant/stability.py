@@ -21,7 +21,7 @@ class StabilityState:
     """State of the stability control."""
 
     reference: float = 0.0  # yaw rate that the car is to follow [rad/s]
-    active: bool = False  # whether it intervenes
+    active: bool = False  # whether the control intervenes
     # yaw moment that it asks for, positive to the left [N m]; the plant's third input
     moment: float = 0.0
 

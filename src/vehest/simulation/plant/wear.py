@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat
 
-Share = Annotated[float, Field(ge=0.0, le=0.5)]
+Share = Annotated[float, Field(ge=0.0, le=0.5)]  # number from 0 to 0.5
 
 
 @dataclass(frozen=True)

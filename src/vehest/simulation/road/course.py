@@ -175,6 +175,7 @@ class _HeadingProfile:
         self._headings = np.concatenate([[0.0], np.cumsum(areas)])
 
     def __call__(self, arc_length: FloatArray) -> FloatArray:
+        """Heading at these arc lengths [m], likewise an array [rad]."""
         before = np.clip(
             np.searchsorted(self._nodes, arc_length, side="right") - 1, 0, len(self._nodes) - 2
         )

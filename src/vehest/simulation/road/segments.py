@@ -30,7 +30,7 @@ class Straight:
 class Corner:
     """A corner: clothoid, circular arc, clothoid."""
 
-    radius: float  # of the arc [m]
+    radius: float  # radius of the arc [m]
     angle: float  # change of heading, positive to the left [rad]
     transition: float  # length of each clothoid [m]
     # bank of the arc, growing along the clothoids; positive with the inner side lower [rad]
@@ -96,7 +96,7 @@ class Compound:
         ].pieces()[2:]
 
 
-Segment = Straight | Corner | Compound
+Segment = Straight | Corner | Compound  # segment of a course
 
 
 def left(radius: float, degrees: float, transition: float, banking: float = 0.0) -> Corner:

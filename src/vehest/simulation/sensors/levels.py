@@ -44,7 +44,7 @@ class SensorLevel(Errors):
         As `Errors` does, or the correlation time is zero.
     """
 
-    signed: ClassVar[tuple[str, ...]] = ("gain", "bias")
+    signed: ClassVar[tuple[str, ...]] = ("gain", "bias")  # names of the fields that may be negative
     noise: float = 0.0  # density of the white noise [unit/√Hz]
     offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
     # standard deviation of a first-order Gauss-Markov process that is stationary from the first
@@ -65,8 +65,9 @@ class SensorLevel(Errors):
 
 @dataclass(frozen=True)
 class Mounting(Errors):
-    """Where the inertial unit sits and how it is turned against the body."""
+    """Place and orientation of the inertial unit in the body."""
 
+    # names of the fields that may be negative
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z", "roll", "pitch", "yaw")
     lever_x: float = 0.0  # position of the unit forward of the centre of gravity [m]
     lever_y: float = 0.0  # position of the unit left of the centre of gravity [m]
@@ -80,11 +81,11 @@ class Mounting(Errors):
 
 @dataclass(frozen=True)
 class Tilt(Errors):
-    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others
-    are zero.
+    """Angles that tilt the inertial unit, so that gravity leaks into the accelerometers; others are
+    zero.
     """
 
-    signed: ClassVar[tuple[str, ...]] = ("roll_share",)
+    signed: ClassVar[tuple[str, ...]] = ("roll_share",)  # names of the fields that may be negative
     # whether the body's roll counts; it also makes the gyros measure about the body's axes instead
     # of the road's
     roll: bool = True
@@ -123,6 +124,7 @@ class Reference(Errors):
         As `Errors` does, or heading has errors without a meaning.
     """
 
+    # names of the fields that may be negative
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
     kind: str = "ideal"  # kind of sensor: ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
     vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
@@ -193,12 +195,15 @@ REFERENCES: dict[str, Reference] = {
 }
 
 
+# errors of a gyro of a production car
 _GYRO = SensorLevel(
     noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01
 )
+# errors of an accelerometer of a production car
 _ACCELEROMETER = SensorLevel(
     noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01
 )
+# errors of a wheel force sensor
 _WHEEL_FORCE = SensorLevel(
     noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005
 )

@@ -284,7 +284,9 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
 
 
 def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
-    """What the bag holds of a topic; its type and layout are those that are declared."""
+    """Connections of a bag for a topic, whose type and layout are checked against the declared
+    ones.
+    """
     connections = [connection for connection in reader.connections if connection.topic == name]
     if not any(connection.msgcount for connection in connections):
         topics = printable(
