@@ -34,6 +34,7 @@ from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.configuration.composition import Config
+# the command line
 app = typer.Typer(
     name="vehest",
     no_args_is_help=True,
@@ -46,6 +47,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable "
     "data, 4 something is missing, 5 some jobs failed, 130 or 143 stopped by a signal.",
 )
+# commands of ``vehest data``
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
@@ -71,7 +73,8 @@ def _offer(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
-DATASETS = _offer(lambda: choices("dataset"))
+DATASETS = _offer(lambda: choices("dataset"))  # completion by names of data sets
+# completion by names of models
 MODELS = _offer(
     lambda: [
         "pretrained",
@@ -79,15 +82,19 @@ MODELS = _offer(
         *(model_folder.name for model_folder in Path(OUTPUT, "train").glob("[!.]*")),
     ]
 )
+# completion by choices of groups
 OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
-PIPELINES = _offer(pipeline_names)
+PIPELINES = _offer(pipeline_names)  # completion by names of pipelines
 
 
+# type of the option ``--dry-run``
 DryRun = Annotated[
     bool,
     typer.Option("--dry-run", help="List the stages that would run or be reused; run nothing."),
 ]
+# type of the option ``--force``
 Force = Annotated[bool, typer.Option("--force", help="Run again although the result exists.")]
+# type of an argument that is a data set or a file
 DatasetOrFile = Annotated[
     str,
     typer.Argument(
@@ -95,16 +102,20 @@ DatasetOrFile = Annotated[
         autocompletion=DATASETS,
     ),
 ]
+# type of the option ``--json``
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")
 ]
+# type of the option ``--quiet``
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
+# type of the option ``--jobs``
 Jobs = Annotated[
     int | None,
     typer.Option(
         "--jobs", "-j", min=1, help="Number of parallel processes; by default one per core."
     ),
 ]
+# type of the option ``--launcher``
 LauncherName = Annotated[
     str,
     typer.Option(
@@ -117,6 +128,7 @@ LauncherName = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of the option ``--address``
 Address = Annotated[
     str | None,
     typer.Option(
@@ -128,6 +140,7 @@ Address = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of the option ``--slurm``
 Slurm = Annotated[
     list[str] | None,
     typer.Option(
@@ -138,11 +151,13 @@ Slurm = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of an argument that is a data set
 Dataset = Annotated[
     str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)
 ]
 
 
+# type of the arguments that are overrides
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(

@@ -124,7 +124,7 @@ class Motion:
         return replace(self, rate_hz=self.rate_hz / factor, channels=channels, moving=moving)
 
     def corrected(self, factors: dict[str, float]) -> Motion:
-        """The same with some channels multiplied by factors."""
+        """The motion with some channels multiplied by factors."""
         return replace(
             self,
             channels={

@@ -165,7 +165,7 @@ class Measured:
         return self.value + self.half_width
 
     def widened(self, deviation: float) -> Measured:
-        """The same value with a systematic standard uncertainty added to its interval."""
+        """The quantity with a systematic standard uncertainty added to its interval."""
         return Measured(self.value, math.hypot(self.half_width, student(math.inf) * deviation))
 
 

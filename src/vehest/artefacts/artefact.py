@@ -69,7 +69,7 @@ class StagePlan:
 
     @property
     def keyed_content(self) -> dict[str, Any]:
-        """What determines the content, without options that have their defaults."""
+        """Everything that determines the content, without options that have their defaults."""
         config = self.config if self.key_config is None else self.key_config
         return {**self.content, "config": config}
 

@@ -77,6 +77,7 @@ def implicit_euler_observer(
         vx[k] = u
 
 
+# `implicit_euler_observer`, compiled
 compiled_observer = numba.njit(cache=True, error_model="numpy")(implicit_euler_observer)
 
 

@@ -88,7 +88,7 @@ class SelfCalibrating(SelfCalibratingSettings):
 
     @property
     def causal(self) -> bool:
-        """Whether it filters; a smoothed estimate uses later measurements too."""
+        """Whether no later measurements are used: true for the filter, false for the smoother."""
         return not self.smoothed
 
     @property

@@ -327,8 +327,8 @@ class _Levels:
     longitudinal: Noise | None  # error of du/dt by ax [m/s²]; None where ax is not read
     speed: float  # standard deviation of the measured u [m/s]
     reference: float  # standard deviation of the reference of v [m/s]
-    rear: Axle | None  # None where the car is not known
-    front: Axle | None  # None where the car is not known or steer is not read
+    rear: Axle | None  # rear axle; None where the car is not known
+    front: Axle | None  # front axle; None where the car is not known or steer is not read
 
 
 def cramer_rao_floor(

@@ -25,7 +25,7 @@ from vehest.data.recording import Recording
 from vehest.data.resampling import resampled
 from vehest.data.splits import Span
 
-BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]  # array of truth values
 
 # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section
 # V)
@@ -809,5 +809,5 @@ def _unwrap_once(angle: FloatArray) -> FloatArray:
 
 
 def wrap_to_half_turn(angle: FloatArray) -> FloatArray:
-    """The same angle within [-π, π) [rad]."""
+    """Angle within [-π, π), equal to the given one but for whole turns [rad]."""
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi

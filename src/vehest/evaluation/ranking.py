@@ -42,7 +42,7 @@ class Comparison:
 
     @property
     def reversed(self) -> Comparison:
-        """The same comparison with first and second swapped."""
+        """The comparison with first and second swapped."""
         verdict: Verdict = (
             "higher"
             if self.verdict == "lower"

@@ -100,7 +100,7 @@ def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def filled(samples: FloatArray) -> FloatArray:
-    """The same samples with straight lines over gaps (NaN); zeros where no sample is finite."""
+    """Samples with straight lines over gaps (NaN); zeros where no sample is finite."""
     is_finite = np.isfinite(samples)
     if is_finite.all():
         return samples

@@ -54,7 +54,7 @@ def replayed(
 
 
 def in_float64(estimator: Estimator) -> Estimator:
-    """The same estimator with weights in float64, also where it was trained in float32.
+    """The estimator with weights in float64, also where it was trained in float32.
 
     The expected outputs are then as exact as C in double.
     """

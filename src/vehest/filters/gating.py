@@ -16,7 +16,8 @@ PATIENCE = 0.5  # s, time for which a measurement is refused before its gate ope
 
 
 class Gate(NamedTuple):
-    """When a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y - ŷ.
+    """Rule by which a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y -
+    ŷ.
 
     That is the chi-square test of the normalised innovation squared with one degree of freedom,
     measurement by measurement, so that a sensor that fails takes no other one with it. What is

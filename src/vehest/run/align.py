@@ -108,7 +108,7 @@ def override_of(alignment: Alignment) -> str:
 
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
-    """All results of an alignment as plain values for JSON, in SI units.
+    """Results of an alignment as plain values for JSON, in SI units.
 
     Returns
     -------

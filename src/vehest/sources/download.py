@@ -32,7 +32,7 @@ CHECKSUMS = "checksums.txt"  # name of the record of checksums
 UNDER_WAY = ".download"  # folder of files that are being downloaded
 CHUNK = 1 << 15  # bytes that are received at a time
 TIMEOUTS = (15.0, 60.0)  # s, longest times to connect and between two chunks
-# what to do after a failed download, for messages
+# text on what to do after a failed download
 REMEDY = "correct download.url or put the file into the data set's folder by hand"
 NAME = re.compile(r'[^./\\:*?"<>|\s-][^/\\:*?"<>|\x00-\x1f\x7f]*')  # matches valid names of files
 

@@ -108,7 +108,7 @@ class FileSource(Source):
         return {None: slice(None)}
 
     def _selected_runs(self, file: Path) -> Runs:
-        """All runs, or the one that the option ``run`` names.
+        """Runs of a file: all, or the one that the option ``run`` names.
 
         A source has them in the cache ``_runs_of``.
 

@@ -319,7 +319,7 @@ class Trial:
     validation: float  # value of the metric on the validation range, to six significant digits
     origin: str  # key of its training in `vehest.run.weights`
     evaluation: str  # version and options of its evaluation
-    chosen: bool = False  # whether it has the lowest value of its search
+    chosen: bool = False  # whether the trial has the lowest value of its search
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ from vehest.studies.kit.standing import (
 )
 from vehest.studies.kit.warnings import sizes_of_sideslip, warnings_of
 
-TAKES = "split"  # what pipelines of this study name (`vehest.studies.registry`)
+TAKES = "split"  # data that pipelines of this study name (`vehest.studies.registry`)
 MAX_DRAWN = 8  # largest number of estimators in figures, the best by validation
 VERSION = "5"  # raised where tables or figures change
 # metrics of the leaderboard that are errors

@@ -24,7 +24,7 @@ from vehest.studies.kit.runs import by_name
 from vehest.studies.kit.standing import describe_interval, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
-TAKES = "folds"  # what pipelines of this study name (`vehest.studies.registry`)
+TAKES = "folds"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 TEST = "test"  # name of the test set of each fold
 VERSION = "3"  # raised where tables or figures change

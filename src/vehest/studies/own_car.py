@@ -27,7 +27,7 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest.studies.kit.recommendation import Recommendation, plain_text, recommendation_of
 from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
-TAKES = "parts"  # what pipelines of this study name (`vehest.studies.registry`)
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
 PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat

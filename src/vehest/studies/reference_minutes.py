@@ -38,7 +38,7 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest.studies.drive import data_of_parts
 from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
-TAKES = "parts"  # what pipelines of this study name (`vehest.studies.registry`)
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
 VERSION = "2"  # raised where tables or figures change
 TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")  # file of the report's template
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")  # those of metrics.csv
@@ -70,6 +70,8 @@ OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
 )
+# largest deviation of the recorded minutes from those asked for, over the latter, by which ends of
+# a few seconds may shorten them
 MAX_MINUTES_DEVIATION = (
     0.15  # of the minutes asked for, by which ends of a few seconds may shorten them
 )

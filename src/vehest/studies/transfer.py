@@ -44,7 +44,7 @@ from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 
 VERSION = "4"  # raised where tables or figures change
 TEMPLATE = Path(__file__).with_name("transfer.md.j2")  # file of the report's template
-TAKES = "parts"  # what pipelines of this study name (`vehest.studies.registry`)
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 MAX_PANEL_COLUMNS = 4  # panels side by side at most; further ones begin a row
 TITLE_WIDTH = 24  # characters of a line of a panel's title

@@ -28,7 +28,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class FitContext:
-    """What a caller gives a fit besides data and settings: checkpoints, stop request, progress."""
+    """Arguments of a fit besides data and settings: checkpoints, stop request, progress."""
 
     # folder in which each member stores its checkpoints; empty: none are stored
     checkpoint_folders: Sequence[Path] = ()

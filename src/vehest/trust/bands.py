@@ -118,7 +118,7 @@ class Bands:
     datasets: tuple[str, ...]  # data sets of the recordings that gave the factors
     scaled_on: tuple[str, ...]  # names of the ranges that gave scale and domain
     calibrated_on: tuple[str, ...]  # names of the ranges that gave the factors
-    blocks: Blocks  # what a block is: a ``range``, or a segment from ``turn`` to turn
+    blocks: Blocks  # kind of the blocks: a ``range``, or a segment from ``turn`` to turn
     n_blocks: int  # number of blocks of the validation
     seconds: float  # duration of the samples that gave the factors [s]
     channels: tuple[str, ...]  # channels that the model reads, in the order of its rows' columns

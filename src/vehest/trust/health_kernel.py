@@ -36,7 +36,7 @@ from vehest.constants import FloatArray
 from vehest.estimators.kernels import compiling
 from vehest.trust.named_arrays import open_views
 
-IntArray = NDArray[np.int64]
+IntArray = NDArray[np.int64]  # array of integers
 # arrays are views without references, so none are counted: two thirds of the time to compile
 part = partial(compiling.part, _nrt=False)
 

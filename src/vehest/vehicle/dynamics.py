@@ -175,7 +175,8 @@ class Dynamics(nn.Module):
         return rk4(self.rates, state, inputs, step)
 
     def observation(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """What sensors read: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (..., 4).
+        """Measurements that sensors show: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (...,
+        4).
 
         Yaw rate and rim speed are those of the state itself.
         """
@@ -208,7 +209,7 @@ class PacejkaCar(Dynamics):
         self.tyres = PacejkaTyres(PACEJKA, with_curvature=with_curvature)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by Pacejka's curves; see `Dynamics.motion`."""
         return self.car.motion(
             state, inputs, self.tyres(self.car.slips(state, inputs), self.car.loads())
         )
@@ -234,7 +235,7 @@ class ResidualCar(PacejkaCar):
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by Pacejka's curves and the network; see `Dynamics.motion`."""
         return _kinematic(
             state,
             super().motion(state, inputs).rates
@@ -258,7 +259,7 @@ class NeuralCar(Dynamics):
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by the network; see `Dynamics.motion`."""
         return _kinematic(state, self.network(torch.cat([state[..., :4], inputs], -1)))
 
 
@@ -322,7 +323,7 @@ class TyreNetworkCar(Dynamics):
         )
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by tyre forces of the network; see `Dynamics.motion`."""
         return self.car.motion(
             state, inputs, self.forces(state, inputs, self.car.slips(state, inputs))
         )

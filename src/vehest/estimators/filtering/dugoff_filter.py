@@ -178,7 +178,7 @@ class DugoffFilter(SigmaPointEstimator):
         return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
-        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²].
+        """Whether forces are trusted, (T,), by the measured lateral acceleration (T,) [m/s²].
 
         See `in_nonlinear_range`.
         """

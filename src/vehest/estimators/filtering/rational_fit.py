@@ -173,7 +173,7 @@ class LevelSearch:
         return int((distance < LIMIT_MARGIN * np.ptp(boxes, axis=1)).sum())
 
     def levels_at(self, powers: FloatArray) -> dict[str, float]:
-        """All levels at powers of ten of the searched ones.
+        """Levels by name, at powers of ten of the searched ones.
 
         Sensors' levels are scaled until the normalised innovations squared are 1 on average.
         """

@@ -61,7 +61,7 @@ def rational_tanh(x: Any) -> Any:
     return _F(2.0) * n * d / (d * d + n * n)
 
 
-_rational_tanh = numba.njit(inline="always")(rational_tanh)
+_rational_tanh = numba.njit(inline="always")(rational_tanh)  # `rational_tanh`, compiled and inlined
 
 
 @overload(tanh)

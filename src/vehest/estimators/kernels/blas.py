@@ -8,7 +8,7 @@ from functools import cache
 import scipy.linalg.cython_blas  # noqa: F401 - loads the library that compiled code calls
 from threadpoolctl import ThreadpoolController
 
-_controller = cache(ThreadpoolController)
+_controller = cache(ThreadpoolController)  # controller of the numbers of threads, made once
 
 
 def single_blas_thread() -> AbstractContextManager[object]:

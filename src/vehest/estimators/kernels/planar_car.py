@@ -55,6 +55,7 @@ BLOCK = 110  # largest number of sigma points that are computed together
 # numbers of the kinds of cars, see `_kind_of`
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
 
+# options of numba for these functions
 _FAST = {"nogil": True, "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"}}
 compiled = entry(**_FAST)  # decorator of functions that Python calls
 piece = part(**_FAST)  # decorator of functions that only compiled ones call

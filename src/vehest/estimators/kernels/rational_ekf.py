@@ -25,7 +25,7 @@ from vehest.filters.gating import refuses
 from vehest.filters.kalman_scan import make_symmetric
 from vehest.vehicle.rational_tyres import rational_axle
 
-_axle = numba.njit(rational_axle)
+_axle = numba.njit(rational_axle)  # `rational_axle`, compiled
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from vehest.estimators.kernels.threads import over_members
 
+# decorator of compiled functions
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 
 LEVELS = 256  # the share of dropout is rounded to a multiple of 1/256

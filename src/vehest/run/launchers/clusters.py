@@ -73,7 +73,7 @@ class TaskSpec:
     """
 
     position: int  # index of the group among those that are launched
-    group: Group  # what is to be done
+    group: Group  # group of tasks to run
     folder: Path  # folder to which the driver's relative paths refer
     mark: Path  # folder in the driver's output root; a machine that finds it shares the root
     versions: Mapping[str, str]  # versions of the driver, which the machine must have too

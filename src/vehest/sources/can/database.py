@@ -134,7 +134,7 @@ class Database:
 
 
 def read_dbc(file: Path) -> list[Any]:
-    """All messages of a DBC, as cantools holds them.
+    """Messages of a DBC, as cantools holds them.
 
     The text is UTF-8, or else Windows-1252. Signals that no message sends are left out.
 

@@ -44,7 +44,7 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 def read_topics(
     bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All messages of topics, in the order in which the bag received them.
+    """Messages of topics, in the order in which the bag received them.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def read_topics(
 def survey_topics(
     bag: Path, ignored: Sequence[str], most_fields: int
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All topics whose messages are of ROS's own types, with their plain numbers.
+    """Topics whose messages are of ROS's own types, with their plain numbers.
 
     Parameters
     ----------

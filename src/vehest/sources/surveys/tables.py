@@ -158,7 +158,7 @@ class Shape:
     # there is no such row
     score: float = 0.0
     rate_hz: float | None = None  # rate that a line above the names states [Hz]
-    fault: str = ""  # what to do where there are no names, for messages
+    fault: str = ""  # text on what to do where there are no names
 
 
 def survey_table(file: Path) -> Log:
