@@ -72,9 +72,7 @@ OVERVIEW_CAPTION = (
 )
 # largest deviation of the recorded minutes from those asked for, over the latter, by which ends of
 # a few seconds may shorten them
-MAX_MINUTES_DEVIATION = (
-    0.15  # of the minutes asked for, by which ends of a few seconds may shorten them
-)
+MAX_MINUTES_DEVIATION = 0.15
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
