@@ -21,7 +21,7 @@ T = TypeVar("T")  # type of the setting
 class Declaration:
     """Declaration of a setting, besides its type and default."""
 
-    doc: str  # text for people
+    doc: str  # text on the setting, for people
     unit: str = ""  # SI unit; empty for what has none
     positive: bool = False  # whether it has to be more than 0
     least: float | None = None  # smallest value; None: no such bound

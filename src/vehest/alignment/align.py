@@ -240,8 +240,8 @@ def _parameter(
 
 
 def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
-    """Delay, then offsets (they are in the sensor's axes), then mounting, of those parameters whose
-    interval excludes zero.
+    """Configurations of the transforms that correct those parameters whose interval excludes zero,
+    in the order of their application: delay, offsets (they are in the sensor's axes), mounting.
     """
     values = {
         parameter.name: _rounded(parameter.value)

@@ -436,8 +436,8 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 
 def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Short excursions that begin and end with a jump: far beyond the usual range, or to one value
-    by steps that are far larger than usual.
+    """Findings of short excursions that begin and end with a jump: far beyond the usual range, or
+    to one value by steps that are far larger than usual.
 
     A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre
     needs longer to come and go. A wheel that shows nothing is the finding ``dropout``.

@@ -872,8 +872,8 @@ class Smoothing:
         return smooth[first : first + count]
 
     def kernel(self, order: int) -> FloatArray:
-        """Impulse response of a derivative of the low-pass; its norm is the deviation that white
-        noise of deviation 1 has after it.
+        """Impulse response of a derivative of the low-pass; its norm is the standard deviation,
+        after it, of white noise of standard deviation 1.
 
         Parameters
         ----------

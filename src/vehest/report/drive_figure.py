@@ -65,7 +65,8 @@ CHANNEL_LABELS = {
 HEALTH = {1: ("degraded", "#e69f00"), 2: ("invalid", "#6b1414")}
 VALID_COLOUR = "#dfe4e8"  # colour of valid samples in the panel of health
 CHANNEL_COLOUR = "#33373b"  # colour of measured channels
-COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to the left
+# colours of the course with β to the right, none, and to the left
+COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")
 # kind of panel -> its height, in
 HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}
 

@@ -318,9 +318,9 @@ class Reliability:
 
     label: str  # name of the estimator
     line: Line  # colour and marker
-    coverage: FloatArray  # fraction of errors inside
-    low: FloatArray  # lower end of its interval
-    high: FloatArray  # upper end
+    coverage: FloatArray  # share of errors inside the band of each level
+    low: FloatArray  # lower end of the interval of each coverage
+    high: FloatArray  # upper end of the interval of each coverage
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:

@@ -38,7 +38,7 @@ from vehest.sources.tabular import unused_columns
 # Time stamps between these count from 1970.
 MIN_UNIX_SECONDS = 6e8  # s, in 1989
 MAX_UNIX_SECONDS = 4e9  # s, in 2096
-MAX_LISTED_COLUMNS = 40  # columns of a table that are listed, at most
+MAX_LISTED_COLUMNS = 40  # largest number of columns of a table that are listed
 SPREAD = ("min", "mean", "max", "std")  # statistics of a channel that are listed
 
 Lines = list[str | TerminalTable]  # lines and tables for a terminal

@@ -46,7 +46,7 @@ from vehest.run.versions import code_of, is_of_other_stages
 CODE = "code"  # cause of a change: versions of code
 DATA = "data"  # cause of a change: raw files
 CAUSES = (CODE, CONFIGURATION, DATA)  # possible causes of a change of a published study
-MAX_NAMED = 6  # changes of a cause that are named; further ones are counted
+MAX_NAMED = 6  # largest number of changes of a cause that are named; further ones are counted
 STALE_LIST = "stale.yaml"
 """File in results/: studies that may still be stale, each with the reason and what will end it."""
 

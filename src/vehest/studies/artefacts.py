@@ -332,7 +332,8 @@ class StudyArtefacts:
     command: str  # the command that makes this report
     # part -> title, for all parts of the pipeline file
     titles: Mapping[str, str] = field(default_factory=dict)
-    # part -> what was compared in it; a study that is not in parts has one without a name
+    # name of a part -> artefacts that were compared in it; a study that is not in parts has one
+    # without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
     absent: Sequence[str] = ()  # parts whose raw files are not available
     # part -> names of trainings that are planned and not done, absent parts included

@@ -83,8 +83,8 @@ def record_of_epochs(
 
 
 class DivergenceError(DataError):
-    """A loss finds that its training has diverged, so that the trainer returns to the best
-    parameters so far.
+    """Raised by a loss that finds that its training has diverged, so that the trainer returns to
+    the best parameters so far.
     """
 
 

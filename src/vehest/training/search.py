@@ -22,7 +22,7 @@ from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
 INITIAL_STEP_SHARE = 0.05  # edge of the first simplex along a parameter, over its range
-UNUSABLE_COST = 1e6  # replaces a cost that is not finite, so that a search goes on elsewhere
+UNUSABLE_COST = 1e6  # cost in place of one that is not finite, so that a search goes on elsewhere
 MAX_GRID = 1000  # starts along a parameter
 Cost = Callable[[FloatArray], float]  # function of parameters (K,) that is minimised
 Box = Sequence[tuple[float, float]]  # smallest and largest value of each of K parameters

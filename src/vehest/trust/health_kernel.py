@@ -149,7 +149,8 @@ class Model(NamedTuple):
     layout: Layout  # sizes and columns
     settings: Settings  # limits and forgetting factors
     constant: Annotated[FloatArray, "channels"]  # c of the autoregression
-    lags: Annotated[FloatArray, "order channels channels"]  # A [lag, m, q]
+    # coefficients of the autoregression, A [lag, m, q]: of channel m at a lag in channel q
+    lags: Annotated[FloatArray, "order channels channels"]
     precision: Annotated[FloatArray, "channels channels"]  # S⁻¹
     deviation: Annotated[FloatArray, "channels"]  # standard deviation of the innovations
     instant: Annotated[FloatArray, "channels 13"]  # W

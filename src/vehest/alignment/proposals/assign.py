@@ -552,7 +552,9 @@ def _channels_of_motion(
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
-    """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
+    """Proposals of speed, yaw rate and lateral acceleration, without a speed that was made of
+    wheels.
+    """
     question = ""
     if "ay" in turning.columns:
         figures = f"correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"

@@ -24,7 +24,9 @@ from vehest.training.through_filter import (
 )
 from vehest.vehicle.dynamics import Perceptron, TyreNetworkCar
 
-SLIP = 0.3  # rad and 1, what slips are divided by before a network sees them
+# rad and 1, values by which slip angles and longitudinal slip are divided before a network sees
+# them
+SLIP = 0.3
 # weights of squared errors of vx, vy, yaw rate and rim speed: the inverse of how much they change
 # from sample to sample
 WEIGHTS = (0.2225, 0.5064, 0.1566, 0.1145)

@@ -92,7 +92,7 @@ class RationalModel:
     curve_covariance: FloatArray  # covariance of the curves' logarithms at the start, (4, 4)
     adapted: tuple[str, ...]  # tyre parameters that are states
     step: float  # Δt [s]
-    minimum_speed: float  # below it wheels roll without slip [m/s]
+    minimum_speed: float  # speed below which wheels roll without slip [m/s]
     adapt_above: float  # |u r| below which tyre parameters stay [m/s²]
     largest_sideslip: float  # |β| beyond which motion and tyres restart [rad]
     tyre_bound: float  # factor by which tyre parameters may differ from their start values

@@ -42,8 +42,8 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
     linear_weight: nn.Parameter  # w₁ of f₁ and f₂, (P, 2)
     linear_bias: nn.Parameter  # b₁ of f₁ and f₂, (P, 2), if there are biases
     hidden_weight: nn.Parameter  # w₂ of Q neurons of f₁ and f₂, (P, 2, Q)
-    output_weight: nn.Parameter  # w₃ of these neurons, (P, 2, Q)
-    hidden_bias: nn.Parameter  # b₂ of these neurons, (P, 2, Q), if there are biases
+    output_weight: nn.Parameter  # w₃ of Q neurons of f₁ and f₂, (P, 2, Q)
+    hidden_bias: nn.Parameter  # b₂ of Q neurons of f₁ and f₂, (P, 2, Q), if there are biases
     output_bias: nn.Parameter  # b₃ of f₁ and f₂, (P, 2), if there are biases
 
     def __init__(self, settings: Any, yaw_rate_max: float = 1.0) -> None:

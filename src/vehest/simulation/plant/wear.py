@@ -25,7 +25,8 @@ class Stint:
     wear_time: PositiveFloat = 1200.0  # time over which ``wear`` is lost [s]
 
     def friction_at(self, time: float) -> float:
-        """The factor at a time after the first sample [s]; before it, that of the first.
+        """Factor of the tyres' friction at a time after the first sample [s]; before it, that of
+        the first.
 
         Returns
         -------

@@ -19,7 +19,7 @@ from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
 # deg, root mean square of the reference, below which a test hardly distinguishes estimators
 MIN_SIDESLIP_DEG = 0.5
-# lowest error over the noise of the reference, below which errors of the reference may decide the
+# lowest error over the noise of the reference below which errors of the reference may decide the
 # order of estimators
 MIN_ERROR_OVER_NOISE = 2.0
 MAX_BOUND_OVER_SIGNAL = (
