@@ -36,7 +36,7 @@ from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.train import model_artefact
 from vehest.trust.bands import LEVELS, Bands, Piece, calibrated, pooled_quantile
-from vehest.trust.calibration import Stretch, pieces_of
+from vehest.trust.calibration import CalibrationRange, pieces_of
 from vehest.trust.record import About, Trust, read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -180,14 +180,14 @@ def scaled_by_variance(bands: Bands, pieces: Sequence[Piece]) -> Bands:
     return replace(bands, **own)
 
 
-def development_drives(car: Car, output: Path) -> list[Stretch]:
+def development_drives(car: Car, output: Path) -> list[CalibrationRange]:
     """Drives of a car that the filter's choices were made on, with ax from the speed where it was not measured."""
     runner = Runner(output, Messages(), StopSignals())
     found = []
     for drive in drives_of(car, runner, os.environ["VEHEST_DATA"]):
         ax = drive["ax"] if "ax" in drive else np.gradient(drive["vx"], 1.0 / drive.rate_hz)
         whole = replace(drive, channels={**drive.channels, "ax": ax})
-        found.append(Stretch(whole, whole.start_time, car.dataset, whole.id))
+        found.append(CalibrationRange(whole, whole.start_time, car.dataset, whole.id))
     return found
 
 

@@ -10,7 +10,7 @@ import signal
 import sys
 from types import FrameType
 
-INTERRUPTED = 128 + signal.SIGINT  # exit code
+INTERRUPTED = 128 + signal.SIGINT  # exit code of a process that Ctrl-C ended
 
 
 def main() -> None:

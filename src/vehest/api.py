@@ -44,7 +44,7 @@ from vehest.inference.models import SELF_CALIBRATING, find_model, open_model
 from vehest.inference.reading import read_checked, without_references
 from vehest.inference.tables import write_estimate_table
 from vehest.sources.named_columns import read_frame
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
@@ -192,7 +192,9 @@ def _fitted(
         for part in (train, validation)
     ]
     model.fit(FitData(*parts), settings)
-    learnt, stopped = ([Stretch(own, own.start_time, "", own.id) for own in part] for part in parts)
+    learnt, stopped = (
+        [CalibrationRange(own, own.start_time, "", own.id) for own in part] for part in parts
+    )
     model.trust = learn_trust(model, learnt, stopped)
     return model
 
@@ -373,6 +375,7 @@ def estimate(
 
 
 def _fields_of(series: PlainRecording | PlainEstimate) -> dict[str, Any]:
+    """Name -> value of each field of a recording or an estimate."""
     return {field.name: getattr(series, field.name) for field in fields(series)}
 
 
@@ -396,14 +399,15 @@ def _for_car(
 
 
 class OnlineEstimate(NamedTuple):
-    """What an estimator returns after a sample."""
+    """Estimate of a model after a sample."""
 
     vy: float  # lateral velocity [m/s]; NaN only before the first estimate
-    sideslip: float  # [rad]
-    health: float  # 0 valid, 1 degraded, 2 invalid
-    health_reason: float  # for `reason_in_words`
-    band_vy: float = math.nan  # half widths of the 90 % band, NaN without a calibration [m/s]
-    band_sideslip: float = math.nan  # [rad]
+    sideslip: float  # sideslip angle [rad]
+    health: float  # 0: valid, 1: degraded, 2: invalid
+    health_reason: float  # number of the reasons, for `reason_in_words`
+    band_vy: float = math.nan  # half width of the 90 % band of vy [m/s]; NaN without a calibration
+    # half width of the 90 % band of the sideslip angle [rad]; NaN likewise
+    band_sideslip: float = math.nan
 
 
 class OnlineEstimator:
@@ -460,7 +464,9 @@ class OnlineEstimator:
 
     @property
     def lead_seconds(self) -> float:
-        """How long after its sample an estimate applies [s]; negative behind a slow low-pass."""
+        """Time from a sample to the instant for which its estimate holds [s]; negative behind a
+        slow low-pass.
+        """
         rate = self.stepper.estimator.settings.rate_hz
         return float(self.stepper.horizon_steps / rate - self.stepper.delay)
 

@@ -34,6 +34,7 @@ from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.configuration.composition import Config
+# the command line
 app = typer.Typer(
     name="vehest",
     no_args_is_help=True,
@@ -46,16 +47,20 @@ app = typer.Typer(
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable "
     "data, 4 something is missing, 5 some jobs failed, 130 or 143 stopped by a signal.",
 )
+# commands of ``vehest data``
 data_app = typer.Typer(no_args_is_help=True, help="Inspect data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
-ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-MAX_ERROR_CHARACTERS = 4_000  # of an error message; the rest is cut off
-NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"  # of Typer
-STAGES = "Single stages, all of which `run` includes"
-CLUSTER = "On a cluster"
+ROOT_KEYS = ("root", "output", "seed", "rate_hz")  # keys of the configuration outside groups
+# largest number of characters of an error message; the rest is cut off
+MAX_ERROR_CHARACTERS = 4_000
+# message of Typer that is replaced
+NOT_A_NUMBER = "Input should be a valid number, unable to parse string as a number"
+STAGES = "Single stages, all of which `run` includes"  # title of a panel of the help
+CLUSTER = "On a cluster"  # title of a panel of the help
+# commands whose configuration can be shown
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
-OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")
+OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")  # default output root
 
 
 def _offered(*groups: str) -> str:
@@ -68,7 +73,8 @@ def _offer(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
-DATASETS = _offer(lambda: choices("dataset"))
+DATASETS = _offer(lambda: choices("dataset"))  # completion by names of data sets
+# completion by names of models
 MODELS = _offer(
     lambda: [
         "pretrained",
@@ -76,15 +82,19 @@ MODELS = _offer(
         *(model_folder.name for model_folder in Path(OUTPUT, "train").glob("[!.]*")),
     ]
 )
+# completion by choices of groups
 OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
-PIPELINES = _offer(pipeline_names)
+PIPELINES = _offer(pipeline_names)  # completion by names of pipelines
 
 
+# type of the option ``--dry-run``
 DryRun = Annotated[
     bool,
     typer.Option("--dry-run", help="List the stages that would run or be reused; run nothing."),
 ]
+# type of the option ``--force``
 Force = Annotated[bool, typer.Option("--force", help="Run again although the result exists.")]
+# type of an argument that is a data set or a file
 DatasetOrFile = Annotated[
     str,
     typer.Argument(
@@ -92,16 +102,20 @@ DatasetOrFile = Annotated[
         autocompletion=DATASETS,
     ),
 ]
+# type of the option ``--json``
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")
 ]
+# type of the option ``--quiet``
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
+# type of the option ``--jobs``
 Jobs = Annotated[
     int | None,
     typer.Option(
         "--jobs", "-j", min=1, help="Number of parallel processes; by default one per core."
     ),
 ]
+# type of the option ``--launcher``
 LauncherName = Annotated[
     str,
     typer.Option(
@@ -114,6 +128,7 @@ LauncherName = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of the option ``--address``
 Address = Annotated[
     str | None,
     typer.Option(
@@ -125,6 +140,7 @@ Address = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of the option ``--slurm``
 Slurm = Annotated[
     list[str] | None,
     typer.Option(
@@ -135,11 +151,13 @@ Slurm = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
+# type of an argument that is a data set
 Dataset = Annotated[
     str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)
 ]
 
 
+# type of the arguments that are overrides
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(
@@ -539,10 +557,10 @@ def identify(
     estimate lap.csv --car my_car.yaml` starts from wheelbase, leakage and rear axle.
     """
     require_paths(files_and_overrides(words)[0])
-    from vehest.run.identify import identify_files, in_words
+    from vehest.run.identify import identify_files, record_table
 
     record = identify_files(words, out)
-    emit(as_json, {"out": str(out), **asdict(record)}, [in_words(record), f"out: {out}"])
+    emit(as_json, {"out": str(out), **asdict(record)}, [record_table(record), f"out: {out}"])
 
 
 @app.command()
@@ -912,7 +930,7 @@ def report(
 
         messages = Messages(quiet=quiet)
         with messages.running("import", "vehest"):
-            from vehest.run.published import check_listed, check_published, in_words
+            from vehest.run.published import check_listed, check_published, describe_verdict
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         names, overrides_of_check = files_and_overrides(words)
@@ -921,7 +939,7 @@ def report(
             if names
             else check_listed(overrides_of_check, messages)
         )
-        emit(as_json, verdicts, map(in_words, verdicts))
+        emit(as_json, verdicts, map(describe_verdict, verdicts))
         failed = any(
             verdict["failure"] if "failure" in verdict else verdict["state"] != "up to date"
             for verdict in verdicts
@@ -1222,7 +1240,7 @@ def data_align(
     """
     require_dataset_or_file(source)
     from vehest.alignment.settings import AlignmentSettings
-    from vehest.run.align import align_recording, as_plain, in_words, write_alignment
+    from vehest.run.align import align_recording, alignment_lines, as_plain, write_alignment
 
     quantities = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(
@@ -1234,7 +1252,7 @@ def data_align(
     emit(
         as_json,
         {**as_plain(alignment), "out": None if out is None else str(out)},
-        in_words(alignment, out),
+        alignment_lines(alignment, out),
     )
 
 
@@ -1280,12 +1298,13 @@ def main() -> None:
 
 
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
-"""What Typer raises for options, arguments and commands that it does not know; newer ones carry
-their own copy of Click.
+"""Base of the exceptions of Typer for options, arguments and commands that it does not know; newer
+ones carry their own copy of Click.
 """
 
 
 def _fail_usage(error: Any) -> None:
+    """End with exit code 2 and one line on a wrong usage."""
     context = error.ctx
     if type(error).__name__ == "NoArgsIsHelpError":  # the help is on the screen
         sys.exit(error.exit_code)
@@ -1306,6 +1325,7 @@ def _fail_usage(error: Any) -> None:
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:
+    """End with a message of one line and an exit code."""
     line = printable(" ".join(message.split()))
     try:
         sys.stdout.flush()
@@ -1364,6 +1384,7 @@ def _run_study(
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
+    """The resolved configuration of a command."""
     from vehest.configuration.composition import compose_config
 
     return compose_config(command, overrides)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-GRAVITY = 9.81  # m/s²
+GRAVITY = 9.81  # standard gravity [m/s²]
 
 FloatArray = NDArray[np.float64]
 """Array of double precision, of any shape."""

@@ -8,34 +8,35 @@ from typing import Any, ClassVar, TypeVar
 
 from vehest.data.errors import ConfigurationError
 
-# of a setting, in SI units: far beyond what any of them means, far below what overflows
+# largest magnitude of a setting, in SI units: far beyond what any of them means, far below what
+# overflows
 MAX_SETTING = 1e12
 UNSET: Any = None  # default of a number that has to be given, or else follows from others
-MAX_WIDTH = 4096  # of a layer, a window or an ensemble: more would take all memory
+MAX_WIDTH = 4096  # largest width of a layer, a window or an ensemble: more would take all memory
 
-T = TypeVar("T")
+T = TypeVar("T")  # type of the setting
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What is declared of a setting beside its type and default."""
+    """Declaration of a setting, besides its type and default."""
 
-    doc: str  # text for people
+    doc: str  # text on the setting, for people
     unit: str = ""  # SI unit; empty for what has none
     positive: bool = False  # whether it has to be more than 0
-    least: float | None = None  # smallest value; none: no such bound
-    most: float | None = None  # largest value
-    above: float | None = None  # value that it has to exceed
-    below: float | None = None  # value that it has to stay under
-    # values that the search for a fitted number starts from; empty where it has a closed form
+    least: float | None = None  # smallest value; None: no such bound
+    most: float | None = None  # largest value; None: no such bound
+    above: float | None = None  # value that it has to exceed; None: no such bound
+    below: float | None = None  # value that it has to stay below; None: no such bound
+    # values from which the search for a fitted number starts; empty where it has a closed form
     start: tuple[float, ...] = ()
-    box: tuple[float, float] = (0.0, 0.0)  # range that the search stays within
+    box: tuple[float, float] = (0.0, 0.0)  # range within which the search stays
     # channel whose largest absolute value in training multiplies start and box; empty: none
     of_largest: str = ""
     is_fitted: bool = False  # whether the fit determines it unless it is given
 
     def problem(self, value: Any) -> str:
-        """What is wrong with a value, as text that follows its name; empty if it is valid."""
+        """Text on what is wrong with a value, which follows its name; empty if it is valid."""
         if value is None:
             return ""
         if isinstance(value, int | float) and not abs(value) <= MAX_SETTING:
@@ -100,7 +101,7 @@ class Group:
         A value is out of its bounds.
     """
 
-    group: ClassVar[str] = "estimator"
+    group: ClassVar[str] = "estimator"  # name of the group in a configuration, for messages
 
     def __post_init__(self) -> None:
         for name, declared in self.declarations().items():
@@ -110,6 +111,6 @@ class Group:
 
     @classmethod
     def declarations(cls) -> Mapping[str, Declaration]:
-        """Name -> declaration."""
+        """Name of a setting -> its declaration."""
         declared = {field_.name: declaration(field_) for field_ in fields(cls)}
         return {name: value for name, value in declared.items() if value is not None}

@@ -29,6 +29,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
 VECTOR_BYTES = 64  # size of a vector, in either precision
+# flags of LLVM that allow a product and a sum to be contracted to one rounding
 _FUSED = ("contract",)
 
 
@@ -269,7 +270,10 @@ _between(
 @infer_global(root)
 @infer_global(operator.neg)
 class _Own(AbstractTemplate):  # type: ignore[misc]
+    """Typing of operations on one vector, whose result is a vector of the same type."""
+
     def generic(self, args: Any, kws: Any) -> Any:
+        """Signature for one argument of the type `Lanes`; None for any other."""
         return signature(args[0], *args) if isinstance(args[0], Lanes) else None
 
 

@@ -14,12 +14,12 @@ from vehest.data.splits import Span
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import (
     band_figures,
-    banded,
     coverage_intervals,
     crps_of_levels,
     figures_by_regime,
     interval_score,
     proportion_interval,
+    scored_bands,
 )
 from vehest.evaluation.metrics import (
     COVERAGE,
@@ -141,7 +141,7 @@ def test_interval_of_full_coverage_matches_single_sample_blocks_and_counts_edges
 def test_true_bands_have_their_nominal_coverage():
     rng = np.random.default_rng(4)
     parts = [part_of(rng), part_of(rng)]
-    banded_errors = banded(parts, BANDS)
+    banded_errors = scored_bands(parts, BANDS)
     turns = [np.sin(part.time) for part in parts]
     figures = band_figures(banded_errors, parts, turns, 20.0)
     assert set(figures) <= set(UNITS)
@@ -173,7 +173,7 @@ def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
     moving = replace(part.at(slice(half)), bands={q: b[:half] for q, b in part.bands.items()})
     figures_of_parts = []
     for drive in (moving, stopping):
-        within = banded([drive], BANDS)
+        within = scored_bands([drive], BANDS)
         figures = band_figures(within, [drive], [None], 20.0)
         figures_of_parts.append((figures, coverage_intervals(within, [drive], 20.0)))
     for name in ("coverage_90", "width_90", "interval_score", "crps"):
@@ -188,7 +188,7 @@ def test_bands_of_sideslip_are_judged_where_it_is_scored_alone():
         2.0 * 0.1 * GAUSSIAN[2], rel=1e-12
     )
     nothing = replace(part, is_sideslip_scored=np.zeros(len(part.time), dtype=bool))
-    within = banded([nothing], BANDS)
+    within = scored_bands([nothing], BANDS)
     assert set(band_figures(within, [nothing], [None], 20.0)) == {
         name for name in figures_of_parts[0][0] if name.endswith("_vy")
     }
@@ -203,7 +203,7 @@ def test_figures_by_lateral_acceleration_omit_rare_ranges():
         "ay_6_": (6.0, math.inf),
     }
     masks = {name: (part.ay >= low) & (part.ay < high) for name, (low, high) in names.items()}
-    figures = figures_by_regime(banded([part], BANDS), [masks], 20.0)
+    figures = figures_by_regime(scored_bands([part], BANDS), [masks], 20.0)
     assert set(figures) == {"ay_0_2", "ay_2_4", "ay_4_6"}
     assert figures["ay_0_2"]["coverage_90"] == pytest.approx(0.9, abs=0.05)
 

@@ -18,7 +18,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import Stepper
 from vehest.estimators.registry import estimator_names
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.contract import GuardedRun, GuardedStepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import RESTART, usual_limits
@@ -355,7 +355,9 @@ def calibrated(name, **settings):
     else:
         drives = [kind(60.0, rate, seed=seed) for seed in range(3)]
     drives = [drive[0] if isinstance(drive, tuple) else drive for drive in drives]
-    learnt, stopped = ([Stretch(drive, drive.start_time, "", drive.id)] for drive in drives[:2])
+    learnt, stopped = (
+        [CalibrationRange(drive, drive.start_time, "", drive.id)] for drive in drives[:2]
+    )
     return estimator, learn_trust(estimator, learnt, stopped), drives[2].without_references()
 
 

@@ -17,7 +17,7 @@ from vehest.data.store import write_estimate, write_recording
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_names
 from vehest.inference.estimation import estimate_recording
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.record import write_trust
 
 FOLDER = Path(__file__).parent
@@ -57,7 +57,8 @@ def main():
         folder.mkdir(parents=True)
         save_model(estimator, folder, {"seed": 0, "downsample": PREPARATION})
         learnt, stopped = (
-            [Stretch(drive, drive.start_time, "", drive.id)] for drive in _drives(estimator)
+            [CalibrationRange(drive, drive.start_time, "", drive.id)]
+            for drive in _drives(estimator)
         )
         trust = learn_trust(estimator, learnt, stopped)
         write_trust(trust, folder)

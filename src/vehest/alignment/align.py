@@ -51,6 +51,7 @@ from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.recording import Recording
 from vehest.data.transforms import transform_from_config
 
+# name of a parameter -> its SI unit
 UNITS: dict[str, str] = {
     "lever_x": "m",
     "lever_y": "m",
@@ -67,7 +68,7 @@ UNITS: dict[str, str] = {
 READ_AS = {"rad": (180.0 / math.pi, "deg"), "s": (1e3, "ms")}
 """SI unit -> factor and unit in tables for people; files and JSON hold SI units."""
 
-# rad s²/m of the understeer gradient, by which real cars depart from a constant one
+# rad s²/m, by which the understeer gradients of real cars depart from a constant one
 UNDERSTEER_CHANGE = 3e-4
 LINKAGE_CHANGE = 0.06
 """Standard deviation of the ratio from linkage, wheelbase and gain of the yaw rate, as a share of
@@ -86,12 +87,12 @@ steady-state relation.
 class Parameter:
     """One estimated number."""
 
-    name: str  # in `UNITS`
-    value: float  # in SI units
-    uncertainty: float  # standard uncertainty, both contributions together
+    name: str  # name, one of `UNITS`
+    value: float  # estimate in SI units
+    uncertainty: float  # standard uncertainty of all contributions together
     low: float  # lower end of the 95 % interval
-    high: float  # its upper end
-    scatter: float  # contribution of the residuals' scatter
+    high: float  # upper end of the 95 % interval
+    scatter: float  # contribution of the residuals' scatter to it
     tilt: float  # contribution of roll and pitch of body and road that are not measured
     model: float = 0.0  # contribution of an understeer gradient that is not constant
 
@@ -110,11 +111,11 @@ class Parameter:
 class Residual:
     """Low-passed difference between a sensor and its expected signal by the reference."""
 
-    channel: str
-    unit: str
-    # ``before`` as recorded, ``after`` once the transforms have been applied, ``rest`` without the
-    # part that follows the accelerations, as
-    # roll and pitch do, NaN where not fitted
+    channel: str  # channel of the sensor
+    unit: str  # SI unit of the channel
+    # root mean square: ``before`` as recorded, ``after`` once the transforms have been applied,
+    # ``rest`` without the part that follows the accelerations, as roll and pitch do; NaN where not
+    # fitted
     rms: Mapping[str, float]
 
 
@@ -122,15 +123,16 @@ class Residual:
 class Alignment:
     """Alignment of a measuring set-up by a drive."""
 
-    recording: Recording  # as it was
-    settings: AlignmentSettings
-    parameters: tuple[Parameter, ...]  # in the order of `UNITS`
+    recording: Recording  # recording as it was
+    settings: AlignmentSettings  # settings of the estimate
+    parameters: tuple[Parameter, ...]  # estimated parameters in the order of `UNITS`
     transforms: tuple[
         Mapping[str, Any], ...
     ]  # configurations of the transforms that would correct it, in the order of their application
-    residuals: tuple[Residual, ...] = ()  # of the channels that were compared
-    correlation: Correlation | None = None  # where there is a reference
-    notes: tuple[str, ...] = ()  # a sentence or two each
+    residuals: tuple[Residual, ...] = ()  # residuals of the channels that were compared
+    # cross-correlation of sensor and reference; None where there is no reference
+    correlation: Correlation | None = None
+    notes: tuple[str, ...] = ()  # remarks, a sentence or two each
 
     def __getitem__(self, name: str) -> Parameter:
         """A parameter by its name. Raises `KeyError`: it was not asked for."""
@@ -226,8 +228,8 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
 def _parameter(
     name: str, value: float, scatter: float, tilt: float, freedom: int, model: float = 0.0
 ) -> Parameter:
-    """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch
-    and Satterthwaite (GUM, G.4.1).
+    """A parameter with the 95 % interval of Student's distribution, effective degrees of freedom
+    after Welch and Satterthwaite (GUM, G.4.1).
     """
     uncertainty = math.hypot(scatter, tilt, model)
     effective = freedom * (uncertainty / scatter) ** 4 if scatter > 0 else math.inf
@@ -238,8 +240,8 @@ def _parameter(
 
 
 def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
-    """Delay, then offsets (they are in the sensor's axes), then mounting, of those parameters whose
-    interval excludes zero.
+    """Configurations of the transforms that correct those parameters whose interval excludes zero,
+    in the order of their application: delay, offsets (they are in the sensor's axes), mounting.
     """
     values = {
         parameter.name: _rounded(parameter.value)
@@ -511,5 +513,5 @@ def _percent(share: float) -> str:
 
 
 def _rounded(value: float) -> float:
-    """Six significant digits, as configurations show a value."""
+    """A value rounded to six significant digits, as configurations show it."""
     return float(f"{value:.6g}")

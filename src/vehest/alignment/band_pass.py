@@ -9,7 +9,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
-EXTENSION = 15  # samples added at both ends by odd reflection
+EXTENSION = 15  # number of samples that are added at both ends by odd reflection
 
 
 def butterworth_band(low_hz: float, high_hz: float, rate_hz: float) -> FloatArray:

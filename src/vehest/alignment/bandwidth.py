@@ -14,28 +14,33 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
-# s; a delay that is surely longer is reported, and one by holding is a warning
+# s; a delay that is surely longer is reported; one by holding is then a warning
 MIN_REPORTED_DELAY_SECONDS = 0.015
-MIN_PHASE_SHARE = 0.9  # share of the phase that a low-pass must explain
-MIN_TIME_CONSTANT_SECONDS = 0.1  # s; a shorter one is a delay in the band where cars move
-# s; yaw rate that surely lags the steering angle by more is reported
+MIN_PHASE_SHARE = 0.9  # smallest share of the phase that a low-pass must explain
+# s, smallest time constant of a low-pass; a shorter one is a delay in the band where cars move
+MIN_TIME_CONSTANT_SECONDS = 0.1
+# s, longest lag of the yaw rate behind the steering angle that is not reported
 MAX_YAW_RESPONSE_SECONDS = 0.3
-MIN_CHANGES = 20  # changes of value; with fewer a channel does not count as held
-MAX_ADJACENT_SHARE = 0.1  # share of changes that may follow the one before at once
+MIN_CHANGES = 20  # smallest number of changes of value of a held channel
+# largest share of changes of a held channel that follow the one before at once
+MAX_ADJACENT_SHARE = 0.1
 # share of changes by one quantum above which a channel is quantised, not held
 MAX_SINGLE_STEP_SHARE = 0.5
-COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")  # health expects these to change all the time
-# Hz; a faster recording is low-passed where it is brought to the rate of a model
+# channels that may be coarse; health expects these to change all the time
+COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")
+# Hz, highest rate of a recording in which coarse channels matter; a faster one is low-passed where
+# it is brought to the rate of a model
 MAX_COARSE_RATE_HZ = 30.0
-MAX_LEVELS = 5000.0  # steps in the range of a channel; one with more is not coarse
-MIN_WHOLE_STEP_SHARE = 0.99  # of the changes of a coarse channel are whole numbers of its step
-STEP_TOLERANCE = 0.02  # distance of a change from whole numbers of the step, in steps
-# s around a sample; where the share of repeated samples is MIN_REPEAT_SHARE, health calls them held
-REPEAT_SECONDS = 0.5
-MIN_REPEAT_SHARE = 0.3
-MIN_COARSE_SHARE = 0.05  # of the moving time that a coarse channel repeats samples so
-COARSE_CUTOFF_HZ = 3.0  # Hz, of the low-pass that removes the steps of a coarse channel
-MAX_CUTOFF_SHARE = 0.4  # of the sampling rate, above which that cut-off does not lie
+MAX_LEVELS = 5000.0  # largest number of steps in the range of a coarse channel
+# smallest share of the changes of a coarse channel that are whole numbers of its step
+MIN_WHOLE_STEP_SHARE = 0.99
+STEP_TOLERANCE = 0.02  # largest distance of such a change from whole numbers of the step, in steps
+REPEAT_SECONDS = 0.5  # s around a sample in which repeated samples are counted
+MIN_REPEAT_SHARE = 0.3  # share of repeated samples from which on health calls them held
+# smallest share of the moving time in which a coarse channel repeats samples so
+MIN_COARSE_SHARE = 0.05
+COARSE_CUTOFF_HZ = 3.0  # Hz, cut-off of the low-pass that removes the steps of a coarse channel
+MAX_CUTOFF_SHARE = 0.4  # largest ratio of this cut-off to the sampling rate
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
@@ -139,7 +144,7 @@ def low_pass_findings(
 
 
 def _seconds(measured: Measured) -> str:
-    """A time with its 95 % interval as text, its lower end at least zero."""
+    """Text of a time with its 95 % interval, whose lower end is at least zero."""
     return f"{measured.value:.2g} s (95 %: {max(measured.low, 0.0):.2g} to {measured.high:.2g})"
 
 
@@ -211,7 +216,7 @@ def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
 
 
 def coarse_steps(recording: Recording, moving: BoolArray) -> dict[str, float]:
-    """Coarse channels -> their step [SI]; those that are held or have gaps are left out.
+    """Coarse channel -> its step [SI]; channels that are held or have gaps are left out.
 
     A coarse channel changes by whole numbers of its step, between which its samples repeat; only
     those where the car is ``moving``, (T,), count.
@@ -244,7 +249,7 @@ def coarse_cutoff_hz(rate_hz: float) -> float:
 
 
 def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:
-    """How often a held channel, (T,), really changes [1/s]; None if it is not held.
+    """Rate at which a held channel, (T,), really changes [1/s]; None if it is not held.
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does
     so too while it moves slowly, but by one quantum at a time.

@@ -50,45 +50,51 @@ MAX_WRONG_UNITS = 3  # units that are corrected one after another; further ones 
 STUCK_SECONDS = 1.0  # s of driving with one value, from which on a channel counts as stuck
 MIN_STUCK_SAMPLES = 3  # equal samples in a row; shorter runs do not count as stuck
 MIN_COARSE_LEVELS = 10  # different values of a coarse sensor; a command that rests takes fewer
-# share of the samples at an extreme value, above which it may be saturation
+# share of the samples at an extreme value above which it may be saturation
 SATURATED_FRACTION = 2e-3
-# times as often as the value next to it; a quantised sine has 2.4 times as many at its peak
+# smallest ratio of the samples at a saturated value to those at the next one; a quantised sine has
+# 2.4 at its peak
 SATURATED_EXCESS = 4
 USUAL_QUANTILES = (0.005, 0.995)  # quantiles of a channel's samples that bound its usual range
 SPIKE_EXCESS = 1.0  # widths of the usual range; samples that lie further beyond it may be spikes
 SPIKE_SECONDS = 0.25  # s; a longer excursion beyond the usual range is no spike
 USUAL_STEP_QUANTILE = 0.995  # quantile of |steps between samples| that is the usual step
-SPIKE_STEP = 3.0  # usual steps that a spike must jump by: a sensor that shakes jumps all the time
-JUMP_STEP = 20.0  # usual steps by which an excursion within the usual range must jump away and back
+# smallest jump of a spike, in usual steps: a sensor that shakes jumps all the time
+SPIKE_STEP = 3.0
+# smallest jump away and back of an excursion within the usual range, in usual steps
+JUMP_STEP = 20.0
 JUMP_SECONDS = 1.0  # s; a longer excursion within the usual range is not reported
-STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
-STRAIGHT_SPEED = 3.0  # m/s; slower samples are not used as straight ahead
-# s of driving straight ahead; with less neither steering offset nor speed is checked
+STRAIGHT_YAW_RATE = 0.02  # rad/s, largest yaw rate that counts as straight ahead
+STRAIGHT_SPEED = 3.0  # m/s, lowest speed of samples that count as straight ahead
+# s, shortest time of driving straight ahead by which steering offset and speed are checked
 STRAIGHT_SECONDS = 3.0
-# rad while driving straight ahead; the limit of the steering wheel is more than the crown of a road
-# requires
+# rad, largest offset while driving straight ahead; for the steering wheel more than the crown of a
+# road requires
 MAX_STEERING_OFFSETS = {"steer": np.deg2rad(3.0), "handwheel": np.deg2rad(2.5)}
 # rad, steps of a steering wheel's angle from one sample to the next that are those of a full turn:
 # a hand turns it by less
 FULL_TURN = (1.5 * np.pi, 2.5 * np.pi)
-MAX_SPEED_DIFFERENCE = 0.04  # share of the reference's; speedometers read up to 10 % too much
-MAX_READING_ERROR = 0.35  # share of the reference's speed, beyond which a unit may be wrong
-# rad, mounting angle about the vertical; smaller ones are not reported
-MIN_ROTATION = np.deg2rad(4.0)
-# smaller estimate of that angle over the larger one; below it is no rotation
+# largest difference from the reference's speed, as a share of it; speedometers read up to 10 % too
+# much
+MAX_SPEED_DIFFERENCE = 0.04
+# largest such share that is an error of reading; beyond it a unit may be wrong
+MAX_READING_ERROR = 0.35
+MIN_ROTATION = np.deg2rad(4.0)  # rad, smallest mounting angle about the vertical that is reported
+# smallest ratio of the smaller to the larger of two estimates of that angle
 MIN_ROTATION_AGREEMENT = 0.6
-MIN_ROTATION_MOTION = 0.4  # m/s², standard deviation of d(vx)/dt and of vx·yaw_rate
-MAX_ROTATION_GAIN_ERROR = 0.35  # distance of either gain from 1, beyond which it is no rotation
-DROPOUT_SPEED = 3.0  # m/s; wheels of a slower car are not checked
-DROPOUT_SHARE = 0.1  # of the other wheels' median speed, below which a wheel's signal is lost
-DROPOUT_SECONDS = 0.1  # s; a shorter loss is not reported
+# m/s², smallest standard deviation of d(vx)/dt and of vx·yaw_rate by which it is estimated
+MIN_ROTATION_MOTION = 0.4
+MAX_ROTATION_GAIN_ERROR = 0.35  # largest distance of either gain from 1 for a rotation
+DROPOUT_SPEED = 3.0  # m/s, lowest speed at which wheels are checked
+DROPOUT_SHARE = 0.1  # speed of a wheel over the other wheels' median below which its signal is lost
+DROPOUT_SECONDS = 0.1  # s, shortest loss that is reported
 DROPOUT_BRAKING = 4.0  # m/s²; while braking harder a wheel may be locked, and does not count
 DROPOUT_CLEAR_SECONDS = 1.0  # s before and after such braking that do not count either
-REVERSE_SPEED = 0.5  # m/s; a car that rolls backwards faster than this is reversing
-REVERSE_SECONDS = 1.0  # s; driving backwards for less is not reported
-# m/s; a faster car does not go backwards. Below, the signs of ay and steering decide
+REVERSE_SPEED = 0.5  # m/s, lowest speed at which a car that goes backwards is reversing
+REVERSE_SECONDS = 1.0  # s, shortest time of driving backwards that is reported
+# m/s, highest speed of a car that reverses; below it, the signs of ay and steering decide
 MAX_REVERSE_SPEED = 8.0
-MIN_REVERSE_YAW_RATE = 0.03  # rad/s; with less the signs of ay and steering do not count
+MIN_REVERSE_YAW_RATE = 0.03  # rad/s, smallest yaw rate at which the signs of ay and steering count
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
@@ -255,7 +261,7 @@ def _without_ax_of_speed(recording: Recording) -> Recording:
 
 
 def _kinematics(motion: Motion) -> Iterator[Finding]:
-    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
+    """Findings where ay - vx·yaw_rate does not follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
     band = kinematic_band(motion)
     if (
         band is None
@@ -288,7 +294,8 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
 
 
 def _rotation(motion: Motion) -> Iterator[Finding]:
-    """d(vx)/dt must show in ax alone and vx·yaw_rate in ay alone.
+    """Findings of a turned inertial unit: d(vx)/dt must show in ax alone and vx·yaw_rate in ay
+    alone.
 
     A unit that is turned by ψ about the vertical, counter-clockwise, reads ax = cos ψ d(vx)/dt +
     sin ψ vx·yaw_rate and ay = -sin ψ d(vx)/dt + cos ψ vx·yaw_rate; each of the two has its own
@@ -339,8 +346,8 @@ def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
-    """Values that stay the same for long while the car moves; at standstill nothing needs to
-    change.
+    """Findings of values that stay the same for long while the car moves; at standstill nothing
+    needs to change.
     """
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
@@ -385,8 +392,9 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 
 def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolArray:
-    """Which runs of equal values (N, 2) a coarse channel enters and leaves by its smallest step, as
-    a sensor that was stuck does not; none where it takes few values, as a command does.
+    """Whether a coarse channel enters and leaves each of the runs of equal values (N, 2) by its
+    smallest step, as a sensor that was stuck does not; none where it takes few values, as a command
+    does.
     """
     if len(np.unique(samples)) < MIN_COARSE_LEVELS:
         return np.zeros(len(runs), bool)
@@ -431,8 +439,8 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
 
 
 def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Short excursions that begin and end with a jump: far beyond the usual range, or to one value
-    by steps that are far larger than usual.
+    """Findings of short excursions that begin and end with a jump: far beyond the usual range, or
+    to one value by steps that are far larger than usual.
 
     A code for "not available", a lost bit or a zero for want of a sample looks so; a manoeuvre
     needs longer to come and go. A wheel that shows nothing is the finding ``dropout``.
@@ -529,8 +537,8 @@ def _usual_step(measured: FloatArray) -> tuple[float, set[float]]:
 
 
 def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Straight ahead a steering angle must be about zero: its median where a moving car hardly
-    turns, less what is proportional to yaw_rate/vx.
+    """Findings of a steering angle that is not about zero straight ahead: its median where a moving
+    car hardly turns, less what is proportional to yaw_rate/vx.
     """
     for name, max_offset in MAX_STEERING_OFFSETS.items():
         if not {"vx", "yaw_rate", name} <= set(recording.channels):
@@ -584,7 +592,7 @@ def _rows_of_full_turns(recording: Recording) -> NDArray[np.int64]:
 
 
 def _speed_difference(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Straight ahead, where wheels slip least, the car's speed must be the reference's."""
+    """Findings of a speed that is not the reference's straight ahead, where wheels slip least."""
     if not {"vx", "vx_ref", "yaw_rate"} <= set(recording.channels):
         return
     is_straight = np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE
@@ -633,7 +641,9 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
 
 
 def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
-    """Driving backwards is legitimate, but most estimators take the car to go forwards."""
+    """Notes of driving backwards, which is legitimate, although most estimators take the car to go
+    forwards.
+    """
     speed = "vx" if "vx" in recording else "vx_ref"
     if speed not in recording:
         return
@@ -692,11 +702,12 @@ def _lasting_runs(backwards: BoolArray, recording: Recording) -> NDArray[np.int6
 
 
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
-    """Length and begin of the longest run, (N, 2), as text."""
+    """Text of the length and begin of the longest run, (N, 2)."""
     begin, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
     return f"for {(end - begin) / recording.rate_hz:.3g} s from t = {recording.time[begin]:.12g} s"
 
 
+# functions that check a recording
 _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _impossible_values,
     _agreement,

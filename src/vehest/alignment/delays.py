@@ -23,27 +23,27 @@ from vehest.constants import FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.recording import Recording
 
-MIN_PHASE_SHARE = 0.97  # share of the phase that a delay must explain
+MIN_PHASE_SHARE = 0.97  # smallest share of the phase that a delay must explain
 SPEEDS_WITH_SLIP = frozenset({"vx", "motor_speed", "wheel speeds"})
 """Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead
 and never lag.
 """
-MAX_HALF_WIDTH_SECONDS = 0.05  # s; a delay that is known no better is not known
-CHANNELS_OF_SIGNAL = {"wheel speeds": WHEELS}
+MAX_HALF_WIDTH_SECONDS = 0.05  # s, largest half width of the 95 % interval of a delay that is known
+CHANNELS_OF_SIGNAL = {"wheel speeds": WHEELS}  # name of a compared signal -> its channels
 
 
 @dataclass(frozen=True)
 class Delay:
     """Delay of a channel against another."""
 
-    channel: str
-    against: str  # the other
-    signals: str  # that were compared, for people
+    channel: str  # channel that is late
+    against: str  # channel against which it is late
+    signals: str  # text on the signals that were compared
     delay: Measured  # lateness of the channel, negative if the other is the late one [s]
 
     @property
     def turned(self) -> Delay:
-        """The same seen from the other channel."""
+        """The same delay as seen from the other channel, with the opposite sign."""
         return Delay(
             self.against,
             self.channel,
@@ -56,13 +56,13 @@ class Delay:
 class Late:
     """Channels that are late together."""
 
-    channels: tuple[str, ...]
-    delay: float  # to whole milliseconds [s]
-    evidence: str  # for people
+    channels: tuple[str, ...]  # names of the channels
+    delay: float  # delay, rounded to whole milliseconds [s]
+    evidence: str  # text on why it is known
 
 
 def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
-    """All signals that delays and low-passes are found from, under names of their own.
+    """Signals by which delays and low-passes are found, under names of their own.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
 
 
 def spectra_of(motion: Motion) -> CrossSpectra | None:
-    """Their cross-spectra; None for a drive that is too short.
+    """Cross-spectra of these signals; None for a drive that is too short.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def spectra_of(motion: Motion) -> CrossSpectra | None:
 def delays_of(
     motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()
 ) -> list[Delay]:
-    """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed
+    """Every delay that the drive shows, established or not, except those of ``slow``, low-passed
     channels.
 
     Parameters
@@ -253,7 +253,8 @@ def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
 
 
 def _late(delays: Sequence[Delay]) -> list[Late]:
-    """Channels that are later than another; what lags is taken to be late, not the other early.
+    """Channels that are later than another; that which lags is taken to be late, not the other
+    early.
 
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref
     is not late behind vy_ref.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Level = Literal["error", "warning", "note"]
+Level = Literal["error", "warning", "note"]  # severity of a finding
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,5 @@ class Finding:
     check: str  # name of the check
     channel: str  # empty if it is about none or if the data do not decide which
     message: str  # fault, place and remedy
-    suspects: tuple[
-        str, ...
-    ] = ()  # channels of which some are at fault, where ``channel`` is empty
+    # channels of which some are at fault, where ``channel`` is empty
+    suspects: tuple[str, ...] = ()

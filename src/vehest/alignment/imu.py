@@ -31,9 +31,10 @@ from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]  # array of complex numbers in double precision
 
-IMU_CHANNELS = ("ax", "ay", "yaw_rate")
+IMU_CHANNELS = ("ax", "ay", "yaw_rate")  # channels of the inertial unit
+# names of the parameters of the unit
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
 # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch;
@@ -44,30 +45,35 @@ TILT_LIKENESS = 0.3
 
 ROAD_CUTOFF = 0.2  # Hz; bank and grade of the road change more slowly
 
-MAX_BLOCKS = 12  # blocks at most that a drive is divided into for the jackknife
-MIN_BLOCK_SECONDS = 2.0  # s, longer than the residuals of the band remember
-MIN_BLOCKS = 8  # a drive that is too short for so many blocks of MIN_BLOCK_SECONDS is refused
-# highest one over all searched delays; with less, sensor and reference are refused
+MAX_BLOCKS = 12  # largest number of blocks into which a drive is divided for the jackknife
+MIN_BLOCK_SECONDS = 2.0  # s, shortest block; longer than the correlation time of the residuals
+MIN_BLOCKS = 8  # smallest number of blocks; a drive that is too short for so many is refused
+# smallest maximum of the correlation over all searched delays; with less, sensor and reference are
+# refused
 MIN_CORRELATION = 0.5
-# condition number of the scaled columns, above which a fit is refused; ordinary drives have 4 to 20
-MAX_CONDITION = 50.0
-# of a parameter's effect; with more a requested one is refused, a tilt not fitted
+MAX_CONDITION = 50.0  # largest condition number of the scaled columns; ordinary drives have 4 to 20
+# largest share of noise in a parameter's effect; with more a requested one is refused, a tilt not
+# fitted
 MAX_NOISE_SHARE = 0.05
-KERNEL_REACH = 6.0  # standard deviations of the Gaussian kernel, at which it ends
-N_ITERATIONS = 60  # steps of Levenberg and Marquardt at most; a fit that needs more is refused
-STEP_TOLERANCE = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
-MIN_VARIANCE = 1e-24  # (m/s²)² or (rad/s)², of a channel's residuals; avoids an infinite weight
-# standard uncertainties; a parameter outside the fit that moves by more is reported
+KERNEL_REACH = 6.0  # half the length of the Gaussian kernel, in its standard deviations
+# largest number of steps of Levenberg and Marquardt; a fit that needs more is refused
+N_ITERATIONS = 60
+STEP_TOLERANCE = 1e-6  # change of a parameter (m, rad, s, m/s², rad/s) below which it has converged
+# smallest variance of a channel's residuals, (m/s²)² or (rad/s)²; avoids an infinite weight
+MIN_VARIANCE = 1e-24
+# smallest change of a parameter outside the fit that is reported, in standard uncertainties
 SUSPICIOUS_UNCERTAINTIES = 3.0
+# remedy for a drive that does not determine a parameter, for messages
 MORE_MOTION = "more turning, braking and accelerating"
 
+# parameter of the tilt -> standard deviation of its prior
 TILT_PRIOR = {
     "tilt_gain_x": TILT_GAIN,
     "tilt_gain_y": TILT_GAIN,
     "tilt_lag_x": TILT_LAG_GAIN,
     "tilt_lag_y": TILT_LAG_GAIN,
 }
-# all parameters of a sensor that is aligned
+# all parameters at zero, as of a sensor that is aligned
 NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
 
 
@@ -75,26 +81,25 @@ NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
 class Correlation:
     """Cross-correlation between the sensor and its expected signal by the reference."""
 
-    signal: str  # for people
+    signal: str  # text on the signals
     at_end: bool  # whether the largest value lies at the end of the delays that are searched
     peak: float  # lag of the largest value, between samples by a parabola [s]
-    highest: float  # the largest value
+    highest: float  # largest value
 
 
 @dataclass(frozen=True, eq=False)
 class ImuFit:
-    """Parameters of the sensor by a drive."""
+    """Estimated parameters of the inertial unit, with their uncertainties."""
 
-    names: Sequence[str]  # of the N parameters that were asked for
-    values: Mapping[str, float]  # of all parameters, those that were not asked for zero
+    names: Sequence[str]  # names of the N parameters that were asked for
+    values: Mapping[str, float]  # values of all parameters; those that were not asked for are zero
     scatter: FloatArray  # standard uncertainty of each by the scatter of the residuals, (N,)
     tilt: FloatArray  # standard uncertainty of each by roll and pitch that are not modelled, (N,)
-    blocks: int  # number of blocks that ``scatter`` comes from
-    suspects: Mapping[
-        str, tuple[float, float]
-    ]  # name -> value and standard uncertainty of others that the residuals suggest
-    correlation: Correlation  # by which the delay was looked for first
-    signals: Signals  # that were compared
+    blocks: int  # number of blocks by which ``scatter`` was estimated
+    # name -> value and standard uncertainty of other parameters that the residuals suggest
+    suspects: Mapping[str, tuple[float, float]]
+    correlation: Correlation  # correlation by which the delay was first searched
+    signals: Signals  # signals that were compared
 
 
 def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
@@ -176,16 +181,17 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
 class Signals:
     """Signals that are compared, unfiltered, and the filter."""
 
-    recording: Recording
+    recording: Recording  # recording of the signals
     speed: str  # channel of the reference's forward velocity
     measured: ComplexArray  # ax + i·ay of the sensor, (T,)
     velocity: ComplexArray  # vx + i·vy of the reference, (T,)
     gyro: FloatArray  # yaw rate of the sensor, (T,)
     reference_rate: FloatArray | None  # yaw rate of the reference if there is one, (T,)
-    # in the accelerometer by roll and pitch; None where they are not measured or not used, (T,)
+    # gravity in the accelerometer by roll and pitch, (T,); None where they are not measured or not
+    # used
     gravity: ComplexArray | None
-    smoothing: Smoothing
-    margin: int  # samples at either end that serve filtering and shifting only
+    smoothing: Smoothing  # low-pass that both sides go through
+    margin: int  # number of samples at either end that serve filtering and shifting only
 
     @property
     def rate_hz(self) -> float:
@@ -194,12 +200,12 @@ class Signals:
 
     @property
     def duration(self) -> float:
-        """Of the signals without the margins [s]."""
+        """Length of the signals without the margins [s]."""
         return (len(self.measured) - 2 * self.margin) / self.rate_hz
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels that are compared."""
+        """Names of the channels that are compared."""
         return IMU_CHANNELS if self.reference_rate is not None else IMU_CHANNELS[:2]
 
     def low_passed(self, samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
@@ -393,12 +399,12 @@ def _axiswise(factors: complex, plane: ComplexArray) -> ComplexArray:
 class Fit:
     """A fit of C channels over T samples by P parameters."""
 
-    names: Sequence[str]  # of the P parameters
-    values: Mapping[str, float]  # of all parameters, also of those that are not free
+    names: Sequence[str]  # names of the P parameters
+    values: Mapping[str, float]  # values of all parameters, also of those that are not free
     error: FloatArray  # measured less predicted, (C, T)
     columns: FloatArray  # derivatives of the prediction, (P, C, T)
-    weights: FloatArray  # of the channels, (C,)
-    prior: FloatArray  # precisions, (P, P); zero but for parameters that have a prior
+    weights: FloatArray  # weights of the channels, (C,)
+    prior: FloatArray  # precision of the prior, (P, P); zero except for parameters that have one
 
     @property
     def point(self) -> FloatArray:
@@ -407,7 +413,7 @@ class Fit:
 
     @property
     def cost(self) -> float:
-        """Twice the negative logarithm of the likelihood, but for a constant."""
+        """Twice the negative logarithm of the likelihood, up to a constant."""
         values = self.point
         return float(
             -self.error.shape[1] * np.log(self.weights).sum() + values @ self.prior @ values
@@ -431,8 +437,8 @@ class Fit:
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
-    """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no
-    delay of its own.
+    """Correlation of sensor and reference over the delay: of the yaw rates if the reference has
+    one, else of the accelerations without vx·yaw rate, which has no delay of its own.
     """
     v = signals.velocity
     gyro = signals.gyro
@@ -477,8 +483,8 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
 def _require_peak(
     recording: Recording, correlation: Correlation, settings: AlignmentSettings
 ) -> None:
-    """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that
-    are searched.
+    """Raise an error for a sensor and a reference that do not correlate, or only at the end of the
+    delays that are searched.
     """
     if correlation.highest < MIN_CORRELATION:
         problem = (
@@ -500,8 +506,8 @@ def _require_peak(
 def _most_likely(
     model: ImuModel, start: Mapping[str, float], names: Sequence[str], requested: Sequence[str]
 ) -> Fit:
-    """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the
-    mean square of its own residuals.
+    """The fit of largest likelihood, by Levenberg and Marquardt's steps; each channel's variance is
+    the mean square of its own residuals.
     """
     prior = np.diag([TILT_PRIOR[name] ** -2 if name in TILT_PRIOR else 0.0 for name in names])
 
@@ -645,8 +651,8 @@ def _require_identified(
     requested: Sequence[str],
     noise: Mapping[str, tuple[float, float, float]],
 ) -> None:
-    """Refuse parameters whose column, without the share of the others, does not stand well above
-    the noise of yaw rate and reference.
+    """Raise an error for parameters whose column, without the share of the others, does not stand
+    well above the noise of yaw rate and reference.
     """
     unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(requested), : len(requested)]))
     for index, name in enumerate(requested):
@@ -672,7 +678,7 @@ def _noise(samples: FloatArray) -> float:
 
 
 def require_length(recording: Recording, usable: float, lost: float) -> None:
-    """Refuse, by a `DataError`, what is too short for an uncertainty.
+    """Raise `DataError` for a drive that is too short for an uncertainty.
 
     Parameters
     ----------
@@ -806,7 +812,7 @@ def _suspects(
 
 
 def _likened(pull: FloatArray, size: float | FloatArray) -> FloatArray:
-    """Variance of each parameter (P, axes) by an error of that size that resembles its effect to
+    """Variance of each parameter, (P,), by an error of a given size that resembles its effect to
     the assumed degree.
     """
     return pull.shape[2] * np.square(pull).sum(axis=2) * np.square(TILT_LIKENESS * size)
@@ -818,8 +824,8 @@ class Smoothing:
     samples are kept as its band needs.
     """
 
-    deviation: float  # of the kernel [samples]
-    rate_hz: float  # of the input
+    deviation: float  # standard deviation of the kernel [samples]
+    rate_hz: float  # sampling rate of the input [Hz]
 
     @property
     def reach(self) -> int:
@@ -828,7 +834,7 @@ class Smoothing:
 
     @property
     def step(self) -> int:
-        """Every how many samples one is kept."""
+        """Number of input samples of which one is kept."""
         return max(math.floor(self.deviation / MIN_KERNEL_SAMPLES), 1)
 
     def __call__(
@@ -866,8 +872,8 @@ class Smoothing:
         return smooth[first : first + count]
 
     def kernel(self, order: int) -> FloatArray:
-        """Impulse response of a derivative of the low-pass; its norm is the deviation that white
-        noise of deviation 1 has after it.
+        """Impulse response of a derivative of the low-pass; its norm is the standard deviation,
+        after it, of white noise of standard deviation 1.
 
         Parameters
         ----------
@@ -888,7 +894,7 @@ class Smoothing:
 
 
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
-    """The filter of -3 dB at a frequency.
+    """The low-pass with -3 dB at a frequency.
 
     Parameters
     ----------

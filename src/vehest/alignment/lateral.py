@@ -20,18 +20,22 @@ from vehest.alignment.spectra import (
 )
 from vehest.constants import FloatArray
 
+# names of the signals that are fitted together
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
-# gain of d(vy)/dt over that of vx·yaw_rate, or its inverse, above which no delay is estimated;
-# noise alone shrinks it to 0.6 in sound drives
+# largest ratio of the gains of d(vy)/dt and vx·yaw_rate, or its inverse, with which a delay is
+# estimated; noise alone shrinks it to 0.6 in sound drives
 MAX_GAIN_RATIO = 2.5
-MIN_SLIDING_SHARE = 0.1  # of what the other terms leave of ay, that d(vy)/dt must explain
-N_SHIFTS = 6  # times at most that channels are shifted by the fitted delays and fitted again
-SHIFT_TOLERANCE_SECONDS = 1e-3  # s; once both remaining delays are shorter, no more shifts follow
-MIN_SAMPLES = 10  # with fewer samples no delay is estimated
-N_STEPS = 8  # Gauss-Newton steps of a fit at most
-N_WEIGHTINGS = 3  # fits one after another, each weighted by the residual of the last one
+# smallest share of what the other terms leave of ay that d(vy)/dt must explain
+MIN_SLIDING_SHARE = 0.1
+# largest number of times that channels are shifted by the fitted delays and fitted again
+N_SHIFTS = 6
+SHIFT_TOLERANCE_SECONDS = 1e-3  # s, remaining delays below which no more shifts follow
+MIN_SAMPLES = 10  # smallest number of samples with which a delay is estimated
+N_STEPS = 8  # largest number of Gauss-Newton steps of a fit
+N_WEIGHTINGS = 3  # number of fits one after another, each weighted by the residual of the last one
 MAX_STEP_SECONDS = 0.1  # s, largest change of a delay by one Gauss-Newton step
-MIN_RESIDUAL_SHARE = 1e-6  # of the largest power of ay in a bin; limits the weights of bins
+# smallest residual in a bin over the largest power of ay; limits the weights of bins
+MIN_RESIDUAL_SHARE = 1e-6
 
 
 def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | None:
@@ -93,7 +97,9 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
 
 
 def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | None:
-    """Of the signals, once yaw rate and ay are shifted onto the clock of the lateral velocity."""
+    """Cross-spectra of the signals, after yaw rate and ay are shifted onto the clock of the lateral
+    velocity by these delays [s].
+    """
     clock = np.arange(len(motion)) / motion.rate_hz
     ay = motion["ay"]
     yaw_rate = motion["yaw_rate"]
@@ -117,7 +123,7 @@ def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | N
 def _weighted(
     spectrum: ComplexArray, omega: FloatArray
 ) -> tuple[tuple[float, float], FloatArray] | None:
-    """Both delays, and the weights that the residual leaves, (F,)."""
+    """Both delays [s], and the weights of the bins by the residual, (F,)."""
     floor = MIN_RESIDUAL_SHARE * float(spectrum[:, 0, 0].real.max())
     weight = np.ones(len(omega)) / max(floor, np.finfo(float).tiny)
     start = (0.0, 0.0)
@@ -139,8 +145,8 @@ def _weighted(
 def _fit(
     spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, start: tuple[float, float]
 ) -> tuple[tuple[float, float], FloatArray, float] | None:
-    """Gauss-Newton: both delays, the power of the residual (F,), and the share of it that d(vy)/dt
-    took away.
+    """Both delays [s] by Gauss-Newton, the power of the residual (F,), and the share of it that
+    d(vy)/dt took away.
     """
     turning, sliding = start
     for _ in range(N_STEPS):

@@ -11,8 +11,10 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
-MAX_EXCESS = 100.0  # times what a vehicle can do; beyond lies no wrong unit
-MAX_MISSING_SHARE = 0.05  # of the samples of a channel, which a line then bridges
+# largest sample over the largest that a vehicle can do; beyond lies no wrong unit
+MAX_EXCESS = 100.0
+MAX_MISSING_SHARE = 0.05  # largest share of missing samples of a channel, which a line then bridges
+# channels of the four wheels
 WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr")
 
 
@@ -20,13 +22,13 @@ WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr"
 class Motion:
     """Complete channels of a drive, and motion that is made of them."""
 
-    rate_hz: float  # sampling rate
+    rate_hz: float  # sampling rate [Hz]
     channels: dict[str, FloatArray]  # name -> samples without gaps, (T,)
-    # channel of the forward velocity: the reference's own before one that wheels slip; empty if
-    # there is none
+    # name of the channel of the forward velocity: the reference's own before one by wheels that
+    # slip; empty if there is none
     speed: str
-    velocity: str  # channel of the lateral velocity; empty if there is none
-    moving: BoolArray  # where the car does not stand, (T,)
+    velocity: str  # name of the channel of the lateral velocity; empty if there is none
+    moving: BoolArray  # whether the car does not stand, (T,)
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -56,17 +58,17 @@ class Motion:
 
     @property
     def turning(self) -> FloatArray:
-        """vx·yaw_rate [m/s²], (T,)."""
+        """Part of the lateral acceleration by turning, vx·yaw_rate [m/s²], (T,)."""
         return self.vx * self["yaw_rate"]
 
     @property
     def sliding(self) -> FloatArray:
-        """d(vy)/dt [m/s²], (T,)."""
+        """Part of the lateral acceleration by sliding, d(vy)/dt [m/s²], (T,)."""
         return self.derivative(self.vy)
 
     @property
     def forward(self) -> FloatArray:
-        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, this where it is known [m/s²], (T,)."""
+        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, the latter where it is known [m/s²], (T,)."""
         gained = self.derivative(self.vx)
         return (
             gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
@@ -78,7 +80,7 @@ class Motion:
         return np.asarray(np.mean([self[name] for name in WHEELS], axis=0), dtype=np.float64)
 
     def derivative(self, samples: FloatArray) -> FloatArray:
-        """By time, with central differences, which delay nothing.
+        """Derivative by time, with central differences, which delay nothing.
 
         Parameters
         ----------
@@ -122,7 +124,7 @@ class Motion:
         return replace(self, rate_hz=self.rate_hz / factor, channels=channels, moving=moving)
 
     def corrected(self, factors: dict[str, float]) -> Motion:
-        """The same with some channels multiplied by factors."""
+        """The motion with some channels multiplied by factors."""
         return replace(
             self,
             channels={
@@ -176,5 +178,5 @@ def _bridged(recording: Recording, name: str) -> FloatArray | None:
 
 
 def rms(samples: FloatArray) -> float:
-    """Root mean square."""
+    """Root mean square of samples."""
     return float(np.sqrt(np.mean(np.square(samples))))

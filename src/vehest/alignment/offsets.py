@@ -13,13 +13,15 @@ from vehest.alignment.signs import settled_samples
 from vehest.alignment.spectra import MAX_GROUPS, Measured, jackknife
 from vehest.constants import GRAVITY, FloatArray
 
-MIN_NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
-# m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
+MIN_NOTED_OFFSET = 0.15  # m/s², smallest offset that is noted: that of a unit tilted by 0.9 degrees
+# m/s², largest offset that is only noted: 2.9 degrees, more than the crown of a road and a careless
+# mounting together
 MAX_NOTED_OFFSET = 0.5
-MAX_GYRO_OFFSET = 0.05  # rad/s
-MAX_INCLINED_OFFSET = 0.5 * GRAVITY  # m/s², of a unit pitched by 30 degrees; no more is mounted so
-BLOCK_SECONDS = 2.0  # shortest block of time
-MIN_BLOCKS = 6  # fewer give no interval, and no offset
+MAX_GYRO_OFFSET = 0.05  # rad/s, largest offset of the yaw rate that is named as a possible cause
+# m/s², largest offset of a unit that is only tilted, by 30 degrees; no more is mounted so
+MAX_INCLINED_OFFSET = 0.5 * GRAVITY
+BLOCK_SECONDS = 2.0  # s, shortest block of time
+MIN_BLOCKS = 6  # smallest number of blocks with which there is an interval, and an offset
 
 
 def lateral_offset(motion: Motion) -> Measured | None:
@@ -111,12 +113,14 @@ def offset_findings(motion: Motion) -> list[Finding]:
 
 
 def _longitudinal_findings(motion: Motion) -> Iterator[Finding]:
+    """A warning of an offset of ax beyond any road."""
     offset = longitudinal_offset(motion)
     if offset is not None and abs(offset.value) - offset.half_width > MAX_NOTED_OFFSET:
         yield Finding("warning", "offset", "ax", _described(offset, f"d({motion.speed})/dt"))
 
 
 def _lateral_findings(motion: Motion) -> Iterator[Finding]:
+    """A note or a warning of an offset of ay."""
     offset = lateral_offset(motion)
     if (
         offset is None
@@ -136,6 +140,7 @@ def _lateral_findings(motion: Motion) -> Iterator[Finding]:
 
 
 def _described(offset: Measured, expected: str, another_cause: str = "") -> str:
+    """Text of an offset, of what it is left over, and of its possible causes."""
     text = (
         f"constant offset of {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) "
         f"relative to {expected}"

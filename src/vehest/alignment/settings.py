@@ -14,9 +14,12 @@ roll or pitch [s].
 The body follows late, say 0.1 times 50 ms.
 """
 
-DEFAULT_CUTOFF_HZ = 2.0  # Hz
-MIN_KERNEL_SAMPLES = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
-MAX_CUTOFF_SHARE = math.sqrt(math.log(2.0)) / (2.0 * math.pi * MIN_KERNEL_SAMPLES)  # of the rate
+DEFAULT_CUTOFF_HZ = 2.0  # Hz, cut-off where none is set
+# smallest standard deviation of the kernel, in samples; a narrower sampled Gaussian has no exact
+# derivatives
+MIN_KERNEL_SAMPLES = 1.5
+# largest ratio of the cut-off to the rate
+MAX_CUTOFF_SHARE = math.sqrt(math.log(2.0)) / (2.0 * math.pi * MIN_KERNEL_SAMPLES)
 
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "lever_arm": ("lever_x", "lever_y"),
@@ -34,16 +37,16 @@ class AlignmentSettings:
     asked for, or a value is wrong.
     """
 
-    estimate: tuple[str, ...]  # names in `QUANTITIES`
-    cutoff_hz: float | None = None  # of the low-pass that both sides go through [Hz]; `cutoff_at`
-    max_delay: float = 0.5  # largest delay that is looked for, either way [s]
-    # standard deviation of roll and pitch beside those that follow the accelerations [rad]; 0:
+    estimate: tuple[str, ...]  # names of the quantities to estimate, in `QUANTITIES`
+    # cut-off of the low-pass that both sides go through [Hz]; None: see `cutoff_at`
+    cutoff_hz: float | None = None
+    max_delay: float = 0.5  # largest delay that is searched, either way [s]
+    # standard deviation of roll and pitch besides those that follow the accelerations [rad]; 0:
     # levelled
     tilt: float = 0.001
-    wheelbase: float | None = None  # needed for the steering ratio [m]
-    steering_channel: str | None = (
-        None  # of the steering ratio; by default ``handwheel``, or ``steer`` where there is none
-    )
+    wheelbase: float | None = None  # distance between the axles, needed for the steering ratio [m]
+    # channel of the steering ratio; None: ``handwheel``, or ``steer`` where there is none
+    steering_channel: str | None = None
     max_ay: float = 3.0  # lateral acceleration up to which steering is taken as linear [m/s²]
     min_speed: float = 5.0  # speed from which the steering relation is used [m/s]
 

@@ -23,27 +23,31 @@ from vehest.data.errors import listed
 
 KINEMATIC_BAND_HZ = (0.1, 2.0)  # Hz, band-pass of all comparisons with a derivative
 FILTER_END_SECONDS = 2.0  # s at either end, which the band-pass distorts and which do not count
-# samples; with fewer there is no relation, and no check for saturation and spikes
+# smallest number of samples of a relation, and of checks for saturation and spikes
 MIN_SAMPLES = 100
-MIN_SETTLED_SECONDS = 10.0  # s of samples behind the band-pass; with less it is not used
-MIN_STEADY_CORRELATION = 0.7  # |correlation| of a relation; a weaker one is dropped
-MIN_SIGN_CORRELATION = 0.3  # the same for d(vy)/dt against ay - vx·yaw_rate
-MIN_SCALE_CORRELATION = 0.8  # |correlation| of a relation; the scale of a weaker one is not checked
-MIN_ANGLE_CORRELATION = 0.95  # the same for sideslip_ref against atan2(vy_ref, vx)
-MIN_ACCELERATION = 0.2  # m/s², standard deviation of ay; with less there is no lateral relation
-MIN_SLIDING = 1e-3  # m/s², standard deviation of d(vy)/dt; with less it is compared with nothing
-# rad, standard deviation of atan2(vy_ref, vx); with less it is compared with nothing
-MIN_SIDESLIP = 1e-3
-MAX_ROLLING_SIDESLIP = 0.2  # rad of sideslip, beyond which drivers steer against the turn
-MIN_STEERED_SECONDS = 5.0  # s without a drift; with less, steering and yaw rate are not compared
-MAX_REVERSED_CHANNELS = 4  # channels that are reversed together, at most, to explain the signs
+MIN_SETTLED_SECONDS = 10.0  # s, shortest settled time behind the band-pass with which it is used
+MIN_STEADY_CORRELATION = 0.7  # smallest |correlation| of a relation
+MIN_SIGN_CORRELATION = 0.3  # smallest |correlation| of d(vy)/dt with ay - vx·yaw_rate
+MIN_SCALE_CORRELATION = 0.8  # smallest |correlation| of a relation whose scale is checked
+MIN_ANGLE_CORRELATION = 0.95  # smallest |correlation| of sideslip_ref with atan2(vy_ref, vx)
+# m/s², smallest standard deviation of ay with which there is a lateral relation
+MIN_ACCELERATION = 0.2
+MIN_SLIDING = 1e-3  # m/s², smallest standard deviation of d(vy)/dt that is compared
+MIN_SIDESLIP = 1e-3  # rad, smallest standard deviation of atan2(vy_ref, vx) that is compared
+# rad, largest sideslip angle without drifting; beyond it drivers steer against the turn
+MAX_ROLLING_SIDESLIP = 0.2
+# s, shortest time without a drift with which steering and yaw rate are compared
+MIN_STEERED_SECONDS = 5.0
+# largest number of channels that are reversed together to explain the signs
+MAX_REVERSED_CHANNELS = 4
 KILOMETRES_AN_HOUR = 3.6  # km/h in 1 m/s
-DEGREES_PER_RADIAN = 180.0 / np.pi
-# factor from 1 that a right scale may have; the smallest factor of a wrong unit is 3.6
+DEGREES_PER_RADIAN = 180.0 / np.pi  # degrees in 1 rad
+# largest factor of a right scale, either way from 1; the smallest factor of a wrong unit is 3.6
 SCALE_TOLERANCE = 1.7
-# the same for ax, which pitch, grade and slip change; the factor of ax in g is 9.8
+# largest factor of a right scale of ax, which pitch, grade and slip change; the factor of ax in g
+# is 9.8
 LONGITUDINAL_TOLERANCE = 3.0
-UNIT_TOLERANCE = 1.25  # factor from 1 that a wrong scale may have once a unit is corrected
+UNIT_TOLERANCE = 1.25  # largest factor of a wrong scale from 1 once a unit is corrected
 ALTERNATIVE_UNITS = {
     **dict.fromkeys(("vx", "vx_ref", "vy_ref"), (KILOMETRES_AN_HOUR, "km/h", "m/s")),
     **dict.fromkeys(("ax", "ay"), (1.0 / GRAVITY, "g", "m/s²")),
@@ -52,7 +56,7 @@ ALTERNATIVE_UNITS = {
 }
 """Channel -> factor by which its values are too large in a wrong unit, that unit, and the SI unit.
 """
-# units that stop an ingest: no estimator survives them
+# channel -> unit that stops an ingest, since no estimator survives it
 UNSAFE = {
     "yaw_rate": "deg/s",
     "sideslip_ref": "deg",
@@ -63,19 +67,19 @@ UNSAFE = {
 class Relation:
     """Two quantities that must be equal, or at least of one sign."""
 
-    left: str  # quantity, as in a sentence
-    right: str  # quantity that it must be
-    channels: tuple[str, ...]  # in which a fault may be, the likeliest first
-    powers: tuple[int, ...]  # of each channel in left over right, 1 or -1
-    scale: float  # left over right
-    correlation: float
+    left: str  # left quantity, as in a sentence
+    right: str  # right quantity, which it must be equal to
+    channels: tuple[str, ...]  # channels in which a fault may be, the likeliest first
+    powers: tuple[int, ...]  # power of each channel in left over right, 1 or -1
+    scale: float  # left over right, by their sizes, with the sign of the correlation
+    correlation: float  # correlation of both
     # factor within which they must be equal; infinite where only the sign counts
     tolerance: float = SCALE_TOLERANCE
-    least_correlation: float = MIN_SCALE_CORRELATION  # below which the scale is unknown
+    least_correlation: float = MIN_SCALE_CORRELATION  # correlation below which the scale is unknown
 
     @property
     def text(self) -> str:
-        """Both quantities, such as ``ay vs. vx·yaw_rate``."""
+        """Text of both quantities, such as ``ay vs. vx·yaw_rate``."""
         return f"{self.left} vs. {self.right}"
 
     def holds(self, scale: float) -> bool:
@@ -133,7 +137,7 @@ def relations_of(motion: Motion) -> list[Relation]:
 
 
 def _lateral(motion: Motion) -> Iterator[Relation]:
-    """ay against vx·yaw_rate as it is, and d(vy)/dt against ay - vx·yaw_rate, both without
+    """Relations of ay to vx·yaw_rate as it is, and of d(vy)/dt to ay - vx·yaw_rate, both without
     vx·yaw_rate and its derivative.
 
     The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass
@@ -173,7 +177,7 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
 
 
 def _steered(motion: Motion) -> Iterator[Relation]:
-    """Steering against yaw rate: of one sign while the car does not drift."""
+    """Relations of steering to yaw rate, whose sign counts while the car does not drift."""
     if not (motion.speed and "yaw_rate" in motion and motion.steering):
         return
     rolling = motion.moving.copy()
@@ -191,7 +195,9 @@ def _steered(motion: Motion) -> Iterator[Relation]:
 
 
 def _longitudinal(motion: Motion) -> Iterator[Relation]:
-    """ax against d(vx)/dt, both without vy·yaw_rate, whose sign and unit may be wrong as well."""
+    """Relation of ax to d(vx)/dt, both without vy·yaw_rate, whose sign and unit may be wrong as
+    well.
+    """
     band = kinematic_band(motion) if motion.speed and "ax" in motion else None
     if band is None:
         return
@@ -213,7 +219,7 @@ def _longitudinal(motion: Motion) -> Iterator[Relation]:
 
 
 def _repeated(motion: Motion) -> Iterator[Relation]:
-    """Quantities that are measured twice."""
+    """Relations of quantities that are measured twice."""
     for name in ("yaw_rate", "vx"):
         reference = f"{name}_ref"
         moving = motion.moving
@@ -301,8 +307,8 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:
-    """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or
-    the rate too low.
+    """Samples at which a band-pass has forgotten the ends and the car moves; None if they are too
+    few, or the rate too low.
 
     Returns
     -------
@@ -417,7 +423,9 @@ def sign_findings(
 
 
 def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
-    """One explanation is the smallest, or the only one, and steering or heading was asked."""
+    """Whether one explanation is the smallest, or the only one, and steering or heading was
+    compared.
+    """
     smallest, *numbers = (_number(names) for names in explanations)
     heading = any(
         set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations
@@ -436,14 +444,14 @@ def _number(names: Sequence[str]) -> int:
 class UnitMistake(NamedTuple):
     """A channel whose values are in another unit than declared."""
 
-    channel: str
-    factor: float  # by which its values are too large
+    channel: str  # name of the channel
+    factor: float  # factor by which its values are too large
     actual: str  # unit of the values
     declared: str  # unit in which they were read
 
 
 def unit_mistakes() -> Iterator[UnitMistake]:
-    """All mistakes that are looked for.
+    """Mistakes of units that are looked for.
 
     Yields
     ------
@@ -457,10 +465,11 @@ def unit_mistakes() -> Iterator[UnitMistake]:
 
 @dataclass(frozen=True)
 class WrongUnit:
-    """A factor by which channels disagree."""
+    """A wrong unit that explains why channels disagree in scale."""
 
-    relations: tuple[Relation, ...]  # that are wrong by it
-    explanations: tuple[UnitMistake, ...]  # that explain it equally well; empty if none does
+    relations: tuple[Relation, ...]  # relations that are wrong by it
+    # mistakes that explain it equally well; empty if none does
+    explanations: tuple[UnitMistake, ...]
 
     @property
     def factors(self) -> dict[str, float]:
@@ -469,7 +478,7 @@ class WrongUnit:
 
     @property
     def finding(self) -> Finding:
-        """For people."""
+        """The finding for people."""
         figures = ", ".join(
             f"{relation.text}: gain {relation.scale:.3g} instead of 1 "
             f"(correlation {relation.correlation:.2f})"

@@ -15,27 +15,31 @@ from numpy.typing import NDArray
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]  # array of complex numbers in double precision
 
 BAND_HZ = (0.1, 3.0)  # Hz, where cars move and references can be differentiated
 SEGMENT_SECONDS = (4.0, 16.0)  # s, length of the shortest and longest segment
-SEGMENTS_IN_A_DRIVE = 8.0  # that a drive is divided into, without overlap, within SEGMENT_SECONDS
-MIN_DRIVE_SECONDS = 16.0  # s; a shorter drive has no spectra
-MIN_RATE_HZ = 5.0  # Hz; a slower recording has no spectra
-MIN_BINS = 4  # frequencies in the band; with fewer there are no spectra
-MIN_SEGMENTS = 6  # segments of selected samples alone; with fewer there are no spectra
-MIN_SAMPLES_A_PERIOD = 5.0  # of the highest frequency that is used
-MIN_AVERAGED_RATE_HZ = 30.0  # Hz; a faster recording is averaged down to at least this
-MAX_GROUPS = 12  # groups of segments, or blocks, that the jackknife leaves out in turn, at most
-SMOOTHED_BINS = 5  # neighbouring bins of a running mean; odd
-MAX_COHERENCE = 0.99  # of a bin; limits its weight, which is infinite at 1
-# of the strongest bin's power (geometric mean of both signals); with less a bin has no weight: a
-# window leaks more
+# number of segments into which a drive is divided, without overlap, within SEGMENT_SECONDS
+SEGMENTS_IN_A_DRIVE = 8.0
+MIN_DRIVE_SECONDS = 16.0  # s, shortest drive that has spectra
+MIN_RATE_HZ = 5.0  # Hz, lowest rate of a recording that has spectra
+MIN_BINS = 4  # smallest number of frequencies in the band
+MIN_SEGMENTS = 6  # smallest number of segments of selected samples alone
+# smallest number of samples in a period of the highest frequency that is used
+MIN_SAMPLES_A_PERIOD = 5.0
+MIN_AVERAGED_RATE_HZ = 30.0  # Hz, lowest rate to which a faster recording is averaged down
+# largest number of groups of segments, or blocks, that the jackknife leaves out in turn
+MAX_GROUPS = 12
+SMOOTHED_BINS = 5  # number of neighbouring bins of a running mean; odd
+# largest coherence of a bin that counts; limits its weight, which is infinite at 1
+MAX_COHERENCE = 0.99
+# smallest power of a bin over that of the strongest (geometric mean of both signals); with less it
+# has no weight, since a window leaks more
 MIN_POWER_SHARE = 1e-6
-MIN_MEAN_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
-MAX_LAG_SECONDS = 1.2  # s; longer delays are not searched
-MAX_TIME_CONSTANT_SECONDS = 10.0  # s; longer ones are not searched
-N_STEPS = 25  # Gauss-Newton steps of a fit at most
+MIN_MEAN_COHERENCE = 0.25  # smallest mean coherence over the band with which a lag is known
+MAX_LAG_SECONDS = 1.2  # s, longest delay that is searched
+MAX_TIME_CONSTANT_SECONDS = 10.0  # s, longest time constant that is searched
+N_STEPS = 25  # largest number of Gauss-Newton steps of a fit
 CONFIDENCE = 0.95  # level of all intervals, which texts call 95 %
 
 
@@ -45,8 +49,8 @@ class CrossSpectra:
     another.
     """
 
-    names: tuple[str, ...]  # of the signals
-    frequency: FloatArray  # of the bins [Hz], (F,)
+    names: tuple[str, ...]  # names of the signals
+    frequency: FloatArray  # frequencies of the bins [Hz], (F,)
     groups: ComplexArray  # sums of conj(X_i)·X_j over the segments of a group, (G, F, N, N)
 
     @property
@@ -147,8 +151,8 @@ def _pieces(samples: FloatArray, factor: int, length: int) -> FloatArray:
 class Measured:
     """A quantity with the half width of its 95 % interval."""
 
-    value: float
-    half_width: float
+    value: float  # estimate, in the unit of the quantity
+    half_width: float  # half width of the interval, in the same unit
 
     @property
     def low(self) -> float:
@@ -161,7 +165,7 @@ class Measured:
         return self.value + self.half_width
 
     def widened(self, deviation: float) -> Measured:
-        """The same value with a systematic standard uncertainty added to its interval."""
+        """The quantity with a systematic standard uncertainty added to its interval."""
         return Measured(self.value, math.hypot(self.half_width, student(math.inf) * deviation))
 
 
@@ -195,7 +199,7 @@ def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -
 
 
 def student(freedom: float) -> float:
-    """Half width of the 95 % interval in standard deviations.
+    """Half width of the 95 % interval of Student's distribution, in standard deviations.
 
     Parameters
     ----------
@@ -207,18 +211,18 @@ def student(freedom: float) -> float:
 
 @dataclass(frozen=True)
 class Lag:
-    """How one signal follows another: a delay and a first-order low-pass, of which either may be
+    """Lag of one signal behind another: a delay and a first-order low-pass, of which either may be
     held at zero.
     """
 
-    delay: Measured  # [s]
-    time_constant: Measured  # [s]
-    together: Measured  # their sum, which is the delay of slow motion [s]
+    delay: Measured  # delay [s]
+    time_constant: Measured  # time constant of the low-pass [s]
+    together: Measured  # sum of both, which is the delay of slow motion [s]
     fit: float  # share of the phase that is explained
 
 
 def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool) -> Lag | None:
-    """The lag of a signal behind another from the phase of their cross-spectrum, -ωτ - atan(ωT).
+    """The lag of a signal behind another, from the phase of their cross-spectrum, -ωτ - atan(ωT).
 
     The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not
     the mean phase. Each bin has the weight of maximum likelihood, coherence² / (1 - coherence²)
@@ -297,7 +301,8 @@ def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[
 def _refined(
     cross: ComplexArray, omega: FloatArray, start: tuple[float, float], *, low_pass: bool
 ) -> tuple[float, float]:
-    """Gauss-Newton on the weighted phase; the time constant cannot be negative.
+    """Delay and time constant [s] by Gauss-Newton on the weighted phase; the time constant cannot
+    be negative.
 
     Parameters
     ----------

@@ -10,15 +10,16 @@ from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.recording import Recording
 from vehest.data.runs import equal_runs
 
-BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]  # array of truth values
 
-MAX_STANDSTILL_YAW_RATE = 0.05  # rad/s
-MAX_STANDSTILL_SHAKING = 0.3  # m/s²
+MAX_STANDSTILL_YAW_RATE = 0.05  # rad/s, largest magnitude of the yaw rate of a standing car
+# m/s², largest standard deviation of an acceleration of a standing car
+MAX_STANDSTILL_SHAKING = 0.3
 
 
 def standstill(recording: Recording) -> BoolArray:
-    """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate
-    nor accelerations speak of motion.
+    """Where the car stands, (T,): the speed is zero and, where they are measured, neither yaw rate
+    nor accelerations show motion.
 
     Parameters
     ----------

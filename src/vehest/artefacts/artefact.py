@@ -34,11 +34,11 @@ from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_json
 from vehest.version import __version__
 
-CHECKOUT = Path(__file__).resolve().parents[3]
-MANIFEST = "manifest.json"
+CHECKOUT = Path(__file__).resolve().parents[3]  # root of the repository, if vehest runs from one
+MANIFEST = "manifest.json"  # name of the file that describes a folder and its files
 TIMINGS = "timings.csv"  # durations, which differ each time and are no part of the content
-FORMAT = 1
-Status = Literal["complete", "interrupted"]
+FORMAT = 1  # version of the manifest
+Status = Literal["complete", "interrupted"]  # whether a stage ran to its end
 Write = Callable[[Path], Status | None]
 """Fills an empty folder, which then becomes an artefact; ``interrupted`` if it was stopped."""
 
@@ -47,14 +47,14 @@ Write = Callable[[Path], Status | None]
 class StagePlan:
     """An artefact before it is made."""
 
-    stage: str
+    stage: str  # name of the stage, such as ``train``
     label: str  # start of the folder's name
     # the part of the configuration that determines the content, plain values
     config: Mapping[str, Any]
     inputs: Mapping[str, str]  # name -> digest
     code: str  # version of the stage's code
-    output: Path  # the output root
-    # the part of ``config`` in the key; none: all of it
+    output: Path  # output root
+    # the part of ``config`` that enters the key; None: all of it
     key_config: Mapping[str, Any] | None = None
 
     @property
@@ -69,7 +69,7 @@ class StagePlan:
 
     @property
     def keyed_content(self) -> dict[str, Any]:
-        """What determines the content, without options that have their defaults."""
+        """Everything that determines the content, without options that have their defaults."""
         config = self.config if self.key_config is None else self.key_config
         return {**self.content, "config": config}
 
@@ -85,12 +85,12 @@ class StagePlan:
 
     @property
     def lock(self) -> Lock:
-        """Held by the process that makes the artefact."""
+        """Lock that the process holds which makes the artefact."""
         return Lock(self.output, self.stage, self.folder.name)
 
     @property
     def checkpoint_folder(self) -> Path:
-        """Folder of the state of an unfinished run of this stage."""
+        """Folder for the state of an unfinished run of this stage."""
         return self.output / "checkpoints" / self.folder.name
 
     def drop(self, unfinished: Path) -> None:
@@ -105,17 +105,17 @@ class StagePlan:
 class Artefact:
     """A folder that a stage has made from its `StagePlan`."""
 
-    folder: Path
-    stage: str
-    label: str
-    key: str
+    folder: Path  # folder of its files
+    stage: str  # name of the stage
+    label: str  # start of the folder's name
+    key: str  # hash of what determines the content
     status: Status  # ``interrupted`` where a fit was stopped with its best so far
     outputs: Mapping[str, str]  # file -> sha256
-    config: Mapping[str, Any]
-    inputs: Mapping[str, str]
+    config: Mapping[str, Any]  # the part of the configuration that determines the content
+    inputs: Mapping[str, str]  # name -> digest
     provenance: Mapping[str, Any] = field(default_factory=dict)  # time, seconds, versions, machine
-    skipped: bool = False  # whether it existed already
-    code: str = ""
+    skipped: bool = False  # whether it existed already, so that the stage was not run
+    code: str = ""  # version of the stage's code
 
     @property
     def digest(self) -> str:
@@ -128,8 +128,8 @@ class Artefact:
 class Output:
     """Digest and length of a file's bytes."""
 
-    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    bytes: int
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # digest in hexadecimal digits
+    bytes: int  # length of the file
 
 
 @dataclass(frozen=True)
@@ -139,19 +139,19 @@ class Manifest:
     A manifest that states no format has format 0, which is otherwise the same as 1.
     """
 
-    stage: str
-    label: str
-    key: str
-    status: Status
-    config: dict[str, Any]
-    inputs: dict[str, str]
-    outputs: dict[str, Output]
-    provenance: dict[str, Any]
-    code: str = ""
+    stage: str  # name of the stage
+    label: str  # start of the folder's name
+    key: str  # hash of what determines the content
+    status: Status  # ``interrupted`` where a fit was stopped with its best so far
+    config: dict[str, Any]  # the part of the configuration that determines the content
+    inputs: dict[str, str]  # name of an input -> digest
+    outputs: dict[str, Output]  # file -> its digest and length
+    provenance: dict[str, Any]  # time, seconds, versions and machine
+    code: str = ""  # version of the stage's code
 
 
 def find(plan: StagePlan, warn: Callable[[str], None] = lambda text: None) -> Artefact | None:
-    """The artefact of a plan, as `valid_artefact`."""
+    """The valid artefact of a plan, if its folder holds one; None as in `valid_artefact`."""
     return valid_artefact(plan.folder, plan.key, warn)
 
 

@@ -23,7 +23,7 @@ Keys = dict[str, dict[str, str]]
 Causes are ``code``, ``configuration`` and ``data``.
 """
 
-CONFIGURATION = "configuration"
+CONFIGURATION = "configuration"  # cause of a change: the configuration differs
 
 
 def changed_keys(recorded: Keys, today: Keys) -> list[tuple[str, str]]:

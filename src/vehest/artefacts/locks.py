@@ -19,17 +19,17 @@ from filelock import FileLock, Timeout
 
 from vehest.data.files import file_name, writing_error
 
-LOCKS = "locks"
+LOCKS = "locks"  # folder of the lock files in an output root
 POLL_SECONDS = 0.05  # s between two attempts to take a lock that another process has
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """The lock of an artefact that another process holds."""
+    """Description of the lock for which a process waits, since another one makes the artefact."""
 
-    stage: str
-    label: str
-    holder: str  # for people
+    stage: str  # name of the stage
+    label: str  # label of the artefact
+    holder: str  # text on the process that has the lock, for messages
 
 
 class Lock:
@@ -69,7 +69,7 @@ class Lock:
 
     @property
     def holder(self) -> str:
-        """The process that took the lock last."""
+        """Text on the process that took the lock last, for messages."""
         with suppress(OSError, UnicodeDecodeError):
             return self._path.read_text(encoding="utf-8").strip() or "another process"
         return "another process"

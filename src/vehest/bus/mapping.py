@@ -15,7 +15,7 @@ from vehest.sources.can import CanSource, ChannelSignal
 from vehest.sources.can.database import Database, read_dbc
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
-# options of a data set that say nothing of a bus; nor does the rate
+# options of a data set that concern recordings only, not a bus
 FOR_RECORDINGS = (
     "gappy",
     "transforms",
@@ -26,7 +26,7 @@ FOR_RECORDINGS = (
 
 @dataclass(frozen=True)
 class BusSignals:
-    """Signals of a bus as channels."""
+    """Signals of a bus that carry the channels of a model, and how their values become channels."""
 
     database: Database  # messages that carry them
     by_channel: Mapping[str, ChannelSignal]  # channel -> its message and signal

@@ -15,6 +15,7 @@ MAX_FIRST_ID = 0x7FE
 
 COUNTS = 16  # values of the alive counter, after which it begins anew
 
+# text of the DBC, with places for both identifiers
 DBC = """VERSION ""
 
 NS_ :

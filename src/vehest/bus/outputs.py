@@ -15,7 +15,8 @@ from vehest.data.estimate import IN_DEGREES, number_cell, time_cell
 from vehest.data.files import writing_error
 from vehest.trust.health import reason_in_words
 
-LEADING_COLUMNS = ("vy", "sideslip")
+LEADING_COLUMNS = ("vy", "sideslip")  # first columns of a table after the times
+# last columns of a table
 TRAILING_COLUMNS = ("band_vy", "band_sideslip", "health", "health_reason")
 
 
@@ -115,7 +116,7 @@ class Output:
             csv.writer(self._table, lineterminator="\n").writerow(cells)
 
     def frame(self, frame: Any) -> None:
-        """Write a frame of an estimate."""
+        """Write a frame of an estimate to the log."""
         if self._log is not None:
             frame.channel = 0
             with writing(self._path):

@@ -34,9 +34,9 @@ from vehest.trust.clock import RESET_SECONDS, STOPPED, SampleClock
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0  # s of a log that are read for its timing; more until each signal came twice
-LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
-PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
-# s that another Python thread may go on when the receiver has something to do
+LEAD_SECONDS = 0.5  # s from the start of a replay in real time to its first frame
+PATIENCE = 0.25  # s, interval at which a thread looks whether it is to stop
+# s, longest time for which another Python thread goes on when the receiver has something to do
 SWITCH_SECONDS = 2e-4
 
 
@@ -90,13 +90,14 @@ class Bus:
     fast as possible.
     """
 
-    interface: str = "virtual"
-    channel: str = "vehest"
-    speed: float | None = 1.0
+    interface: str = "virtual"  # interface of python-can
+    channel: str = "vehest"  # channel of the interface
+    speed: float | None = 1.0  # speed of the replay over real time; None: as fast as possible
 
     @contextmanager
     def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
-        """The sender's end of the bus, and the control unit's, which hears the messages only.
+        """Context with both ends of the bus: the sender's, and the control unit's, which receives
+        the given messages only.
 
         Raises
         ------
@@ -132,8 +133,8 @@ class Bus:
 
 
 class Replay:
-    """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it
-    hears there.
+    """Replays a log's frames on a bus, as the car, and runs a control unit that estimates from the
+    frames that it receives.
 
     The model reads ``signals``; ``frames`` writes its estimates as frames; ``stopped`` tells
     whether to end early, with what was written kept. Raises `ConfigurationError`: the DBC has the
@@ -255,7 +256,7 @@ class Replay:
             raise self.failure
 
     def _on_bus(self, wall: float) -> float:
-        """Time of the bus at a time of the clock on the wall [s]."""
+        """Time on the bus [s] at a time of the wall clock [s]."""
         return self.first + (wall - self.begin) * self.speed
 
     # The car
@@ -342,7 +343,7 @@ class Replay:
             self._deal_with(sample)
 
     def _deal_with(self, sample: Sample) -> None:
-        """Estimate a sample, and count how long it took."""
+        """Estimate a sample, and count it with the time that this took."""
         started = time.perf_counter()
         self._estimate(sample)
         took = (

@@ -26,17 +26,19 @@ GAIN = 0.02
 # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
 MAX_PERIOD_DEVIATION = 0.05
 ROUND_RATE_TOLERANCE = 5e-3  # relative distance to a round rate that is assumed to be it
-STAMP_TOLERANCE = 1e-9  # s
+STAMP_TOLERANCE = 1e-9  # s, tolerance of the age at which a value is no longer fresh
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When the messages of a bus arrive."""
+    """Rate and arrival times of the messages of a bus, by which the instants of samples are
+    placed.
+    """
 
-    rate_hz: float  # of the samples
+    rate_hz: float  # rate of the samples [Hz]
     periods: Mapping[str, float]  # channel -> interval between its values [s]
     clock: str  # channel whose frames give the sender's clock
-    offset: float  # from their arrival to the instant of the sample [s]
+    offset: float  # time from the arrival of the clock's frames to the instant of the sample [s]
     start: float  # instant of the first sample [s]
     first: float = 0.0  # time of the first frame [s]
 
@@ -91,7 +93,9 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
 
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
-    """Where in a cycle frames arrive [s], by their circular mean; None if anywhere."""
+    """Time within a cycle at which frames arrive [s], by their circular mean; None if they arrive
+    at any time.
+    """
     if abs(period / cycle - max(round(period / cycle), 1)) > MAX_PERIOD_DEVIATION * max(
         period / cycle, 1.0
     ):
@@ -121,11 +125,11 @@ def check_samples(first: float, last: float, rate_hz: float, location: str) -> N
 
 
 class Sample(NamedTuple):
-    """What is known of a bus at one instant."""
+    """Values of the channels at one instant."""
 
-    time: float  # on the bus's clock [s]
-    values: dict[str, float]  # channel -> value [SI] that is fresh
-    missing: list[str]  # the other channels
+    time: float  # instant on the bus's clock [s]
+    values: dict[str, float]  # channel -> fresh value [SI]
+    missing: list[str]  # channels without a fresh value
 
 
 class Sampler:

@@ -10,29 +10,30 @@ from typing import Any, TextIO
 
 from vehest.trust.health import reason_in_words
 
-HEALTH = ("valid", "degraded", "invalid")
+HEALTH = ("valid", "degraded", "invalid")  # texts of the codes of health, 0 first
 LINE_SECONDS = 10.0  # s, at least, between two lines that `View` writes
 
 
 @dataclass
 class Figures:
-    """How a replay goes, under the names that it reports."""
+    """Figures of a replay, by the names under which they are reported."""
 
-    seconds: float = 0.0  # on the bus's clock, from the first sample to the last
-    frames_sent: int = 0  # of the log, put on the bus
-    frames_received: int = 0  # of them, those that carry wanted signals
-    frames_too_short: int = 0  # of these, those that are shorter than the DBC says
-    samples: int = 0
-    samples_lost: int = 0  # of them, those at which a channel was missing: lost, late or invalid
-    missing: dict[str, int] = field(default_factory=dict)  # channel -> at how many
-    estimates: int = 0  # that were sent
+    seconds: float = 0.0  # time from the first sample to the last, on the bus's clock
+    frames_sent: int = 0  # frames of the log that were put on the bus
+    frames_received: int = 0  # frames with signals that the model reads, among those sent
+    frames_too_short: int = 0  # frames that are shorter than the DBC says, among those received
+    samples: int = 0  # samples that were formed
+    samples_lost: int = 0  # samples at which a channel was missing: lost, late or invalid
+    # channel -> number of samples at which it was missing
+    missing: dict[str, int] = field(default_factory=dict)
+    estimates: int = 0  # estimates that were sent
     # longest time from a sample's instant until its estimate was sent; as fast as possible: that a
     # sample took
     latest_ms: float = 0.0
     deadlines_missed: int = 0  # samples for which that was longer than a cycle of the bus
 
     def plain(self) -> dict[str, Any]:
-        """Figures for people and scripts."""
+        """Figures as plain values, to print or to write as JSON."""
         return {
             name: round(value, 3) if isinstance(value, float) else value
             for name, value in vars(self).items()
@@ -74,7 +75,9 @@ class View:
 def _with_band(
     values: Mapping[str, float], name: str, factor: float, unit: str, digits: int
 ) -> str:
-    """A value with the half width of its band, in a display unit; a dash where there is none."""
+    """Text of a value in a display unit with the half width of its band; a dash where there is
+    none.
+    """
     value = values.get(name, math.nan)
     band = values.get(f"band_{name}", math.nan)
     if math.isnan(value):

@@ -47,7 +47,7 @@ from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import check_yaml_size, first_line, read_text, read_yaml
 from vehest.data.transforms import Preparation
 
-Config = dict[str, Any]
+Config = dict[str, Any]  # composed configuration as plain values
 
 OPTION_HINTS = {
     option: f"an option is written --{option}"
@@ -59,18 +59,20 @@ OPTION_HINTS = {
 # recordings, as a default is
 OVERRIDDEN_RATES_KEY = "given"
 
-RATES = ("estimator.rate_hz", "evaluation.rate_hz")
-LOCAL_SCHEME = "vehest"  # of the search path, for ./conf
-# of a file of ./conf, and of what references stand for; OmegaConf takes 0.1 ms for each
+RATES = ("estimator.rate_hz", "evaluation.rate_hz")  # keys of sampling rates [Hz]
+LOCAL_SCHEME = "vehest"  # scheme of the entry for ./conf in Hydra's search path
+# largest number of values of a file of ./conf, and of all to which references resolve; OmegaConf
+# takes 0.1 ms for each
 MAX_CONFIG_VALUES = 20_000
 OPEN_GROUPS = {"estimate": "estimator"}
 """Command -> group to which overrides may add any key.
 
 These are settings of a model that is opened later, which checks them.
 """
-VALUES_PER_REFERENCE = 10  # as which the work for a reference counts
-CHARACTERS_PER_VALUE = 100  # as which long text counts
-# the first one counts; a package named by another, in a file or an override, would be imported
+VALUES_PER_REFERENCE = 10  # number of values as which resolving one reference counts
+CHARACTERS_PER_VALUE = 100  # number of characters of a long text that count as one value
+# override that empties Hydra's search path; the first one counts, and a package named by another,
+# in a file or an override, would be imported
 NO_SEARCH_PATH = "hydra.searchpath=[]"
 
 
@@ -81,9 +83,9 @@ class Tracking:
     ``uri`` is that of a server or a store; None is a local store in the output root.
     """
 
-    name: Literal["mlflow", "none"]
-    uri: str | None = None
-    experiment: str = "vehest"
+    name: Literal["mlflow", "none"]  # kind of the store of runs
+    uri: str | None = None  # address of the store; None: a local store in the output root
+    experiment: str = "vehest"  # name of the experiment in the store
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Named:
     """A group of options that the schema of its ``name`` checks further."""
 
     __pydantic_config__ = FURTHER_KEYS
-    name: str
+    name: str  # chosen member of the group, by which its schema is found
 
 
 @dataclass(frozen=True)
@@ -99,16 +101,16 @@ class Root:
     """Groups of every command's configuration; those that a command does not have are None."""
 
     __pydantic_config__ = FURTHER_KEYS
-    output: str
-    limits: dict[str, Any]
-    downsample: Preparation
-    root: str | None = None
-    tracking: Tracking | None = None
-    estimator: Named | None = None
-    split: dict[str, Any] | None = None
-    dataset: dict[str, Any] | None = None
-    training: dict[str, Any] | None = None
-    evaluation: dict[str, Any] | None = None
+    output: str  # folder in which artefacts are written
+    limits: dict[str, Any]  # upper bounds of the size of inputs
+    downsample: Preparation  # options of the resampling to a lower rate
+    root: str | None = None  # folder of a data set's raw files
+    tracking: Tracking | None = None  # store of runs
+    estimator: Named | None = None  # estimator and its options
+    split: dict[str, Any] | None = None  # ranges for training, validation and tests
+    dataset: dict[str, Any] | None = None  # data set and its options
+    training: dict[str, Any] | None = None  # options of training
+    evaluation: dict[str, Any] | None = None  # options of scoring
 
     def __post_init__(self) -> None:
         if not self.output or "\0" in self.output:
@@ -119,6 +121,7 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
     """Makes Hydra search ./conf before the packaged folder, and the papers' folder last."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Put ./conf before the packaged folder, and the papers' folder behind it."""
         *local, _, papers = conf_folders()
         for folder in local:
             # Hydra takes it literally, spaces too
@@ -136,9 +139,11 @@ class _LimitedFiles(FileConfigSource):  # type: ignore[misc]
 
     @staticmethod
     def scheme() -> str:
+        """Scheme of the entries in the search path that this source reads."""
         return LOCAL_SCHEME
 
     def load_config(self, config_path: str) -> ConfigResult:
+        """Read a file after its size was checked, and note it if it has a list of defaults."""
         file = Path(os.path.relpath(self.path), self._normalize_file_name(config_path))
         check_yaml_size(read_text(file), f"'{file}'", MAX_CONFIG_VALUES)
         loaded = super().load_config(config_path)
@@ -274,7 +279,9 @@ def _composed(command: str, of_groups: tuple[str, ...], stamp: str) -> DictConfi
 
 
 def _check(override: Override) -> None:
-    """Refuse what Hydra would take, or answer with less help."""
+    """Raise `ConfigurationError` for an override that Hydra would accept wrongly, or refuse with
+    less help.
+    """
     group = override.key_or_group
     text = _shortened(override.input_line)
     if override.is_sweep_override():
@@ -404,7 +411,7 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def _values(override: Override) -> list[str]:
-    """An override once for each of its values, but for at most ``limits.jobs`` + 1 of them."""
+    """The override once for each of its values, at most ``limits.jobs`` + 1 of them."""
     if not override.is_sweep_override():
         return [str(override.input_line)]
     text = _shortened(override.input_line)
@@ -426,7 +433,9 @@ def _values(override: Override) -> list[str]:
 
 
 def check_jobs(number: int, subject: str) -> None:
-    """Refuse more jobs than ``limits.jobs``."""
+    """Raise `ConfigurationError` for more jobs than ``limits.jobs``; ``subject`` begins the
+    message, such as ``these overrides stand``.
+    """
     check_limit("jobs", number, f"{subject} for at least {number} jobs", ConfigurationError)
 
 

@@ -17,15 +17,19 @@ from vehest.data.limits import Limits, limits_from_config
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """How a recording is read, and what is changed of the model."""
+    """Options by which a recording is read, and by which the model is changed."""
 
     output: Path  # root in which models are looked for by name
     dataset: dict[str, Any]  # options of the recording's data set
-    names_dataset: bool  # whether an override chooses it
-    limits: Limits
-    settings: dict[str, Any]  # of the self-calibrating filter that overrides set, name -> value
-    same_vehicle: bool | None  # the user's answer; None: by names and values of the cars
-    preparation: dict[str, Any] | None  # that overrides set; None: that of the model's training
+    names_dataset: bool  # whether an override chooses the data set
+    limits: Limits  # upper bounds of the size of inputs
+    # settings of the self-calibrating filter that overrides set, name -> value
+    settings: dict[str, Any]
+    # the user's word on whether it is the car of the training; None: decided by names and values of
+    # the cars
+    same_vehicle: bool | None
+    # resampling that overrides set; None: that of the model's training
+    preparation: dict[str, Any] | None
 
 
 def estimate_options(overrides: Sequence[str]) -> EstimateOptions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+# groups of the configuration that offer choices, each a folder of conf/
 GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "tracking")
 
 
@@ -27,7 +28,7 @@ def conf_folders() -> list[Path]:
 
 
 def choices(group: str) -> list[str]:
-    """Names that a group offers, from all folders together."""
+    """Names of the choices of a group, from all folders together."""
     return sorted(
         {file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")}
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]
+PositiveNumber = Annotated[float, Field(gt=0.0), "a positive number"]  # number above 0
 
 SAME_CAR_RANGES = {"wheelbase": (1.05, "m"), "mass": (1.25, "kg")}
 """Value -> factor by which it may differ for one car, and its unit.
@@ -64,7 +64,7 @@ class CarValues:
             )
 
     def scaled(self, factor: float) -> CarValues:
-        """The same car with its lengths multiplied; its mass then is that of no car."""
+        """The car with its lengths multiplied by a factor; its mass is unknown then."""
         wheelbase = None if self.wheelbase is None else factor * self.wheelbase
         rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
         imu = None if self.imu_to_rear_axle is None else factor * self.imu_to_rear_axle
@@ -73,7 +73,8 @@ class CarValues:
         )
 
     def difference_to(self, second: CarValues) -> str:
-        """Why this and another car cannot be the same: ``wheelbase 0.33 m, not 2.7 m``; else empty.
+        """Text of the first value in which this and another car differ too much to be the same,
+        such as ``wheelbase 0.33 m, not 2.7 m``; empty if there is none.
 
         They cannot where a value that both have differs by more than `SAME_CAR_RANGES`.
         """
@@ -87,4 +88,4 @@ class CarValues:
         return ""
 
 
-UNKNOWN_CAR = CarValues()
+UNKNOWN_CAR = CarValues()  # car of which no value is known

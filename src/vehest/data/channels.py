@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from vehest.data.errors import DataError
 
-REFERENCE_SUFFIX = "_ref"
+REFERENCE_SUFFIX = "_ref"  # end of the names of channels that come from a reference sensor
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _table() -> dict[str, Channel]:
     return {channel.name: channel for channel in rows}
 
 
-CHANNELS: dict[str, Channel] = _table()
+CHANNELS: dict[str, Channel] = _table()  # canonical name -> channel
 
 
 def channel(name: str) -> Channel:

@@ -25,14 +25,14 @@ MAKES = {
     "steering_ratio": "steer",
     "velocity_from_sideslip": "vy_ref",
 }
-"""Transform -> channel that it makes of others."""
+"""Transform -> channel that it derives from others."""
 
 
 @dataclass(frozen=True)
 class Derivation:
-    """How a channel is made of others."""
+    """How a missing channel is derived from others."""
 
-    of: tuple[str, ...]  # channels of the log that it is made of, in the end
+    of: tuple[str, ...]  # channels of the log from which it is derived in the end
     # entries of a data set's ``transforms``, in order; None: a value that only the user knows
     transforms: tuple[Mapping[str, Any], ...]
 
@@ -47,8 +47,8 @@ class Derivation:
         }
 
     def in_words(self) -> str:
-        """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel
-        (ratio: of …)``.
+        """Text for messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of
+        handwheel (ratio: of …)``.
         """
         entries = ", ".join(
             "{" + ", ".join(f"{key}: {_as_text(value)}" for key, value in entry.items()) + "}"
@@ -113,11 +113,12 @@ def derivation_of(
 
 
 def channels_made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:
-    """Channels that transforms make of others, as far as their names tell."""
+    """Channels that transforms derive from others, by the transforms' names."""
     return frozenset(
         MAKES[name] for entry in transforms if (name := str(entry.get("name"))) in MAKES
     )
 
 
 def _as_text(value: Any) -> str:
+    """Text of an option's value; ``…`` for one that only the user knows."""
     return "…" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -16,8 +16,10 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 
-WHEELS = ("fl", "fr", "rl", "rr")
-STANDSTILL_SPEED = 0.1  # m/s
+WHEELS = ("fl", "fr", "rl", "rr")  # suffixes of the channels of the four wheels
+# m/s, speed below which a sideslip angle of 90 degrees or more has no meaning and gives ``vy_ref``
+# 0
+STANDSTILL_SPEED = 0.1
 
 
 def _checked_channel(name: str) -> str:
@@ -40,7 +42,7 @@ class SteeringRatio:
     """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio."""
 
     ratio: float  # angle for a unit of ``steer``; negative if it counts the other way
-    offset: float = 0.0  # what it shows going straight ahead [rad]
+    offset: float = 0.0  # angle that is shown straight ahead [rad]
     channel: ChannelName = "handwheel"  # the angle; ``steer`` itself may be it
 
     def __post_init__(self) -> None:
@@ -70,7 +72,7 @@ class SteeringCurve:
     inputs: tuple[float, ...]  # values of the channel at the corners, increasing
     # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
     angles: tuple[float, ...]
-    channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
+    channel: ChannelName = "steer"  # channel to which the curve is applied; it may be ``steer``
 
     def __post_init__(self) -> None:
         if (
@@ -121,6 +123,7 @@ class SpeedFromWheels:
     tolerance: PositiveFloat = 0.3  # absolute part of it [m/s]; 5 % of the median come on top
     most_acceleration: PositiveFloat = 12.0  # of the car, forwards or backwards [m/s²]
     hold_seconds: PositiveFloat = 2.0  # for how long ``vx`` goes on without two wheels [s]
+    # part of the tolerance that is proportional to the median
     relative_tolerance: ClassVar[float] = 0.05
 
     def corrected(self, recording: Recording) -> FloatArray:
@@ -214,7 +217,7 @@ class AccelerationFromSpeed:
     """
 
     channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
-    cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
+    cutoff_hz: PositiveFloat = 5.0  # cut-off of a Butterworth filter of second order [Hz]
     # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
     direction: Literal["causal", "zero_phase"] = "causal"
 
@@ -306,14 +309,16 @@ class SideslipFromVelocity:
 
 
 def speed_of_reference(recording: Recording) -> str:
-    """Channel of the forward speed that goes with a reference."""
+    """Name of the channel of the forward speed that belongs to a reference: ``vx_ref``, or ``vx``
+    without one.
+    """
     return "vx_ref" if "vx_ref" in recording else "vx"
 
 
 @dataclass(frozen=True)
 class ScaleToWheelbase:
-    """See a car as one of another wheelbase: times and lengths in units that leave accelerations
-    and angles as they are.
+    """Scale a recording to that of a similar car with another wheelbase: times and lengths in units
+    that leave accelerations and angles as they are.
 
     With λ = to/wheelbase, lengths grow by λ and times by √λ: velocities by √λ, yaw rates by 1/√λ. A
     1:10 car and a full-size one that are geometrically similar on similar tyres then drive the same
@@ -325,8 +330,8 @@ class ScaleToWheelbase:
     vehicles.
     """
 
-    wheelbase: PositiveFloat  # of the car [m]
-    to: PositiveFloat  # of the car that it is seen as [m]
+    wheelbase: PositiveFloat  # wheelbase of the car [m]
+    to: PositiveFloat  # wheelbase to which it is scaled [m]
 
     def __call__(self, recording: Recording) -> Recording:
         """Scale rate, start time and channels."""

@@ -49,12 +49,12 @@ class JobsFailedError(VehestError):
 
 
 def listed(words: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Words joined as text: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def counted(names: Sequence[str]) -> str:
-    """Their number, and the first of them."""
+    """Text of the number of names and, in brackets, of the first six of them."""
     return (
         f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
         if names
@@ -79,7 +79,7 @@ def closest(name: str, choices: Iterable[str]) -> str:
 
 
 def suggestion(name: str, choices: Iterable[str], prefix: str = "") -> str:
-    """What was probably meant by an unknown name, to append to a message.
+    """Text with what was probably meant by an unknown name, to append to a message.
 
     Empty if no choice is close.
     """

@@ -15,6 +15,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import clock_tolerance
 from vehest.data.time_series import TimeSeries
 
+# whether a sample may use measurements of later times: ``causal`` for no
 Mode = Literal["causal", "offline"]
 
 QUANTITIES: dict[str, str] = {
@@ -82,7 +83,7 @@ class Estimate(TimeSeries):
     # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
     channels: Mapping[str, FloatArray]
     mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
-    # of the errors of some of the quantities, (T, n, n), where the method has one
+    # covariance of the errors of some of the quantities, (T, n, n), where the method has one
     covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
@@ -109,7 +110,7 @@ class Estimate(TimeSeries):
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Text that identifies the estimate in messages."""
         return f"of '{self.recording_id}' by {self.estimator}"
 
     @property
@@ -124,10 +125,12 @@ class Estimate(TimeSeries):
         return self.channels[name]
 
     def _table(self) -> dict[str, FloatArray]:
+        """Columns of the table of the estimate, angles also in degrees."""
         [columns] = estimate_columns([self])
         return with_degrees(columns)
 
     def _table_units(self) -> dict[str, str]:
+        """Column of the table -> its unit."""
         return column_units(self)
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
@@ -170,7 +173,7 @@ class Estimate(TimeSeries):
         )
 
     def _held_index(self, times: FloatArray) -> NDArray[np.int64]:
-        """Sample that is held at each time; -1 outside the estimate."""
+        """Index of the sample that is held at each time; -1 outside the estimate."""
         tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(
             np.int64

@@ -18,13 +18,14 @@ from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError, VehestError, closest
 
-ASIDE_PREFIX = ".writing-"
+ASIDE_PREFIX = ".writing-"  # start of the name of a file or folder that is being written
 _ASIDE = re.compile(
     rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?"
 )  # process and host before the name
 FOREIGN_SECONDS = (
     24 * 3600.0
 )  # after which files of another host count as left over, whose processes cannot be seen from here
+# numbers of the errors of a full disk
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 # words in the text of an error without a number -> number of the error
 _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.fromkeys(
@@ -140,7 +141,8 @@ def file_name(name: str, ending: str = "") -> str:
 
 
 def no_room(error: BaseException) -> OSError | None:
-    """The full disk behind an error, also one that a library only words.
+    """The error of a full disk behind an exception, also where a library only reports it as text;
+    None for another cause.
 
     None where the cause is another.
     """
@@ -219,7 +221,8 @@ def is_left_over(path: Path) -> bool:
 
 
 def aside_of(path: Path, name: str = "") -> Path:
-    """A free place beside ``path`` for this process, for ``path`` itself or another name.
+    """A free path beside ``path`` at which this process may write what later becomes ``path`` or
+    another name.
 
     Files that stay there are removed later.
     """
@@ -246,8 +249,8 @@ def sha256_of(path: Path) -> str:
 
 
 def stamp_of(*paths: Path) -> str:
-    """Hash of names, sizes, times and inodes of files and of all files below folders, but for
-    compiled code; links are followed.
+    """Hash by which changes of files are found: of names, sizes, times and inodes of files and of
+    all files below folders, except compiled code; links are followed.
 
     Times of inodes show files that were replaced by others of the same size and date.
     """

@@ -1,4 +1,4 @@
-"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one
+"""Blocked cross-validation: folds of recordings, laps or segments of time that follow one
 another.
 """
 
@@ -18,19 +18,20 @@ from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 
-MIN_FOLDS = 3  # one to test, one to stop on, the rest to learn from
+# smallest number of folds: one to test, one for early stopping, the rest to learn from
+MIN_FOLDS = 3
 
 
 @dataclass(frozen=True)
 class FoldsFile:
-    """How a split is cross-validated."""
+    """Settings of the cross-validation of a split."""
 
-    number: Annotated[int, Field(ge=MIN_FOLDS)] = 5  # of folds, three or more
+    number: Annotated[int, Field(ge=MIN_FOLDS)] = 5  # number of folds, three or more
     # unit that is never cut in two; seconds: ``block_seconds`` of driving
     of: Literal["recordings", "laps", "seconds"] = "laps"
-    recordings: str = "*"  # pattern of those that take part
+    recordings: str = "*"  # pattern of the names of the recordings that take part
     block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
-    # removed from training and validation where they border on another fold [s]
+    # time that is removed from training and validation where they border on another role [s]
     gap_seconds: NonNegativeFloat = 2.0
 
 
@@ -111,8 +112,8 @@ def fold_of(
 def _joined(
     blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float
 ) -> tuple[Span, ...]:
-    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has
-    another role.
+    """Ranges of the blocks of one role: neighbours are joined, and shortened by the gap [s] where
+    they border on a block of another role; a range that is no longer than its gaps is dropped.
 
     Dropped where that is all.
     """

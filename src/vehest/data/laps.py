@@ -11,17 +11,19 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
-MAX_POINTS = 8192  # of the path at most
-# between the curvatures of a lap and of the next; drivers take other lines, the course stays
+MAX_POINTS = 8192  # points of the path, at most
+# smallest correlation between the curvatures of a lap and of the next; drivers take other lines,
+# the course stays
 MIN_LAP_CORRELATION = 0.6
-# of the best correlation, from which the shorter of two periods is taken: two laps repeat too
+# share of the best correlation from which on a shorter period is taken, since two laps repeat too
 MIN_SHARE_OF_BEST = 0.9
-# rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
+# rad, largest deviation of the heading after a lap from a whole number of turns, gyro drift
+# included
 MAX_HEADING_ERROR = 0.8
 # spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
 MAX_CIRCLE_SPREAD = 0.2
 MAX_MISSING_SHARE = 0.005  # share of a lap that a last one may lack and count as complete
-# share of a lap by which the next boundary is looked for before and after where it is expected
+# share of a lap by which the next boundary may lie before or after the expected place
 SEARCH_SHARE = 0.04
 
 
@@ -75,13 +77,16 @@ def _first_of(recording: Recording, *names: str) -> FloatArray:
 
 
 def _turns(turned: FloatArray) -> list[int]:
-    """Points at which whole turns of a circle are done."""
+    """Indices of the points at which whole turns of a circle are completed, 0 first, by the
+    accumulated heading ``turned`` [rad].
+    """
     n_turns = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
     return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(n_turns))) + 1).tolist()]
 
 
 def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
-    """Points after which the curvature repeats and the heading is the same again.
+    """Number of points after which the curvature repeats and the heading is the same again; None
+    where there is none.
 
     None where that is never.
     """
@@ -102,9 +107,7 @@ def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
 
 
 def _correlations(samples: FloatArray) -> FloatArray:
-    """Pearson's correlation of samples with themselves some points later, for lags up to half of
-    them.
-    """
+    """Autocorrelation (Pearson) of samples for lags of 0 to half their number."""
     number = len(samples)
     size = 1 << (2 * number - 1).bit_length()
     spectrum = np.fft.rfft(samples, size)
@@ -126,8 +129,8 @@ def _correlations(samples: FloatArray) -> FloatArray:
 
 
 def _boundaries(curvature: FloatArray, period: int) -> list[int]:
-    """Points at which laps begin: each a period after the one before, moved to where the two laps
-    fit best.
+    """Indices of the points at which laps begin, and of the end of the last complete one: each a
+    period after the one before, shifted to where the two laps agree best.
     """
     bounds = [0]
     reach = max(round(SEARCH_SHARE * period), 1)

@@ -18,11 +18,12 @@ from vehest.data.schema import validated
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on what one input may take; an hour of 55 channels at 1 kHz stays below each."""
+    """Upper bounds of the size of one input; an hour of 55 channels at 1 kHz stays below each."""
 
-    samples: PositiveInt = 20_000_000  # of one channel of a recording, also after resampling
+    # samples of one channel of a recording, also after resampling
+    samples: PositiveInt = 20_000_000
     columns: PositiveInt = 10_000  # columns that the header of a table may name
-    # what reading one file may take beyond ten times its size [bytes]
+    # memory that reading one file may take beyond ten times its size [bytes]
     memory: PositiveInt = 1_600_000_000
     # reach of a filter, or length of an estimator's window, in samples
     filter_samples: PositiveInt = 1_000_000
@@ -31,8 +32,8 @@ class Limits:
     text_bytes: PositiveInt = 16 * 2**20
 
 
-_DEFAULTS = Limits()
-_current: ContextVar[Limits] = ContextVar("limits", default=_DEFAULTS)
+_DEFAULTS = Limits()  # limits where none are set
+_current: ContextVar[Limits] = ContextVar("limits", default=_DEFAULTS)  # limits in force
 
 
 def current_limits() -> Limits:
@@ -42,7 +43,7 @@ def current_limits() -> Limits:
 
 @contextmanager
 def use_limits(limits: Limits) -> Iterator[None]:
-    """Put limits in force for a while."""
+    """Context in which limits are in force."""
     token = _current.set(limits)
     try:
         yield

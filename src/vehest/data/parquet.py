@@ -30,10 +30,7 @@ DAMAGE = (
     OverflowError,
     RecursionError,
 )
-"""What pyarrow and NumPy raise where a file is not what it says.
-
-An ArrowInvalid is a ValueError, too.
-"""
+"""Exceptions of pyarrow and NumPy for a damaged file; an ArrowInvalid is a ValueError, too."""
 
 ROWS_AT_A_TIME = 1 << 15  # rows of a batch at most
 BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else reads all of it

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from typing import Any, BinaryIO
 
-HEADER_BYTES = 1 << 9  # that are read at a time; a header is some dozens of bytes long
-MAX_HEADER_BYTES = 1 << 24  # as pyarrow has it
-MAX_DEPTH = 8  # of structures in a header
+HEADER_BYTES = 1 << 9  # bytes of a header that are read at a time; it is some dozens of bytes long
+MAX_HEADER_BYTES = 1 << 24  # largest length of a header, as in pyarrow
+MAX_DEPTH = 8  # largest nesting of structures in a header
 PADDING = 100  # bytes; what old writers left out of a column's size (PARQUET-816)
 STOP, TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, _, STRUCT = range(13)
-FIXED_BYTES = {BYTE: 1, DOUBLE: 8}
-DATA_PAGE_FIELDS = (5, 8)  # of a page's header: that of a data page of version 1 or 2
+FIXED_BYTES = {BYTE: 1, DOUBLE: 8}  # type of a field -> its length, where that is fixed
+# numbers of the fields of a page's header that hold that of a data page, of version 1 or 2
+DATA_PAGE_FIELDS = (5, 8)
 
 
 def largest_page(stream: BinaryIO, column: Any) -> int:
@@ -79,7 +80,7 @@ def _page_header(stream: BinaryIO, begin: int, end: int) -> tuple[dict[int, Any]
 
 
 def _struct(content: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
-    """Fields of a structure, number -> value, and where it ends.
+    """Fields of a structure, number -> value, and the index of the byte after it.
 
     `IndexError` beyond the content.
     """
@@ -101,7 +102,7 @@ def _struct(content: bytes, at: int, depth: int) -> tuple[dict[int, Any], int]:
 
 
 def _value(content: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
-    """Value of a field and where it ends."""
+    """Value of a field and the index of the byte after it."""
     if kind in (TRUE, FALSE):
         return kind == TRUE, at
     if kind in (I16, I32, I64):
@@ -120,13 +121,15 @@ def _value(content: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
 
 
 def _integer(content: bytes, at: int) -> tuple[int, int]:
-    """A signed number (zigzag) and where it ends."""
+    """A signed number (zigzag) and the index of the byte after it."""
     number, at = _unsigned(content, at)
     return (number >> 1) ^ -(number & 1), at
 
 
 def _unsigned(content: bytes, at: int) -> tuple[int, int]:
-    """An unsigned number, seven bits a byte, the lowest first, and where it ends."""
+    """An unsigned number, seven bits a byte, the lowest first, and the index of the byte after
+    it.
+    """
     number = 0
     for shift in range(0, 70, 7):
         byte = content[at]

@@ -16,12 +16,14 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.time_series import TimeSeries
 
-Kind = Literal["real", "simulated"]
+Kind = Literal["real", "simulated"]  # whether a drive was real or simulated
 
 MAX_PART_SECONDS = 900.0  # s; a longer drive is checked and, from a large table, read in parts
-PART = "part"  # in the provenance of a part of a drive: its number and that of all
-DERIVED = "derived"  # likewise: the data set's transforms and points of its sensors
-MISSING = "missing_samples"  # likewise: channel, empty for all of them -> texts
+PART = "part"  # key in the provenance of a part of a drive: its number and the number of parts
+# key in the provenance: the data set's transforms and the points of its sensors
+DERIVED = "derived"
+# key in the provenance: channel (empty: all of them) -> texts on missing samples
+MISSING = "missing_samples"
 UNNAMED_VEHICLE = "unknown"  # name of the vehicle where nobody named it
 LOWEST_RATE = 1e-6  # Hz; a recording with a lower rate is refused
 HIGHEST_RATE = 1e5  # Hz; a recording, clock or estimator with a higher rate is refused
@@ -46,7 +48,7 @@ class Recording(TimeSeries):
     kind: Kind = "real"  # ``real`` or ``simulated``
     # channels in which NaN means "not measured"; everywhere else NaN is an error
     gappy: frozenset[str] = frozenset()
-    # where samples come from (JSON values only); not part of the data
+    # origin of the samples (JSON values only); not part of the data
     provenance: Mapping[str, Any] = field(default_factory=dict)
     car: CarValues = UNKNOWN_CAR  # values of its data set; a stored recording has none
 
@@ -97,7 +99,7 @@ class Recording(TimeSeries):
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Text that identifies the recording in messages."""
         return f"'{self.id}'"
 
     @property
@@ -202,7 +204,7 @@ class Recording(TimeSeries):
 
 
 def joined(parts: Sequence[Recording]) -> Recording:
-    """The recording of parts that follow one another."""
+    """Concatenate parts that follow one another into one recording."""
     first = parts[0]
     channels = {name: np.concatenate([part[name] for part in parts]) for name in first.channels}
     return replace(
@@ -213,7 +215,8 @@ def joined(parts: Sequence[Recording]) -> Recording:
 
 
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
-    """How far from a sample a time may lie and still be that sample's, in samples.
+    """Largest distance of a time from a sample at which it still counts as that sample's, in
+    samples.
 
     A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s
     (unix time) 0.24 µs.

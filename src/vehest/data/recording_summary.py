@@ -21,7 +21,7 @@ class RecordingSummary:
 
     id: str  # name, unique within its data set
     rate_hz: float  # sampling rate [Hz]
-    channels: frozenset[str]  # that it has
+    channels: frozenset[str]  # names of the channels
     gappy: frozenset[str] = frozenset()  # those of them that were not measured throughout
 
 

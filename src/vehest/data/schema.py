@@ -20,13 +20,14 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from vehest.data.errors import ConfigurationError, DataError, VehestError, suggestion
 
-Schema = TypeVar("Schema")
+Schema = TypeVar("Schema")  # dataclass that is built
 
+# configuration of pydantic for dataclasses that take further keys
 FURTHER_KEYS = ConfigDict(
     extra="ignore", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
 )
 MAX_DEPTH = 60  # levels that plain values may nest
-MAX_INTEGER = 10**300  # whole number
+MAX_INTEGER = 10**300  # largest magnitude of a whole number
 
 
 def validated(
@@ -143,8 +144,8 @@ def _field_types(kind: type) -> dict[str, Any]:
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Validates lists of a dataclass: pydantic takes a configuration for what holds a dataclass,
-    not for the dataclass itself.
+    """Validator of pydantic for lists of a dataclass; a list, since pydantic takes a configuration
+    for what holds a dataclass, not for the dataclass itself.
     """
     return TypeAdapter(list[kind], config={**FURTHER_KEYS, "extra": "forbid"})
 
@@ -181,8 +182,9 @@ def _plain(value: Any, path: list[str]) -> Any:
 # hold: characters of plane 16,
 # which is for private use, replace them while content is validated.
 _SURROGATE = re.compile("[\ud800-\udfff]")
+# code of a lone surrogate -> code that replaces it during validation
 _REPLACED = {code: code + 0x100000 for code in range(0xD800, 0xE000)}
-_RESTORED = {new: old for old, new in _REPLACED.items()}
+_RESTORED = {new: old for old, new in _REPLACED.items()}  # the inverse of `_REPLACED`
 
 
 def _validated(kind: Any, content: Any) -> Any:
@@ -212,6 +214,7 @@ def _with_surrogates(value: Any) -> Any:
     return value
 
 
+# type of an error of pydantic -> what a message says was expected
 _TYPE_WORDS = {
     "int_type": "a whole number",
     "float_type": "a number",
@@ -227,7 +230,7 @@ _TYPE_WORDS = {
 
 
 def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: list[str]) -> str:
-    """The first error of pydantic in one line, with the other choices of its union."""
+    """One line on the first error of pydantic, with the other choices of its union."""
     errors = problem.errors(include_url=False)
     error = errors[0]
     loc = errors[0]["loc"]
@@ -267,6 +270,7 @@ def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: li
 
 
 def _shortened(value: Any) -> str:
+    """Text of a value for a message, cut off after 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]} …"
 

@@ -21,17 +21,18 @@ from vehest.data.schema import validated
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
-Reader = Callable[
-    [Iterable[str] | None], Recording
-]  # reads the named channels of one recording, or all
-Catalogue = Callable[
-    [str], Mapping[str, Reader]
-]  # of the name of a data set: its recordings as ingested, by id
+# reads the named channels of one recording, None for all
+Reader = Callable[[Iterable[str] | None], Recording]
+# name of a data set -> its recordings as ingested, id -> reader
+Catalogue = Callable[[str], Mapping[str, Reader]]
 
-PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
+PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")  # matches a percentage
+# matches laps, such as ``last lap`` or ``2 to 5``
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
+# text on what a start or stop may be, for messages
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
-# of a piece of limited minutes; shorter ones hold no window after the start that is not scored
+# s, shortest segment of limited minutes; a shorter one holds no window after the start that is not
+# scored
 MIN_PIECE_SECONDS = 3.0
 
 
@@ -42,13 +43,13 @@ class RangeFile:
     Start to stop [s or %] or some laps; else raises `ValueError`.
     """
 
-    dataset: str | None = None
-    recording: str | None = None
-    recordings: str | None = None
-    start: Annotated[float | str, SECONDS_OR_SHARE] = -math.inf
-    stop: Annotated[float | str, SECONDS_OR_SHARE] = math.inf
-    laps: str | None = None
-    keep: Condition | None = None
+    dataset: str | None = None  # name of the data set; None: that of the split
+    recording: str | None = None  # id of the one recording
+    recordings: str | None = None  # pattern of the ids of several
+    start: Annotated[float | str, SECONDS_OR_SHARE] = -math.inf  # start of the range
+    stop: Annotated[float | str, SECONDS_OR_SHARE] = math.inf  # end of the range
+    laps: str | None = None  # laps of the range, such as ``last lap``
+    keep: Condition | None = None  # condition on the segments of the range that are used
 
     def __post_init__(self) -> None:
         if (self.recording is None) == (self.recordings is None):
@@ -59,20 +60,21 @@ class RangeFile:
 
 @dataclass(frozen=True)
 class SplitFile:
-    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in
-    all, as if no more had been recorded with a reference; ``minutes_at`` is the share of them after
-    which these begin.
-    """
+    """Content of conf/split/*.yaml."""
 
-    name: str = "unnamed"
-    title: str | None = None
-    dataset: str | None = None
-    train: tuple[RangeFile, ...] = ()
-    validation: tuple[RangeFile, ...] = ()
+    name: str = "unnamed"  # name of the split
+    title: str | None = None  # title for people
+    dataset: str | None = None  # data set of the ranges that name none
+    train: tuple[RangeFile, ...] = ()  # ranges to learn from
+    validation: tuple[RangeFile, ...] = ()  # ranges for early stopping
+    # name of a test set -> its ranges
     tests: dict[str, tuple[RangeFile, ...]] = field(default_factory=dict)
-    folds: FoldsFile | None = None
-    fold: int = 0
+    folds: FoldsFile | None = None  # cross-validation in place of ranges
+    fold: int = 0  # index of the fold that is tested, from 0
+    # training and validation are cut down to so many minutes in all, as if no more had been
+    # recorded with a reference
     minutes: PositiveFloat | None = None
+    # share of the ranges' length at which the minutes begin
     minutes_at: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
     def dataset_of(self, entry: RangeFile | None = None) -> str:
@@ -86,8 +88,8 @@ class SplitFile:
 
 
 def _read(config: Any) -> SplitFile:
-    """A split's configuration, short forms spelt out and checked; `ConfigurationError` for a
-    mistake.
+    """The content of a split's configuration, short forms written out and validated; raises
+    `ConfigurationError`.
     """
     name = config.get("name") if isinstance(config, Mapping) else None
     subject = f"split '{name}'" if isinstance(name, str) else ""
@@ -171,7 +173,8 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, which wraps around.
+    """Cut ranges to a total length: a segment of the ranges laid end to end, which wraps around at
+    the end.
 
     Parameters
     ----------
@@ -203,7 +206,7 @@ def _seconds_of(spans: Iterable[Span]) -> float:
 
 
 def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
-    """Pieces of ranges laid end to end that lie between two times of that line [s]."""
+    """Parts of ranges laid end to end that lie between two times of that common time axis [s]."""
     pieces = []
     position = 0.0
     for span in spans:
@@ -217,6 +220,8 @@ def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
 
 
 class _Ranges:
+    """Resolves the ranges of a split's file into spans of recordings."""
+
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file = file
         self._catalogue = catalogue
@@ -406,7 +411,7 @@ class _Ranges:
         return self._catalogues[dataset]
 
     def _cut(self, role: str, ranges: Sequence[Span], condition: Condition) -> list[Span]:
-        """Stretches of spans in which a condition holds."""
+        """Segments of spans in which a condition holds."""
         spans: list[Span] = []
         for span in ranges:
             recording = self._recording(span.dataset, span.recording, condition.magnitude)

@@ -1,4 +1,4 @@
-"""Stretches of recordings for training, validation and each named test."""
+"""Segments of recordings for training, validation and each named test."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from itertools import chain, pairwise, product
 
 from vehest.data.errors import ConfigurationError, printable
 
-VALIDATION = "validation"
-TRAINING = "training"
+VALIDATION = "validation"  # name of the validation ranges as a test set
+TRAINING = "training"  # name of the training ranges as a test set
 MAX_NAME_CHARACTERS = 100  # characters, so that file names with a stage and a key stay below 255
+# words that YAML or Hydra reads as something else than text
 YAML_WORDS = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n", "nan", "inf"])
+# matches text that YAML reads as a number or date
 YAML_NUMBER = re.compile(
     r"0[xob][0-9a-f_]+|[0-9][0-9_]*(\.[0-9_]*)?(e-?[0-9]+)?|[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}",
     re.IGNORECASE,
 )
+# matches names of devices of Windows
 WINDOWS_DEVICE = re.compile(r"con|prn|aux|nul|com[0-9]|lpt[0-9]", re.IGNORECASE)
 
 
@@ -58,12 +61,12 @@ def check_name(name: str, subject: str) -> None:
 
 @dataclass(frozen=True, order=True)
 class Span:
-    """A stretch [start, stop) of one recording, in the recording's own time [s]."""
+    """A segment [start, stop) of one recording, in the recording's own time [s]."""
 
-    dataset: str
-    recording: str
-    start: float = -math.inf
-    stop: float = math.inf
+    dataset: str  # name of the data set
+    recording: str  # id of the recording
+    start: float = -math.inf  # start [s]
+    stop: float = math.inf  # end [s], not included
 
     def __post_init__(self) -> None:
         if not self.start < self.stop:
@@ -73,12 +76,12 @@ class Span:
             )
 
     def overlaps(self, other: Span) -> bool:
-        """Whether both stretches share samples."""
+        """Whether both segments share samples."""
         is_same_recording = (self.dataset, self.recording) == (other.dataset, other.recording)
         return is_same_recording and self.start < other.stop and other.start < self.stop
 
     def describe(self) -> str:
-        """For messages and reports, for example ``lap3 [150, 450) s``."""
+        """Text for messages and reports, for example ``lap3 [150, 450) s``."""
         if self.start == -math.inf and self.stop == math.inf:
             return f"{self.recording} (all)"
         return f"{self.recording} [{self.start:.12g}, {self.stop:.12g}) s"
@@ -86,9 +89,9 @@ class Span:
 
 @dataclass(frozen=True)
 class Split:
-    """Training, validation and named test stretches.
+    """Training, validation and named test segments.
 
-    Without training and validation stretches it is for estimators that learn nothing.
+    Without training and validation segments it is for estimators that learn nothing.
 
     Raises
     ------
@@ -97,10 +100,10 @@ class Split:
         stretch that serves two purposes.
     """
 
-    name: str
-    train: tuple[Span, ...]  # stretches to learn from
-    validation: tuple[Span, ...]  # stretches to stop on
-    tests: Mapping[str, tuple[Span, ...]]  # name of a test set -> its stretches
+    name: str  # name of the split
+    train: tuple[Span, ...]  # segments to learn from
+    validation: tuple[Span, ...]  # segments for early stopping
+    tests: Mapping[str, tuple[Span, ...]]  # name of a test set -> its segments
 
     def __post_init__(self) -> None:
         if not (self.train or self.validation or self.tests):

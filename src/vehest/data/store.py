@@ -31,7 +31,8 @@ from vehest.data.schema import check_format, validated
 from vehest.data.text_files import first_line, parse_json
 
 _METADATA_KEY = b"vehest"  # key of vehest's description in the metadata of a Parquet file
-_FORMAT = 1
+_FORMAT = 1  # version of the layout of stored files
+# options of pyarrow for stored files
 _LAYOUT: dict[str, Any] = {
     "compression": "zstd",
     "use_dictionary": False,
@@ -45,37 +46,41 @@ _LAYOUT: dict[str, Any] = {
 class RecordingDescription:
     """Description of a recording beside its table; see `Recording`."""
 
-    format: int
-    content: Literal["recording"]
-    id: str
-    vehicle: str
-    rate_hz: float
-    start_time: float
-    kind: Kind = "real"
-    gappy: frozenset[str] = frozenset()
-    provenance: dict[str, Any] = field(default_factory=dict)
+    format: int  # version of the layout
+    content: Literal["recording"]  # kind of content
+    id: str  # name of the recording
+    vehicle: str  # name of the vehicle
+    rate_hz: float  # sampling rate [Hz]
+    start_time: float  # time of the first sample [s]
+    kind: Kind = "real"  # whether it was real or simulated
+    gappy: frozenset[str] = frozenset()  # channels in which NaN means that nothing was measured
+    provenance: dict[str, Any] = field(default_factory=dict)  # origin of the samples
 
 
 @dataclass(frozen=True)
 class EstimateDescription:
-    """Description of an estimate beside its table.
+    """Description of an estimate beside its table; see `Estimate`.
 
     See `Estimate`. ``n_states`` is the side of the covariance.
     """
 
-    format: int
-    content: Literal["estimate"]
-    recording_id: str
-    estimator: str
-    rate_hz: float
-    start_time: float
-    mode: Mode = "causal"
-    n_states: int | None = None
-    covariance_of: tuple[str, ...] = ("vy", "yaw_rate")  # of files from before rows had names
-    band: str = ""  # what calibrated ``band_vy`` and ``band_sideslip``, and for which car
+    format: int  # version of the layout
+    content: Literal["estimate"]  # kind of content
+    recording_id: str  # name of the recording
+    estimator: str  # name of the estimator
+    rate_hz: float  # rate of the estimate [Hz]
+    start_time: float  # time of the first sample [s]
+    mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
+    n_states: int | None = None  # side n of the covariance; None: there is none
+    # quantity behind each row of the covariance; the default is for files in which rows had no
+    # names
+    covariance_of: tuple[str, ...] = ("vy", "yaw_rate")
+    band: str = ""  # text on what calibrated ``band_vy`` and ``band_sideslip``, and for which car
 
 
+# attributes of a recording in its description
 _OF_RECORDING = ("id", "vehicle", "rate_hz", "start_time", "kind")
+# attributes of an estimate in its description
 _OF_ESTIMATE = ("recording_id", "estimator", "rate_hz", "start_time", "mode")
 
 _Description = TypeVar("_Description", RecordingDescription, EstimateDescription)
@@ -142,7 +147,7 @@ def is_stored_estimate(path: Path) -> bool:
 
 
 def _content_of(path: Path) -> str:
-    """What vehest wrote into a Parquet file: ``recording`` or ``estimate``.
+    """Kind of content that vehest wrote into a Parquet file: ``recording`` or ``estimate``.
 
     Empty for a file of another tool, whatever it is.
     """

@@ -1,4 +1,4 @@
-"""Stretches of a recording in which a condition on its channels holds."""
+"""Segments of a recording in which a condition on its channels holds."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Bounds:
         No magnitude lies between them.
     """
 
-    at_least: float = 0.0
-    at_most: float = math.inf
+    at_least: float = 0.0  # smallest magnitude
+    at_most: float = math.inf  # largest magnitude
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.at_least <= self.at_most:
@@ -33,7 +33,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Condition:
-    """What must hold at every sample of a stretch, and how long for.
+    """Condition on every sample of a segment, and the shortest length of a segment.
 
     Raises
     ------
@@ -42,7 +42,7 @@ class Condition:
     """
 
     magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
-    at_least_seconds: NonNegativeFloat = 0.0  # shortest stretch [s]
+    at_least_seconds: NonNegativeFloat = 0.0  # shortest segment [s]
 
     def __post_init__(self) -> None:
         if not self.magnitude:
@@ -51,7 +51,7 @@ class Condition:
             raise ValueError(f"there is no channel '{channel}'; see 'vehest data channels'")
 
     def describe(self) -> str:
-        """For messages, for example ``0 <= |ay| <= 7, 2 s or longer``."""
+        """Text for messages, for example ``0 <= |ay| <= 7, 2 s or longer``."""
         bounds = [
             f"{bounds.at_least:g} <= |{channel}| <= {bounds.at_most:g}"
             for channel, bounds in self.magnitude.items()

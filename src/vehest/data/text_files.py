@@ -20,7 +20,9 @@ from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
 from vehest.data.schema import MAX_DEPTH
 
-MAX_YAML_VALUES = 500_000  # of a YAML text, each counted as often as aliases repeat it
+# largest number of values of a YAML text, each counted as often as aliases repeat it
+MAX_YAML_VALUES = 500_000
+# YAML loader that builds plain values only
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 

@@ -21,14 +21,14 @@ MAX_REPR_CHANNELS = 4  # names in a `repr`, which is to fit on a line
 class TimeSeries(ABC):
     """Channels of T samples each; sample k holds for ``start_time + k / rate_hz``."""
 
-    rate_hz: float
-    start_time: float
-    channels: Mapping[str, FloatArray]
+    rate_hz: float  # sampling rate [Hz]
+    start_time: float  # time of the first sample [s]
+    channels: Mapping[str, FloatArray]  # name -> samples, (T,)
 
     @property
     @abstractmethod
     def label(self) -> str:
-        """Name for people."""
+        """Text that identifies the series in messages."""
 
     @property
     @abstractmethod

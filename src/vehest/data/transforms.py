@@ -37,12 +37,12 @@ from vehest.data.schema import validated
 MAX_DIRECT_TAPS = (
     8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 )
-OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
-MOST_BRIDGED = 0.1  # of a channel's samples
+OUTPUTS_AT_ONCE = 4096  # output samples that a resampling computes together
+MOST_BRIDGED = 0.1  # largest share of a channel's samples that is bridged
 VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
 
 
-Transform = Callable[[Recording], Recording]
+Transform = Callable[[Recording], Recording]  # function from a recording to a recording
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Resample:
 
     rate_hz: float  # the new rate [Hz]
     method: Literal["polyphase", "decimate"] = "polyphase"  # ``polyphase`` or ``decimate``
-    zero_crossings: ClassVar[int] = 16
-    kaiser_beta: ClassVar[float] = 7.0
-    # of the slower Nyquist frequency, where the stop band has then begun
+    zero_crossings: ClassVar[int] = 16  # zero crossings of the filter's sinc on either side
+    kaiser_beta: ClassVar[float] = 7.0  # shape of the Kaiser window
+    # cut-off over the slower Nyquist frequency, at which the stop band has then begun
     cutoff: ClassVar[float] = 0.86
 
     def __post_init__(self) -> None:
@@ -125,8 +125,8 @@ class Resample:
 
     @classmethod
     def reach(cls, ratio: Fraction) -> int:
-        """How many samples before or after it a sample depends on at most, in whole steps of the
-        new clock.
+        """Largest distance, in input samples, of the samples on which an output depends, rounded up
+        to whole steps of the new clock.
         """
         up = ratio.numerator
         down = ratio.denominator
@@ -174,10 +174,11 @@ class LowPass:
     """
 
     cutoff_hz: float  # -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz]
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
     direction: Literal["causal", "zero_phase"] = "zero_phase"  # ``causal`` or ``zero_phase``
     design: Literal["butterworth", "fir"] = "butterworth"  # ``butterworth`` or ``fir``
-    # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
+    # length of a ``fir`` into past and future [s]; the longer, the sharper its cut-off
     reach: PositiveFloat = 0.3
 
     def __post_init__(self) -> None:
@@ -223,7 +224,7 @@ class LowPass:
         )
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
-        """By the ``fir``, on samples extended at both ends by odd reflection.
+        """Samples filtered by the ``fir``, with both ends extended by odd reflection.
 
         A constant stays that constant, a line that line.
         """
@@ -241,8 +242,10 @@ class RemoveOutliers:
     """
 
     half_window: PositiveInt = 5  # samples on either side that count as neighbours
-    threshold: PositiveFloat = 6.0  # how many scaled median absolute deviations make an outlier
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    # number of scaled median absolute deviations beyond which a sample is an outlier
+    threshold: PositiveFloat = 6.0
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -400,9 +403,10 @@ class DelayCorrection:
     """
 
     delay: float  # by how much the channels are late, negative if they are early [s]
-    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
-    reach: ClassVar[int] = 16
-    kaiser_beta: ClassVar[float] = 7.0
+    # names of the channels; all measured ones if empty, never references
+    channels: tuple[str, ...] = ()
+    reach: ClassVar[int] = 16  # samples on either side that the interpolation uses
+    kaiser_beta: ClassVar[float] = 7.0  # shape of the Kaiser window
 
     def __call__(self, recording: Recording) -> Recording:
         """Shift the channels, and cut the recording to the samples that then exist."""
@@ -447,9 +451,9 @@ class DelayCorrection:
 
 @dataclass(frozen=True)
 class OffsetCorrection:
-    """Take constant offsets off channels."""
+    """Subtract constant offsets from channels."""
 
-    # by channel, in its unit
+    # channel -> offset in its unit
     offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)
 
     def __call__(self, recording: Recording) -> Recording:
@@ -465,6 +469,7 @@ class OffsetCorrection:
         )
 
 
+# name in a configuration -> transform
 TRANSFORMS: dict[str, type[Any]] = {
     "resample": Resample,
     "low_pass": LowPass,
@@ -492,11 +497,11 @@ without them.
 
 @dataclass(frozen=True)
 class Preparation:
-    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a
+    """Resampling of recordings to an estimator's rate: ``downsample`` of a configuration or of a
     model.
     """
 
-    method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
+    method: Literal["polyphase", "decimate"] = "polyphase"  # method of `Resample`
     # applied before, at the native rate, each by its ``name`` and its arguments
     transforms: tuple[dict[str, Any], ...] = ()
 
@@ -505,7 +510,7 @@ class Preparation:
             transform_from_config(entry)
 
     def as_plain(self) -> dict[str, Any]:
-        """As files hold it."""
+        """Plain values, as files hold them."""
         return {"method": self.method, "transforms": [dict(entry) for entry in self.transforms]}
 
 
@@ -580,7 +585,7 @@ def _compiled_sums() -> Callable[..., None]:
 
 
 def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
-    """Add what each sample gives to the outputs.
+    """Add the contribution of each sample to the outputs.
 
     ``newest``: place of the first output's last tap on the grid of up times the rate.
     """
@@ -611,7 +616,8 @@ def _extended(samples: FloatArray, margin: int) -> FloatArray:
 
 
 def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, of none those of all measured channels.
+    """The given channels, or all measured ones where none are given; raises an error where one of
+    them has gaps.
 
     Refused where one of the channels has gaps.
     """

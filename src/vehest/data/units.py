@@ -8,7 +8,8 @@ from functools import cache
 
 from vehest.data.errors import DataError
 
-STEP = re.compile(r"((?=.*[1-9])\d*\.?\d+(e[-+]?\d)?)?", re.IGNORECASE)  # of a raw count
+# matches the step of a raw count before a unit, such as ``0.005`` in ``0.005*deg/s``
+STEP = re.compile(r"((?=.*[1-9])\d*\.?\d+(e[-+]?\d)?)?", re.IGNORECASE)
 _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     "m/s": {
         "m/s": 1.0,
@@ -62,6 +63,7 @@ _FACTORS = {  # SI unit -> unit -> factor that makes it SI
     },
     "1": {"1": 1.0},
 }
+# unit -> its SI unit, and the factor that converts to it
 _UNITS = {
     unit: (si_unit, factor) for si_unit, units in _FACTORS.items() for unit, factor in units.items()
 }

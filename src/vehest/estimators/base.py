@@ -64,16 +64,15 @@ class Stepper(ABC):
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Take the measurements of one instant [SI], return ``vy`` [m/s].
+        """Take the measurements of one instant and return the estimate, quantity -> value.
 
-        NaN while there is none yet.
-
-        A method that has a covariance also returns ``vy_variance`` [m²/s²].
+        ``vy`` [m/s] is always there, NaN while there is no estimate yet. A method that has a
+        covariance also returns ``vy_variance`` [m²/s²].
 
         Parameters
         ----------
         sample : mapping
-            Channel -> value; further channels are ignored.
+            Channel -> value [SI]; channels that the method does not read are ignored.
 
         Raises
         ------
@@ -85,8 +84,9 @@ class Stepper(ABC):
 class Estimator(Fittable):
     """A method that estimates lateral velocity and sideslip from measured channels."""
 
-    covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
-    # whether an initial state is left aside; else it is used, or refused as an error
+    # quantities, in order, whose covariance `run` returns; empty: it returns none
+    covariance_of: ClassVar[tuple[str, ...]] = ()
+    # whether an initial state is ignored; else it is used, or refused as an error
     ignores_initial_state: ClassVar[bool] = False
 
     def estimate(
@@ -132,7 +132,7 @@ class Estimator(Fittable):
         return self._estimate_all([self._checked(recording) for recording in recordings], states)
 
     def _checked(self, recording: Recording) -> Recording:
-        """The channels of a recording that the method reads.
+        """Check a recording, and return it with only the channels that the method reads.
 
         Raises
         ------
@@ -163,12 +163,12 @@ class Estimator(Fittable):
         return recording.select(self.channels)
 
     def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
-        """Values of ``channels`` at one instant, (C,).
+        """Values of ``channels`` at one instant, (C,), from a sample channel -> value.
 
         Raises
         ------
         DataError
-            One is missing, or is refused.
+            A channel is missing, or its value is refused (`refuses`).
         """
         try:
             values = [float(sample[name]) for name in self.channels]
@@ -198,7 +198,7 @@ class Estimator(Fittable):
         covariance_of: tuple[str, ...] = (),
         **quantities: FloatArray,
     ) -> Estimate:
-        """An `Estimate` on the recording's clock.
+        """Make an `Estimate` of arrays of quantities, at the recording's times.
 
         Sideslip is atan2(vy, vx) with the measured vx.
         """
@@ -210,9 +210,9 @@ class Estimator(Fittable):
     def _estimate_all(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
     ) -> list[Estimate]:
-        """Estimate checked recordings, each from its state.
+        """Estimate checked recordings, each from its initial state, one after another.
 
-        One after another, unless a method can do better.
+        A method that can batch recordings overrides this.
         """
         return [
             self.estimate_recording(recording, state)
@@ -220,7 +220,7 @@ class Estimator(Fittable):
         ]
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
-        """The state before the first sample; none where the method has no state.
+        """The method's state before the first sample, for `run`; None where it has no state.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ class Estimator(Fittable):
         return None
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
-        """Go on from a state.
+        """Estimate T further samples from a state.
 
         Parameters
         ----------
@@ -292,7 +292,9 @@ class Estimator(Fittable):
         return self._run_over(self._checked(recording), state)
 
     def _run_over(self, recording: Recording, state: Any) -> tuple[Estimate, Any]:
-        """`run` over a checked recording: its estimate, and the state after the last sample."""
+        """Apply `run` to a checked recording; returns its estimate and the state after the last
+        sample.
+        """
         quantities, last_state = self.run(recording.stack(self.channels), state)
         covariance = quantities.pop("covariance", None)
         innovations = quantities.pop("innovations", None)
@@ -326,7 +328,7 @@ class Estimator(Fittable):
 
 
 class RunStepper(Stepper):
-    """An estimator that has `run`, one sample at a time.
+    """Steps an estimator that has `run`, one sample at a time.
 
     The first sample sets the state; without an initial state the estimate begins as that of a
     recording. Estimates equal those of `Estimator.estimate` on the same samples.
@@ -338,9 +340,8 @@ class RunStepper(Stepper):
         self._started = False
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Every quantity at the time of the sample, ``vy`` [m/s] among them.
-
-        NaN in skippable channels was not measured.
+        """Take a sample and return all quantities of the estimate at its time, ``vy`` [m/s] among
+        them. NaN in skippable channels counts as not measured.
         """
         estimator = self._estimator
         row = estimator.checked_sample(sample)

@@ -51,13 +51,14 @@ from vehest.training.sequences import (
     train_phases,
 )
 
-# standard deviations of the true state that a training sequence starts from [m/s, rad/s]
+# m/s and rad/s: standard deviations of v and yaw rate about the true state at which a training
+# sequence starts
 START = (
     0.1,
     0.02,
 )
-# m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is
-# pre-trained
+# m/s, rad/s, rad: largest standard deviation from which an output starts, and with which it is
+# pre-trained; the middle of the logistic functions
 MAX_NOISE = 0.5
 SATURATED = 20.0  # argument at which the logistic function is 1 but for 2e-9
 DISTRUST = 1  # index of the network's output for the deviation of its angle as a measurement
@@ -105,10 +106,10 @@ class EndToEndSettings(Group):
 
 
 class NetworkOutput(NamedTuple):
-    """The network's angle and noise of samples, differentiable, in double precision."""
+    """The network's angle and noise levels for samples, differentiable, in double precision."""
 
     sideslip: Tensor  # β_DD (...) [rad]
-    distrust: Tensor  # σ_DD (...) [rad]
+    distrust: Tensor  # σ_DD, standard deviation of that angle as a measurement (...) [rad]
     process: Tensor  # σ_Vy and σ_ψ̇ (..., 2) [m/s, rad/s], of one sample's step
     least_variance: float  # ε [rad²]
 
@@ -121,14 +122,14 @@ class NetworkOutput(NamedTuple):
 class Cuts(NamedTuple):
     """Training sequences of one length, cut from recordings."""
 
-    inputs: Tensor  # scaled, (B, T, C)
-    sideslip: Tensor  # reference, (B, T) [rad]
-    measured: Tensor  # of the four sensors, (B, T, 4)
+    inputs: Tensor  # scaled inputs of the network, (B, T, C)
+    sideslip: Tensor  # reference sideslip, (B, T) [rad]
+    measured: Tensor  # measurements of the filter's four sensors, (B, T, 4)
     driven: Tensor  # inputs of the filter, (B, T, 3)
     trusted: Tensor  # whether forces are trusted, bool (B, T)
     start: Tensor  # true state at the first sample, (B, 2)
-    seeds: Tensor  # of dropout, int64 (1,)
-    firsts: Tensor  # where they begin in all training samples, int64 (B,)
+    seeds: Tensor  # seed of dropout, int64 (1,)
+    firsts: Tensor  # index of each sequence's first sample among all training samples, int64 (B,)
 
 
 class CnnUkf(NetworkUkf):
@@ -175,12 +176,14 @@ class CnnUkf(NetworkUkf):
 
     @property
     def without(self) -> tuple[str, ...]:
-        """Parts of the method that are taken away."""
+        """Names of the settings that switch parts of the method off, for ablations."""
         parts = ("pseudo_measurement", "adaptive_distrust", "adaptive_process")
         return tuple(name for name in parts if not getattr(self, name))
 
     def new_network(self) -> SampleNetwork:
-        """From a sample to an angle, its deviation and those of a step."""
+        """An untrained network from the inputs of a sample to four outputs: angle, its deviation,
+        and the deviations of a step of both states.
+        """
         return SampleNetwork(len(self.network_inputs), self.hidden, 4)
 
     @property
@@ -190,7 +193,7 @@ class CnnUkf(NetworkUkf):
         return super().variant + tyres + "".join(f"_no_{name}" for name in self.without)
 
     def output_of(self, outputs: Tensor) -> NetworkOutput:
-        """Outputs of the network, (..., 4), as angle and noise.
+        """Convert outputs of the network, (..., 4), into angle and noise levels.
 
         The first is an angle in units of the network's ``unit`` [rad]; the others pass a logistic
         function, so that all deviations lie between 0 and 1 (σ_DD [rad], σ_Vy [m/s], σ_ψ̇ [rad/s]).
@@ -204,9 +207,10 @@ class CnnUkf(NetworkUkf):
         )
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Angle, its variance and the process noise of inputs (T, C) of the network.
+        """Evaluate the network on its inputs (T, C): sideslip angle, its variance and the process
+        noise for the filter.
 
-        There are no gradients. The angle is clipped to what a tangent allows.
+        There are no gradients. The angle is clipped, so that its tangent is finite.
         """
         output = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
         return PseudoMeasurement(
@@ -218,7 +222,7 @@ class CnnUkf(NetworkUkf):
     def fit_network(
         self, data: FitData, training: EndToEndSettings, context: FitContext, index: int
     ) -> FitRecord:
-        """Pre-training, then training through the filter."""
+        """Train the network: alone first, then through the filter."""
         network, train, judged = self.prepare_network(
             data, training, [self.fit_seed], self.minimum_speed
         )
@@ -297,7 +301,7 @@ class CnnUkf(NetworkUkf):
     def pre_training_phase(
         self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings
     ) -> Phase:
-        """Phase of the network alone (Eqs. 5 and 6).
+        """The training phase of the network alone (Eqs. 5 and 6), validated on ``judged``.
 
         Its loss is ½ (ln R + e²/R) on average, with R = σ_DD² + ε and the error e of the angle
         [rad], plus the squared differences of σ_Vy and σ_ψ̇ to the filter's levels.
@@ -333,7 +337,7 @@ class CnnUkf(NetworkUkf):
 
 
 class EndToEnd:
-    """Backpropagation through network and filter over sequences (Eqs. 7 and 8).
+    """Sequences, loss and gradient of the training through network and filter (Eqs. 7 and 8).
 
     Parameters
     ----------
@@ -392,7 +396,9 @@ class EndToEnd:
         self.lost = 0
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
-        """Sequences of each recording from a random offset on, as many as fit, in random order."""
+        """Yield the batches of one epoch: sequences of each recording from a random offset on, as
+        many as fit, in random order.
+        """
         for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(
             self.training.batch_size
         ):
@@ -400,7 +406,7 @@ class EndToEnd:
             yield self.cut(chosen, seeds)
 
     def cut(self, firsts: Tensor, seeds: Tensor) -> Cuts:
-        """Cuts that begin at these samples, (B,)."""
+        """The sequences that begin at the samples ``firsts``, (B,), among all training samples."""
         rows = firsts.unsqueeze(1) + torch.arange(self.training.steps)
         of_sensors = (self.measured[rows], self.driven[rows], self.trusted[rows])
         return Cuts(
@@ -465,7 +471,9 @@ class EndToEnd:
         return torch.where(lost[:, None, None], 0.0, gradient)
 
     def _account(self, bad: Tensor, batch: Cuts, quantity: str) -> Tensor:
-        """Count the sequences with samples that are not finite, ``bad`` (B, T); return them."""
+        """Count the sequences with samples that are not finite, ``bad`` (B, T), and return which
+        they are, (B,); raises `DivergenceError` beyond `MAX_LOST_SHARE`.
+        """
         lost = bad.any(1)
         number = int(lost.sum())
         self.lost += number
@@ -481,11 +489,11 @@ class EndToEnd:
         return lost
 
     def place(self, sample: int) -> str:
-        """Recording and time of one of all training samples, for messages."""
+        """Text of the recording and time of the training sample with this index, for messages."""
         number = int(np.searchsorted(self.offsets, sample, side="right")) - 1
         recording = self.recordings[number]
         time = recording.start_time + (sample - int(self.offsets[number])) / recording.rate_hz
         return f"{time:.2f} s of recording '{recording.id}'"
 
 
-ESTIMATOR = CnnUkf
+ESTIMATOR = CnnUkf  # class by which the registry finds the family

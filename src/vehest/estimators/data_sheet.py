@@ -69,7 +69,7 @@ class DataSheet(Recursive):
         return self.wheelbase / 2.0 if self.cg_to_rear_axle is None else self.cg_to_rear_axle
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """r (l_r - u² / (c g)) [m/s]."""
+        """v = r (l_r - u² / (c g)) [m/s] at each sample; there is no state."""
         vx, yaw_rate = samples.T
         return {
             "vy": yaw_rate * (self.rear - np.square(vx) / (self.cornering_coefficient * GRAVITY))
@@ -85,4 +85,4 @@ class DataSheet(Recursive):
         }
 
 
-ESTIMATOR = DataSheet
+ESTIMATOR = DataSheet  # class by which the registry finds the family

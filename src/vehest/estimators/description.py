@@ -19,7 +19,7 @@ from vehest.declared import Group, setting
 
 
 def rate(default: float) -> Any:
-    """The setting ``rate_hz`` with another default [Hz]."""
+    """Declare the setting ``rate_hz`` of a family with its default [Hz]."""
     return setting(
         default, "sampling rate it works at", unit="Hz", positive=True, most=HIGHEST_RATE
     )
@@ -29,20 +29,21 @@ def rate(default: float) -> Any:
 class EstimatorSettings(Group):
     """Settings of every estimator."""
 
-    rate_hz: float = rate(100.0)
+    rate_hz: float = rate(100.0)  # rate of the estimates [Hz]
 
 
 class Trial(NamedTuple):
     """A family in the first comparison on a car without a trained model (`vehest new`)."""
 
-    # among the trials of all families, the promising and cheap first; those that differ in place
-    # alone are one sweep
+    # position in the order of the trials of all families, promising and cheap ones first; trials
+    # of several families that differ in it alone are one sweep
     place: float
-    about: str  # text for people
-    # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all
-    # of its parameters that the settings have
+    about: str  # one line that describes the method and its cost
+    # command-line overrides of settings and training; ``{wheelbase}`` and ``{mass}`` are those of
+    # the car, ``{car}`` all of its parameters that the settings have
     overrides: str = ""
-    # that some range for training, and each for validation, has to have at the family's rate
+    # number of samples, at the family's rate, that one range for training and each for validation
+    # must have
     samples: int = 0
 
 
@@ -56,15 +57,15 @@ class Description(ABC):
     Attributes
     ----------
     settings : settings_type
-        The family's settings.
+        The estimator's settings.
     preparation : mapping
         How recordings are brought to its rate (``method``, ``transforms``).
     trust : Trust or None
         Its calibration (`vehest.trust.record.Trust`).
     """
 
-    name: ClassVar[str]  # in conf/estimator and in the registry
-    title: ClassVar[str]  # name for people
+    name: ClassVar[str]  # identifier in conf/estimator and in the registry
+    title: ClassVar[str]  # name in tables and figures
     channels: ClassVar[tuple[str, ...]]  # measured channels it reads
     settings_type: ClassVar[Any] = EstimatorSettings
     # channels of ``channels`` that may have gaps, because the method does without a sample
@@ -77,11 +78,12 @@ class Description(ABC):
     slow_kernel: ClassVar[str] = ""
     # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    # in the first comparison on a new car; none: it is left out
+    # trials in the first comparison on a new car; none: the family is left out
     trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
     trace_note: ClassVar[str] = ""  # explains a conspicuous course of its traces, below figures
-    style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
+    # colour, dash and marker of its lines, see `line_style`; None: by its name
+    style: ClassVar[tuple[str, str, str] | None] = None
     # C template of a step, in ``export/templates/methods`` or beside the family's module; or empty
     template: ClassVar[str] = ""
     # raised when weights or estimates change; a version of ``training_type`` alone when the fit
@@ -155,7 +157,8 @@ class Description(ABC):
 
     @property
     def training_friction(self) -> float | None:
-        """Friction of the training recordings, where ``friction`` is estimated with ``vx``.
+        """Friction of the training recordings [1], where the estimator estimates ``friction`` and
+        ``vx``; else None.
 
         Bands widen as the estimate departs from it.
         """
@@ -163,17 +166,17 @@ class Description(ABC):
 
     @property
     def warm_up_steps(self) -> int:
-        """Samples after its first for which it has no estimate yet."""
+        """Number of samples from the start for which it has no estimate yet."""
         return 0
 
     @property
     def variant(self) -> str:
-        """The paper's name of this configuration."""
+        """Identifier of this configuration of the family in tables, as the paper names it."""
         return self.name
 
     @property
     def full_title(self) -> str:
-        """Title with what distinguishes this configuration, for people."""
+        """Title with what distinguishes this configuration of the family."""
         return self.title
 
     @classmethod

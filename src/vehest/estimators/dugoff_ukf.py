@@ -49,12 +49,12 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "full": ("ay", "yaw_rate", "fy_front", "fy_rear"),
     "imu": ("ay", "yaw_rate"),
 }
-"""Levels of sensors, by the inputs."""
+"""Setting ``inputs`` -> sensors whose noise levels the filter needs."""
 SEARCHED: dict[str, tuple[str, ...]] = {
     "full": ("process_vy", "process_yaw_rate", "force_factor"),
     "imu": ("process_vy", "process_yaw_rate"),
 }
-"""Levels that are searched, by the inputs."""
+"""Setting ``inputs`` -> noise levels that the fit searches."""
 # Levels where nothing is searched: process_vy [m/s] and process_yaw_rate [rad/s] of Bertipaglia et
 # al. 2024.
 ASSUMED_LEVELS = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}
@@ -84,11 +84,11 @@ class TrackLevels(Group):
     )
 
     def unknown(self, names: Sequence[str]) -> list[str]:
-        """Levels of these names that are not given."""
+        """Those of these levels that the settings leave to the fit."""
         return [name for name in names if getattr(self, name) is None]
 
 
-LEVELS = tuple(entry.name for entry in fields(TrackLevels))
+LEVELS = tuple(entry.name for entry in fields(TrackLevels))  # names of all noise levels
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class AxleTyres(Group):
         return self.friction_front is not None
 
 
-TYRES = tuple(entry.name for entry in fields(AxleTyres))
+TYRES = tuple(entry.name for entry in fields(AxleTyres))  # names of all tyre parameters
 
 
 class DugoffUkf(DugoffFilter):
@@ -220,13 +220,13 @@ class DugoffUkf(DugoffFilter):
 
     @property
     def variant(self) -> str:
-        """Name with what is measured, the curve, and the gate."""
+        """Identifier with the inputs, the tyre curve and the gate."""
         s = self.settings
         return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
-        """Title with what is measured, and the gate."""
+        """Title with the use of tyre forces, and the gate."""
         return (
             f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre "
             f"forces{self.gate_title}"
@@ -234,12 +234,12 @@ class DugoffUkf(DugoffFilter):
 
     @property
     def n_parameters(self) -> int:
-        """Tyre parameters and levels of noise that are not given."""
+        """Number of tyre parameters and noise levels that are fitted."""
         return self.n_identified
 
     @property
     def n_identified(self) -> int:
-        """Numbers that the identification of tyres and noise finds."""
+        """Number of values that the identification of tyres and noise finds."""
         n_tyres = 0 if self.tyres.has_values else len(TYRES)
         return n_tyres + len(self.noise.unknown(self.level_names))
 
@@ -295,9 +295,10 @@ class DugoffUkf(DugoffFilter):
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
 
     def _identify_tyres(self, data: FitData, training: IdentificationSettings) -> dict[str, float]:
-        """Set the tyres.
+        """Identify and set the tyre parameters of both axles.
 
-        Returns them with half of the range over restarts and the rms of residual forces [N].
+        Returns metrics, name -> value: the parameters, half of their range over restarts, and the
+        root mean square of residual forces [N].
         """
         fit = identify_tyres(
             data.train,
@@ -327,7 +328,7 @@ class DugoffUkf(DugoffFilter):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take tyres and levels back.
+        """Set tyres and levels from stored weights.
 
         Raises
         ------
@@ -347,13 +348,17 @@ class DugoffUkf(DugoffFilter):
         self.levels = levels
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` for a searched level, or for tyres without a reference of sideslip."""
+        """Reference channels that the fit needs: ``vy_ref`` for a searched level, or for tyres
+        where there is no ``sideslip_ref``.
+        """
         if training.method != "data" and self.noise.unknown(SEARCHED[self.inputs]):
             return ("vy_ref",)
         return () if self.tyres.has_values or "sideslip_ref" in channels else ("vy_ref",)
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """An override for tyres where no recording matches ``training.tyres_from``."""
+        """The override that lets tyres be fitted to all recordings, where none matches
+        ``training.tyres_from``; else empty.
+        """
         if self.tyres.has_values or any(
             fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings
         ):
@@ -365,4 +370,4 @@ class DugoffUkf(DugoffFilter):
         return {"network": False, **super().c_values(), **track_c_values(self)}
 
 
-ESTIMATOR = DugoffUkf
+ESTIMATOR = DugoffUkf  # class by which the registry finds the family

@@ -25,8 +25,8 @@ from vehest.training.sequences import PhaseSettings
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
-STARTS = ((-2.0, 2.0), (0.5, 1.5))
-ROUNDING = 1e-9  # by which a search may end beyond the box
+STARTS = ((-2.0, 2.0), (0.5, 1.5))  # ranges of p₁ and p₂ from which searches start
+ROUNDING = 1e-9  # largest distance beyond the box at which a search may end
 MIN_SPREAD = 1e-12  # rad², of models that agree to the last digit
 VARIANCE_POWER_RANGE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
 
@@ -105,17 +105,17 @@ class EnsembleUkf(NetworkUkf):
 
     @property
     def n_parameters(self) -> int:
-        """Parameters of the networks, and p₁ and p₂."""
+        """Number of fitted parameters: those of the networks, p₁ and p₂."""
         return super().n_parameters + len(self.scaling)
 
     def new_network(self) -> SampleNetwork:
-        """From a sample to an angle and its variance, by each member."""
+        """An untrained ensemble; each member maps a sample to an angle and its variance."""
         return SampleNetwork(len(self.network_inputs), self.hidden, 2, self.members)
 
     def fit_network(
         self, data: FitData, training: EnsembleSettings, context: FitContext, index: int
     ) -> FitRecord:
-        """Networks, then the scaling of their variance."""
+        """Train the networks, then search the scaling of their variance."""
         streams = np.random.SeedSequence([self.fit_seed, 2]).generate_state(
             self.members, np.uint64
         ) >> np.uint64(1)
@@ -186,7 +186,7 @@ class EnsembleUkf(NetworkUkf):
         return clip_sideslip(unit * outputs[..., 0].mean(axis=0)), unit**2 * variance
 
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Mean of the networks, and its scaled variance."""
+        """Mean of the networks' angles, and its scaled variance, for inputs (T, C)."""
         sideslip, variance = self._mean_and_variance(inputs)
         scaled = scaled_variance(variance, self.scaling, self.least_variance)
         return PseudoMeasurement(sideslip, scaled)
@@ -253,4 +253,4 @@ def scaled_variance(
     return least_variance + 10.0 ** np.clip(size, *VARIANCE_POWER_RANGE)
 
 
-ESTIMATOR = EnsembleUkf
+ESTIMATOR = EnsembleUkf  # class by which the registry finds the family

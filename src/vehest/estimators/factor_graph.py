@@ -58,10 +58,11 @@ class FactorNoise(Group):
 
 
 class WindowState(NamedTuple):
-    """What a moving window hands on to the next sample."""
+    """State of the moving window between two samples."""
 
-    samples: FloatArray  # of the channels: those in the window before the next one, (N, 4)
-    start: Gaussian[FloatArray]  # first state of the window, before its measurement
+    # values of ``channels`` at the samples in the window, without the next one, (N, 4)
+    samples: FloatArray
+    start: Gaussian[FloatArray]  # (β, r) at the window's first sample, before its measurement
     refused: NDArray[np.int64]  # counters of the gate (`vehest.filters.gating`), (2,)
 
 
@@ -114,7 +115,7 @@ class FactorGraph(SideslipFilter):
 
     @property
     def intervals(self) -> int:
-        """Sampling intervals that the window spans."""
+        """Number of sampling intervals that the window spans; 0 without a window."""
         return round((self.window or 0.0) * self.rate_hz)
 
     @property
@@ -124,7 +125,7 @@ class FactorGraph(SideslipFilter):
 
     @property
     def variant(self) -> str:
-        """Batch, or how long the window is and its gate."""
+        """Identifier with the length of the window and the gate, or ``batch``."""
         return (
             f"factor_graph_lag_{self.window:g}s{self.gate_suffix}"
             if self.causal
@@ -140,7 +141,8 @@ class FactorGraph(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """Straight ahead and unknown, or a known initial state.
+        """Mean and covariance of (β, r) before the first sample: straight ahead with wide
+        deviations, or a known initial state.
 
         Deviations of β [rad] and r [rad/s] are ``noise.first_state``; a known state
         counts as exact.
@@ -160,9 +162,8 @@ class FactorGraph(SideslipFilter):
     def run(  # type: ignore[override]
         self, samples: FloatArray, state: WindowState
     ) -> tuple[dict[str, Any], WindowState]:
-        """Lateral velocity [m/s] and yaw rate [rad/s].
-
-        Of all samples together, or window by window.
+        """Estimate lateral velocity [m/s] and yaw rate [rad/s]: window by window, or, without a
+        window, of all samples together.
         """
         rows = np.vstack([state.samples, samples])
         start = state.start
@@ -240,8 +241,8 @@ class FactorGraph(SideslipFilter):
         return smoothed_means(model, filtered)
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """There are none."""
+        """No weights, since nothing is fitted."""
         return {}
 
 
-ESTIMATOR = FactorGraph
+ESTIMATOR = FactorGraph  # class by which the registry finds the family

@@ -24,10 +24,10 @@ from vehest.training.context import FitContext, FitRecord
 
 @dataclass(frozen=True)
 class FitData:
-    """Recordings to learn from and to stop on, at the estimator's rate, references included."""
+    """Recordings of a fit, at the estimator's rate, with references."""
 
-    train: Sequence[Recording]
-    validation: Sequence[Recording]
+    train: Sequence[Recording]  # recordings that the estimator is trained on
+    validation: Sequence[Recording]  # recordings on which training is stopped early
 
 
 class Fittable(Description):
@@ -35,14 +35,14 @@ class Fittable(Description):
 
     training_type: ClassVar[type]  # dataclass of the settings of its fit
     learns_from: tuple[str, ...] = ("vy_ref",)  # reference channels that its fit reads
-    # weights that may stay NaN, because each recording tells them
+    # names of weights that may stay NaN, because they are read off each recording
     may_be_nan: ClassVar[tuple[str, ...]] = ()
     # whether a fit of several seeds is one computation; else each is a training by itself
     fits_seeds_together: ClassVar[bool] = True
 
     @property
     def learns(self) -> bool:
-        """Whether the fit takes anything from recordings; if not, it needs none."""
+        """Whether the fit determines anything; if not, it needs no recordings."""
         return self.n_parameters > 0
 
     @property
@@ -52,7 +52,7 @@ class Fittable(Description):
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
-        """Estimators with equal keys may be fitted together as members."""
+        """Key of estimators that may be fitted together as members: those with equal keys."""
         return (self.name, self.settings)
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
@@ -63,7 +63,9 @@ class Fittable(Description):
         return self.learns_from
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
-        """Overrides that a fit needs where a pattern in its settings matches none of these ids."""
+        """Command-line overrides that a fit needs where a pattern in its settings matches none of
+        the ids ``recordings``; for drafts of configurations.
+        """
         return ()
 
     def seed(self, seed: int) -> None:
@@ -109,11 +111,11 @@ class Fittable(Description):
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
     def require_fitted(self) -> None:
-        """Raises `ConfigurationError`: a number is neither given nor fitted."""
+        """Raise `ConfigurationError` where a value is neither given in the settings nor fitted."""
 
     @abstractmethod
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Everything the fit determined, by name."""
+        """Arrays of everything that the fit determined, by name, as `load_weights` takes them."""
 
     def min_weights(self) -> int:
         """Lower bound of the number of weights with these settings."""
@@ -121,7 +123,10 @@ class Fittable(Description):
 
     @abstractmethod
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take weights back; raises `DataError`: a name or shape does not fit the settings."""
+        """Set the fitted values from stored weights.
+
+        Raises `DataError` where a name or shape does not fit the settings.
+        """
 
 
 def require_learnable(
@@ -167,7 +172,10 @@ def require_learnable(
 
 
 def largest_absolute(recordings: Sequence[Recording], channel: str, estimator: str) -> float:
-    """Largest absolute value of a channel in recordings; raises `DataError`: it is 0 throughout."""
+    """Largest absolute value of a channel over all recordings, in its unit.
+
+    Raises `DataError` where the channel is 0 throughout; ``estimator`` is named in the message.
+    """
     largest = max(float(np.abs(recording[channel]).max()) for recording in recordings)
     if not largest > 0.0:
         names = ", ".join(f"'{recording.id}'" for recording in recordings)
@@ -183,7 +191,9 @@ def require_shapes(
     weights: Mapping[str, np.ndarray[Any, Any]],
     expected: Mapping[str, tuple[int, ...]],
 ) -> None:
-    """Raise `DataError` for weights whose names or shapes differ from those of the settings."""
+    """Raise `DataError` for loaded weights whose names or shapes differ from ``expected``, those
+    that the settings imply.
+    """
     differing = sorted(
         {(name, values.shape) for name, values in weights.items()} ^ set(expected.items())
     )

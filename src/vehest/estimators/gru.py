@@ -20,7 +20,7 @@ class GruNetwork(RecurrentNetwork):
     Source: Cho et al. 2014; Gräber et al., IEEE T-IV 4 (1), 2019.
     """
 
-    n_gates = 3
+    n_gates = 3  # number of gates of the cell
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero.
@@ -60,4 +60,4 @@ class Gru(RecurrentEstimator):
     style = "#8e24aa", "solid", "D"
 
 
-ESTIMATOR = Gru
+ESTIMATOR = Gru  # class by which the registry finds the family

@@ -32,7 +32,7 @@ from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.training.context import FitContext
 
-LEVELS = ("yaw_rate", "ay", "steer")
+LEVELS = ("yaw_rate", "ay", "steer")  # channels whose noise level the filter needs
 MIN_LEVEL = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
 
 
@@ -44,9 +44,15 @@ class SensorNoise(Group):
     read_from: Literal["training", "recording"] = setting(
         "training", "recordings of the fit, or each recording as a whole (offline)"
     )
-    yaw_rate: float | None = setting(None, "null: read off", unit="rad/s", positive=True)
-    ay: float | None = setting(None, "null: read off", unit="m/s²", positive=True)
-    steer: float | None = setting(None, "null: read off", unit="rad", positive=True)
+    yaw_rate: float | None = setting(
+        None, "of the gyroscope; null: read off", unit="rad/s", positive=True
+    )
+    ay: float | None = setting(
+        None, "of the accelerometer; null: read off", unit="m/s²", positive=True
+    )
+    steer: float | None = setting(
+        None, "of the steering angle; null: read off", unit="rad", positive=True
+    )
     cutoff: float = setting(
         0.2,
         "fraction of the Nyquist frequency above which signals count as noise",
@@ -59,7 +65,7 @@ class SensorNoise(Group):
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Levels that are not given."""
+        """Noise levels that the settings leave to be read off the signals."""
         return tuple(name for name in LEVELS if getattr(self, name) is None)
 
 
@@ -137,7 +143,7 @@ class KalmanFilter(SideslipFilter):
 
     @property
     def causal(self) -> bool:
-        """Not if noise levels are read off the whole recording, later samples included."""
+        """False where noise levels are read off the whole recording, later samples included."""
         return self.noise.read_from == "training" or not self.noise.unknown
 
     @property
@@ -147,14 +153,16 @@ class KalmanFilter(SideslipFilter):
 
     @property
     def variant(self) -> str:
-        """Name with the source of noise levels, unless it is the training, offsets and gate."""
+        """Identifier with the source of noise levels (unless it is the training), the offsets and
+        the gate.
+        """
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
         offsets = "".join(f"_{name}_offset" for name in self.offsets.names)
         return self.name + noise + offsets + self.gate_suffix
 
     @property
     def full_title(self) -> str:
-        """Title with where the noise levels come from, offsets, and the gate."""
+        """Title with the source of the noise levels, the offsets and the gate."""
         noise = (
             ""
             if self.learns
@@ -165,7 +173,7 @@ class KalmanFilter(SideslipFilter):
         return self.title + noise + offsets + self.gate_title
 
     def declarations_of_values(self) -> Mapping[str, Declaration]:
-        """Declarations of the sensors' noise."""
+        """Declarations (units and bounds) of the noise levels, by name."""
         return self.noise.declarations()
 
     def find_numbers(
@@ -175,7 +183,9 @@ class KalmanFilter(SideslipFilter):
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Levels that are given, and those read off the measured channels of recordings."""
+        """All noise levels, name -> value: those that are given, and those read off the measured
+        channels of recordings.
+        """
         return self.values | read_levels(
             recordings, self.noise.unknown, self.noise.cutoff, MIN_LEVEL
         )
@@ -193,7 +203,9 @@ class KalmanFilter(SideslipFilter):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """β and r, and offsets of 0 that are known to their standard deviations."""
+        """State before the first sample: β and r, and offsets of 0 with the standard deviations of
+        the settings.
+        """
         offsets = [getattr(self.offsets, name) for name in self.offsets.names]
         return self.first_motion(
             sample,
@@ -298,4 +310,4 @@ class KalmanFilter(SideslipFilter):
         }
 
 
-ESTIMATOR = KalmanFilter
+ESTIMATOR = KalmanFilter  # class by which the registry finds the family

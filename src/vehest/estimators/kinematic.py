@@ -65,7 +65,7 @@ class Kinematic(Recursive):
 
     @property
     def decay(self) -> float:
-        """Share of v that is left after a sample."""
+        """Factor exp(-τ/T) by which v decays over a sample."""
         return math.exp(-1.0 / (self.rate_hz * self.time_constant))
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
@@ -98,4 +98,4 @@ class Kinematic(Recursive):
         }
 
 
-ESTIMATOR = Kinematic
+ESTIMATOR = Kinematic  # class by which the registry finds the family

@@ -92,7 +92,7 @@ class Ksnn(WindowedEstimator):
 
     @property
     def full_title(self) -> str:
-        """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
+        """Title with the structure, for example ``KS-NN linear + bias, P = 2``."""
         neurons = f", Q = {self.n_hidden}" if self.n_hidden else ""
         bias = "+ bias" if self.bias else "no bias"
         bound = f", kinematic gain ≥ {self.kinematic_gain:g}" if self.kinematic_gain else ""
@@ -103,7 +103,9 @@ class Ksnn(WindowedEstimator):
         return self.new_network(largest_absolute(train, "yaw_rate", self.name))
 
     def new_network(self, yaw_rate_max: float = 1.0) -> Any:
-        """A `KinematicsStructuredNetwork`."""
+        """An untrained `KinematicsStructuredNetwork` whose last local model is centred at a yaw
+        rate [rad/s].
+        """
         from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
 
         return KinematicsStructuredNetwork(self.settings, yaw_rate_max)
@@ -113,7 +115,7 @@ class Ksnn(WindowedEstimator):
         return kernel.shapes_of(self.n_local, self.n_hidden, bias=self.bias) | {"yaw_rate_max": ()}
 
     def min_weights(self) -> int:
-        """All of `weight_shapes`."""
+        """Number of all values in the arrays of `weight_shapes`."""
         return sum(math.prod(shape) for shape in self.weight_shapes().values())
 
     def predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
@@ -161,4 +163,4 @@ class Ksnn(WindowedEstimator):
         )
 
 
-ESTIMATOR = Ksnn
+ESTIMATOR = Ksnn  # class by which the registry finds the family

@@ -38,6 +38,7 @@ from vehest.vehicle.dynamics import (
 from vehest.vehicle.parameters import LENGTH, MASS, YAW_INERTIA
 from vehest.vehicle.planar import F1TENTH
 
+# setting ``dynamics`` -> the paper's abbreviation, in names of variants
 SHORT = {
     "pacejka": "pc",
     "residual": "pcr",
@@ -45,6 +46,7 @@ SHORT = {
     "tyre_network": "nnt",
     "friction_tyre_network": "nntf",
 }
+# setting ``dynamics`` -> description in titles
 TITLES = {
     "pacejka": "Pacejka's tyres",
     "residual": "Pacejka's tyres and learnt residual rates",
@@ -135,6 +137,7 @@ class LearnedUkf(CarFilterEstimator):
     slow_kernel = "vehest.estimators.kernels.planar_car:_transition"
     template = "learned_ukf"
     training_type = ThroughFilterSettings
+    # kind of the car's dynamics
     dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = (
         setting(
             "friction_tyre_network",
@@ -202,7 +205,9 @@ class LearnedUkf(CarFilterEstimator):
 
     @property
     def variant(self) -> str:
-        """The paper's name: nntf_uh and so on; a star for another start of friction."""
+        """The paper's name of the dynamics, training and noise, such as nntf_uh, with a suffix for
+        each setting that departs from the paper.
+        """
         s = self.settings
         subscript = ("u" if s.through_filter else "") + (
             "h" if s.noise == "state_dependent" else ""
@@ -225,7 +230,7 @@ class LearnedUkf(CarFilterEstimator):
 
     @property
     def full_title(self) -> str:
-        """Title with what is learnt."""
+        """Title with the dynamics, and with what is learnt."""
         s = self.settings
         parts = (
             [TITLES[s.dynamics]]
@@ -240,7 +245,7 @@ class LearnedUkf(CarFilterEstimator):
 
     @property
     def n_parameters(self) -> int:
-        """Number of parameters that can change; diagonal noise has none off its diagonals."""
+        """Number of parameters that training changes; diagonal noise has none off its diagonals."""
         fixed = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (
             1 if self.noise == "constant" else 2 + len(STATES)
         )
@@ -248,7 +253,9 @@ class LearnedUkf(CarFilterEstimator):
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
-        """Members that differ in seed, start of friction, repairs or gate share their training."""
+        """Key of estimators that are fitted together: they differ only in seed, start of friction,
+        repairs or gate.
+        """
         return (self.name, replace(self.settings, start_friction=None, repair=True, gate=None))
 
     @classmethod
@@ -286,7 +293,9 @@ class LearnedUkf(CarFilterEstimator):
         index: int,
         twins: Sequence[int],
     ) -> list[PhaseRecord]:
-        """Train one filter; ``twins`` are the places of members that share its training."""
+        """Train one filter and return the record of each phase; ``twins`` are the indices of the
+        members that share its training.
+        """
         dtype = getattr(torch, training.dtype)
         train, validation = (
             [self.drive(recording, dtype) for recording in part]
@@ -307,7 +316,7 @@ class LearnedUkf(CarFilterEstimator):
         return records
 
     def new_network(self) -> CarFilter:
-        """The filter before it learns."""
+        """The filter before its training."""
         s = self.settings
         return CarFilter(
             self._new_dynamics(),
@@ -319,6 +328,7 @@ class LearnedUkf(CarFilterEstimator):
         )
 
     def _new_dynamics(self) -> Dynamics:
+        """New dynamics of the kind that the settings name, with initial values."""
         s = self.settings
         car = vars(s.car)
         width = s.width or (64 if "tyre" in s.dynamics else 256)
@@ -352,4 +362,4 @@ class LearnedUkf(CarFilterEstimator):
         }
 
 
-ESTIMATOR = LearnedUkf
+ESTIMATOR = LearnedUkf  # class by which the registry finds the family

@@ -17,7 +17,7 @@ class LstmNetwork(RecurrentNetwork):
     Source: Hochreiter & Schmidhuber 1997; Kong et al., World Electr. Veh. J. 13 (1), 2022.
     """
 
-    n_gates = 4
+    n_gates = 4  # number of gates of the cell
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero.
@@ -55,4 +55,4 @@ class Lstm(RecurrentEstimator):
     style = "#c792dd", "dashed", "v"
 
 
-ESTIMATOR = Lstm
+ESTIMATOR = Lstm  # class by which the registry finds the family

@@ -77,6 +77,7 @@ def implicit_euler_observer(
         vx[k] = u
 
 
+# `implicit_euler_observer`, compiled
 compiled_observer = numba.njit(cache=True, error_model="numpy")(implicit_euler_observer)
 
 
@@ -165,4 +166,4 @@ class Luenberger(Recursive):
         return {**self.values, "step": 1.0 / self.rate_hz}
 
 
-ESTIMATOR = Luenberger
+ESTIMATOR = Luenberger  # class by which the registry finds the family

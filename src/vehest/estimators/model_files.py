@@ -30,10 +30,10 @@ from vehest.data.transforms import Preparation
 from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class
 
-WEIGHTS = "model.safetensors"
-DESCRIPTION = "model.yaml"
-FORMAT = 1
-DTYPES = ("F32", "F64")
+WEIGHTS = "model.safetensors"  # name of the file of weights
+DESCRIPTION = "model.yaml"  # name of the file of settings and origin
+FORMAT = 1  # version of the layout; folders of another one are refused
+DTYPES = ("F32", "F64")  # data types of tensors that are read
 # former name of a family in files of a model -> name
 RENAMED = {"learned_ukf_variant": "learned_ukf"}
 MIN_CHECKED_SIZE = 4096
@@ -49,18 +49,18 @@ def current_name(estimator: str) -> str:
 
 @dataclass(frozen=True)
 class About:
-    """How a model came to be, as ``about`` of model.yaml says it; further keys are for people."""
+    """Origin of a model, the entry ``about`` of model.yaml; further keys are kept, but not used."""
 
     __pydantic_config__ = FURTHER_KEYS
-    seed: int = 0
-    datasets: tuple[str, ...] = ()  # names of those that it was trained on
-    trained_on: tuple[str, ...] = ()  # ranges
-    validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
-    n_parameters: int | None = None
-    # how recordings were brought to its rate
+    seed: int = 0  # seed of the training
+    datasets: tuple[str, ...] = ()  # names of the data sets that it was trained on
+    trained_on: tuple[str, ...] = ()  # ranges of recordings that it was trained on
+    validated_on: tuple[str, ...] = ()  # ranges on which the training was stopped early
+    n_parameters: int | None = None  # number of fitted values; None: not stated
+    # resampling by which recordings were brought to the model's rate
     downsample: Preparation = field(default_factory=Preparation)
-    interrupted: bool = False
-    note: str = ""  # what people should know of its estimates
+    interrupted: bool = False  # whether the training was stopped before its end
+    note: str = ""  # remark for users on the model's estimates
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,17 @@ class Description:
 
     format: int  # version of the layout
     estimator: str  # name in the registry, never an import path
-    settings: dict[str, Any]  # of the estimator, plain values
-    variant: str = ""  # what the paper calls it
-    channels: tuple[str, ...] = ()  # that it reads
-    about: About = field(default_factory=About)
-    version: str = "1"  # of the estimator; folders older than this entry have none
+    settings: dict[str, Any]  # settings of the estimator, plain values
+    variant: str = ""  # the paper's name of the configuration
+    channels: tuple[str, ...] = ()  # channels that the estimator reads
+    about: About = field(default_factory=About)  # origin
+    version: str = "1"  # version of the family's code; folders older than this entry have none
 
 
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
     """Write a fitted estimator into an existing folder.
 
-    ``about`` are plain values of `About`, and others for people.
+    ``about`` has plain values of the fields of `About`, and perhaps further keys.
 
     Raises
     ------
@@ -254,12 +254,12 @@ def _integers(content: Any, name: str) -> Iterator[tuple[str, int]]:
 def _count_not_finite(
     kind: Estimator | type[Estimator], name: str, values: np.ndarray[Any, Any]
 ) -> int:
-    """How many numbers of a tensor are not finite, though they must be."""
+    """Number of values of the tensor ``name`` that are not finite, though they must be."""
     return int((np.isinf(values) if name in kind.may_be_nan else ~np.isfinite(values)).sum())
 
 
 def _read_weights(folder: Path, kind: type[Estimator]) -> dict[str, np.ndarray[Any, Any]]:
-    """Weights by name; what a tensor takes in memory is in the file.
+    """Read and check the weights of a model folder, by name.
 
     Raises
     ------

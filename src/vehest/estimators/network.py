@@ -59,12 +59,12 @@ class Network(Estimator):
 
     @abstractmethod
     def new_network(self) -> Any:
-        """An ``nn.Module`` as it is built, to train or to load weights into."""
+        """Build the ``nn.Module`` of these settings, to be trained or to receive stored weights."""
 
     def fit_member(
         self, data: FitData, training: Any, context: FitContext, index: int
     ) -> FitRecord:
-        """Train one estimator; ``index`` is its place among the members, see `fit_members`.
+        """Train one estimator; ``index`` is its index among the members, see `fit_members`.
 
         Parameters
         ----------
@@ -89,13 +89,13 @@ class Network(Estimator):
 
     @property
     def n_parameters(self) -> int:
-        """Numbers that training determines; ranges taken from the data do not count."""
+        """Number of values that training determines; scales taken from the data do not count."""
         return sum(
             parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad
         )
 
     def min_weights(self) -> int:
-        """Number of parameters, without memory for them."""
+        """Number of parameters, computed without allocating them."""
         import torch
 
         with torch.device("meta"):
@@ -108,7 +108,7 @@ class Network(Estimator):
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Parameters and ranges (persistent buffers) of the network."""
+        """Parameters and scales (persistent buffers) of the network, by name."""
         if self._loaded and "network" not in vars(self):
             return {name: values.copy() for name, values in self._loaded.items()}
         return {
@@ -117,7 +117,7 @@ class Network(Estimator):
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take parameters and ranges back, in the precision they were trained in.
+        """Set parameters and scales from stored weights, in the precision of the training.
 
         Raises `DataError`: a name or shape does not fit the settings, or a scale is not positive.
         """

@@ -60,7 +60,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @abstractmethod
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
-        """Sideslip angle, variance and process noise by the network, of samples (T, C).
+        """Evaluate the network: sideslip angle, its variance and process noise for T samples.
 
         Parameters
         ----------
@@ -76,12 +76,12 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
 
     @property
     def variant(self) -> str:
-        """Name of the family with the network's inputs and the gate."""
+        """Identifier with the inputs, the gate and the normalisation of the network's inputs."""
         return self.inputs + self.gate_suffix + NORMALISATION_SUFFIXES[self.normalisation]
 
     @property
     def n_parameters(self) -> int:
-        """Weights and biases of the network, and what the filter's fit finds."""
+        """Number of weights and biases of the network and of values that the filter's fit finds."""
         return super().n_parameters + self.n_identified
 
     def fit_member(
@@ -108,7 +108,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         return samples[:, [self.channels.index(name) for name in self.network_inputs]]
 
     def pseudo_measurements(self, recordings: Sequence[Recording]) -> list[PseudoMeasurement]:
-        """Angle and variance of each recording by the network."""
+        """Evaluate the network on each recording."""
         return [
             self.pseudo_of(self.network_samples(recording.stack(self.channels)))
             for recording in recordings
@@ -163,7 +163,7 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         SampleNetworkEstimator.load_weights(self, parts["network"])
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """The network learns from ``vy_ref``."""
+        """Reference channels that the fit reads: those of the network."""
         return self.learns_from
 
     def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:

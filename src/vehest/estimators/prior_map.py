@@ -19,9 +19,9 @@ from vehest.estimators.recursive import Recursive
 
 
 class PriorMap(Recursive):
-    """v = r (b - C u²) with the prior means of b and C.
+    """v = r (b - C u²) with the prior means of b and C: the baseline for estimates of a car that
+    nothing was trained on.
 
-    What an estimate for a car that nobody has trained on has to beat.
 
     It is the steady cornering of a linear single track (Mitschke & Wallentowitz, Dynamik der
     Kraftfahrzeuge), with the compliance C of a typical rear axle. `SelfCalibrating` starts from the
@@ -61,7 +61,9 @@ class PriorMap(Recursive):
 
     @property
     def b(self) -> float:
-        """Distance of the point where v holds from the rear axle [m]."""
+        """Distance from the rear axle to the point at which v is estimated [m], positive
+        forwards.
+        """
         return (
             TYPICAL_REAR * self.wheelbase
             if self.cg_to_rear_axle is None
@@ -76,7 +78,7 @@ class PriorMap(Recursive):
         )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """r (b - C u²) [m/s]."""
+        """v = r (b - C u²) [m/s] at each sample; there is no state."""
         vx, yaw_rate = samples.T
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
@@ -86,4 +88,4 @@ class PriorMap(Recursive):
         return {"about": about, "b": self.b, "k": self.k}
 
 
-ESTIMATOR = PriorMap
+ESTIMATOR = PriorMap  # class by which the registry finds the family

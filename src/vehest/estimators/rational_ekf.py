@@ -62,9 +62,9 @@ from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.vehicle.tyre_track import TyreTrack
 
-# Levels where nothing is tuned: steer [rad/√s], tyres [1/√s].
+# Noise levels where nothing is tuned (method=data): steer [rad/√s], tyres [1/√s].
 ASSUMED_LEVELS = {"steer": 0.02, "tyres": 0.003}
-NOISE_CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
+NOISE_CUTOFF = 0.2  # frequency above which signals count as noise, over the Nyquist frequency
 # Standard deviation of the logarithms of curves that are given, where no other is.
 DEFAULT_CURVE_DEVIATION = 0.1
 # Rounding of a covariance in a file, relative to its largest entry.
@@ -109,8 +109,12 @@ class AxleCurves(Group):
     c2_front: float | None = setting(
         None, "cornering stiffness of the front axle", unit="N/rad", positive=True
     )
-    c1_rear: float | None = setting(None, "of the rear axle", unit="rad²", positive=True)
-    c2_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
+    c1_rear: float | None = setting(
+        None, "where the rear axle's curve bends; not of linear tyres", unit="rad²", positive=True
+    )
+    c2_rear: float | None = setting(
+        None, "cornering stiffness of the rear axle", unit="N/rad", positive=True
+    )
     deviation: float | None = setting(
         None,
         "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after "
@@ -209,7 +213,7 @@ class RationalTrack(SideslipFilter):
 
     @property
     def kind(self) -> TyreKind:
-        """Names and parameters of these tyres."""
+        """Names and parameters of the tyre model of the settings."""
         return KINDS[self.tyres]
 
     @property
@@ -219,11 +223,11 @@ class RationalTrack(SideslipFilter):
 
     @property
     def adapted(self) -> tuple[str, ...]:
-        """Tyre parameters that are states."""
+        """Names of the tyre parameters that are states."""
         return self.kind.adapted
 
     def model(self) -> RationalModel:
-        """The model at the curves of the filter's start, with its limits and start."""
+        """The model with the fitted curves, the limits and the start of the filter."""
         return RationalModel(
             self.car,
             self.axle_curves,
@@ -334,9 +338,8 @@ class RationalFilter(RationalTrack):
 
     @property
     def variant(self) -> str:
-        """The paper's name of these tyres, then.
-
-        Unscented filter, tyres that stay straight ahead, gate.
+        """The paper's name of the tyres, with suffixes for an unscented filter, for tyres that are
+        held straight ahead, and for a gate.
         """
         filter_suffix = "_ukf" if self.filter == "unscented" else ""
         stay_suffix = "_held" if self.adapted and self.adapt_above > 0.0 else ""
@@ -344,7 +347,7 @@ class RationalFilter(RationalTrack):
 
     @property
     def full_title(self) -> str:
-        """The paper's name of these tyres, and the filter."""
+        """Title with the paper's name of the tyres, and the kind of filter."""
         stay = ", tyres held straight ahead" if self.adapted and self.adapt_above > 0.0 else ""
         return f"{self.kind.title}, {self.filter} Kalman filter{stay}{self.gate_title}"
 
@@ -352,17 +355,19 @@ class RationalFilter(RationalTrack):
 
     @property
     def unknown_levels(self) -> tuple[str, ...]:
-        """Noise levels that are not given."""
+        """Noise levels that the settings leave to the fit."""
         return tuple(name for name in self.kind.level_names if getattr(self.noise, name) is None)
 
     @property
     def n_parameters(self) -> int:
-        """Parameters of curves and noise levels that are not given."""
+        """Number of parameters of curves and of noise levels that are fitted."""
         n_curves = 0 if self.curves.has_values else len(self.kind.curve_names)
         return n_curves + len(self.unknown_levels)
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
-        """``vy_ref`` for fitted curves or searched levels, unless there is a sideslip angle."""
+        """Reference channels that the fit needs: ``vy_ref`` for fitted curves or searched levels,
+        unless recordings have ``sideslip_ref``.
+        """
         is_searched = training.method != "data" and bool(searched_levels(self.unknown_levels))
         needs_none = self.curves.has_values and not is_searched
         return () if needs_none or "sideslip_ref" in channels else ("vy_ref",)
@@ -522,4 +527,4 @@ def _require_covariance(name: str, values: FloatArray) -> None:
         raise DataError(f"'{name}' is no covariance: it has the eigenvalue {lowest:g}")
 
 
-ESTIMATOR = RationalFilter
+ESTIMATOR = RationalFilter  # class by which the registry finds the family

@@ -50,20 +50,20 @@ def compiled(step: Callable[..., Any]) -> Any:
 
 
 class Recursive(Estimator):
-    """An observer or filter: it goes through samples in order and carries a state.
+    """Base of observers and filters, which process samples in order and carry a state; nothing in
+    them is random.
 
-    Nothing in it is random.
 
     Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a
     setting is not fitted. A family has either a compiled ``step(numbers, state, sample)``, which
     returns the state after a sample, or its own `run`.
     """
 
-    training_type: ClassVar[type] = NoTraining
+    training_type: ClassVar[type] = NoTraining  # settings of the fit
     # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
     states: ClassVar[tuple[str, ...]] = ("vy",)
-    refuses: ClassVar[tuple[str, ...]] = ("NaN",)
-    step: ClassVar[Any]
+    refuses: ClassVar[tuple[str, ...]] = ("NaN",)  # measurements of a sample that are errors
+    step: ClassVar[Any]  # compiled step: numbers, state, sample -> state after the sample
     values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -87,9 +87,8 @@ class Recursive(Estimator):
         self.unknown = tuple(name for name, value in fitted_settings.items() if value is None)
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> Any:
-        """The state before the first sample.
-
-        That of a protocol, else what is measured, else 0; see `Estimator.first_state`.
+        """The state before the first sample: each value is that of the initial state, else the
+        measured one, else 0; see `Estimator.first_state`.
         """
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
         return tuple(
@@ -120,7 +119,7 @@ class Recursive(Estimator):
         return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
-        """Numbers of the smallest mean squared error of vy; None without a closed form.
+        """Values with the smallest mean squared error of vy, by name; None without a closed form.
 
         Raises
         ------
@@ -132,9 +131,9 @@ class Recursive(Estimator):
     def find_numbers(
         self, data: FitData, training: Any, context: FitContext
     ) -> tuple[Mapping[str, float], FitRecord]:
-        """Best values of what is not given.
+        """Fit the values that are not given, in closed form, else by Nelder-Mead on the mean
+        squared error of vy in training.
 
-        In closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         The recordings have ``vy_ref``, without gaps but in channels that are skippable.
 
@@ -197,14 +196,14 @@ class Recursive(Estimator):
 
     @property
     def n_parameters(self) -> int:
-        """Number of values that are not given."""
+        """Number of values that are fitted."""
         return len(self.unknown)
 
     @classmethod
     def fit_members(
         cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext
     ) -> list[FitRecord]:
-        """Fit one; the others, which could not differ, get the same.
+        """Fit one member, and copy the result to the others, which could not differ.
 
         Raises
         ------
@@ -253,13 +252,13 @@ class Recursive(Estimator):
             )
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Each number as an array of one; without any, one that says that there is none."""
+        """Each fitted value as an array of one element, by name; a placeholder if there is none."""
         return {name: np.array([value]) for name, value in self.values.items()} or {
             "none": np.zeros(1)
         }
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the numbers back; raises `DataError`: one is missing, unknown or out of bounds."""
+        """Set the fitted values; raises `DataError`: one is missing, unknown or out of bounds."""
         require_shapes(
             self, weights, {name: values.shape for name, values in self.weights().items()}
         )
@@ -268,7 +267,7 @@ class Recursive(Estimator):
         self.values = values
 
     def declarations_of_values(self) -> Mapping[str, Declaration]:
-        """Bounds of `values` by name."""
+        """Declarations (units and bounds) of `values`, by name."""
         declarations: Mapping[str, Declaration] = self.settings.declarations()
         return declarations
 
@@ -283,7 +282,8 @@ def _fitted_number(name: str) -> property:
 
 @numba.njit(error_model="numpy")
 def _scan(step, numbers, state, samples, estimates):  # type: ignore[no-untyped-def]
-    """State after the last sample; writes those after all samples into ``estimates``, (T, n).
+    """Apply ``step`` to samples in turn: returns the state after the last one, and writes those
+    after all samples into ``estimates``, (T, n).
 
     Parameters
     ----------

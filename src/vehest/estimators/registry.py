@@ -20,7 +20,7 @@ from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.text_files import first_line
 from vehest.estimators.base import Estimator
 
-ENTRY_POINTS = "vehest.estimators"
+ENTRY_POINTS = "vehest.estimators"  # group of entry points of other packages' estimators
 
 
 @cache
@@ -86,7 +86,7 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 
 def option_names() -> dict[str, list[str]]:
-    """Names of the options of each estimator, without ``estimator.``."""
+    """Estimator -> names of its settings, as options without ``estimator.``."""
     return {
         name: [entry.name for entry in fields(estimator.settings_type)]
         for name, estimator in estimator_classes().items()
@@ -99,7 +99,9 @@ def is_plugin(name: str) -> bool:
 
 
 def plugin_failure(name: str, failed: str, error: Exception) -> ConfigurationError:
-    """The error of an estimator of another package that cannot be ``failed``, as "loaded"."""
+    """The error to raise where an estimator of another package fails; ``failed`` is the participle
+    of what cannot be done, such as "loaded".
+    """
     reason = f"{type(error).__name__}: {printable(first_line(error))}"
     return ConfigurationError(
         f"estimator '{name}' of another package cannot be {failed} ({reason}); repair or remove it"

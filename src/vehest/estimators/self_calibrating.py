@@ -38,9 +38,9 @@ from vehest.estimators.kernels.ksnn import c_tables, packed
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
 
-WINDOW = 30  # samples of the network's input
-NETWORK_HZ = 20.0  # their rate
-NEGLIGIBLE_ODDS = 1e-300  # of a candidate that does not count
+WINDOW = 30  # samples in the window that the network reads
+NETWORK_HZ = 20.0  # Hz, rate of these samples
+NEGLIGIBLE_ODDS = 1e-300  # prior odds of a candidate that does not count
 UNMEASURED_AX_NOISE = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 
@@ -88,12 +88,12 @@ class SelfCalibrating(SelfCalibratingSettings):
 
     @property
     def causal(self) -> bool:
-        """Whether it filters; a smoothed estimate uses later measurements too."""
+        """Whether no later measurements are used: true for the filter, false for the smoother."""
         return not self.smoothed
 
     @property
     def full_title(self) -> str:
-        """Title with whether it smooths."""
+        """Title, with ``smoothed`` if it smooths."""
         return f"{self.title}, smoothed" if self.smoothed else self.title
 
     @property
@@ -141,7 +141,7 @@ class SelfCalibrating(SelfCalibratingSettings):
 
     @property
     def noise(self) -> FloatArray:
-        """Variances by which states grow in a sample of steady driving, (8,)."""
+        """Variances that a sample of steady driving adds to the states, (8,)."""
         n = self.numbers()
         noise = np.square(self.prior[1]) * (1.0 - np.square(self.decay))
         noise[[kernel.V, kernel.U]] = n.dt * n.noise_vy**2, n.dt * n.noise_vx**2
@@ -173,7 +173,9 @@ class SelfCalibrating(SelfCalibratingSettings):
         return values
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> kernel.State:
-        """The priors, with v of the initial state, else 0, and the measured speed."""
+        """State before the first sample: the priors, with v of the initial state, else 0, and u as
+        measured.
+        """
         mean, deviation = self.prior
         mean[kernel.V] = initial_state.get("vy", 0.0)
         mean[kernel.U] = sample[1]
@@ -196,7 +198,7 @@ class SelfCalibrating(SelfCalibratingSettings):
         )
 
     def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
-        """vy [m/s] and its variance."""
+        """Estimate vy [m/s] and its variance [m²/s²] at each sample."""
         if self.smoothed:
             estimates = smooth(self, samples, state)
         else:
@@ -207,7 +209,8 @@ class SelfCalibrating(SelfCalibratingSettings):
     def trace(
         self, samples: FloatArray, state: kernel.State, last_only: bool = False
     ) -> tuple[FloatArray, FloatArray, kernel.State]:
-        """Go on from a state, which is not changed, with the identified parameters.
+        """Estimate further samples from a state, which is not changed, and return the identified
+        parameters, too.
 
         Parameters
         ----------
@@ -246,7 +249,7 @@ class SelfCalibrating(SelfCalibratingSettings):
         )
 
     def c_values(self) -> dict[str, Any]:
-        """Numbers, priors and the network."""
+        """Numbers, priors and the network for the C template."""
         n = self.numbers()
         mean, deviation = self.prior
         grips, start = self.bank_arrays
@@ -275,7 +278,7 @@ class SelfCalibrating(SelfCalibratingSettings):
         }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """The network's rows, and the yaw rate of its last local model."""
+        """The network's rows, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
         return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
@@ -306,4 +309,4 @@ def _shipped_network() -> tuple[FloatArray, float]:
     return rows, float(weights["yaw_rate_max"])
 
 
-ESTIMATOR = SelfCalibrating
+ESTIMATOR = SelfCalibrating  # class by which the registry finds the family

@@ -56,12 +56,12 @@ class SideslipFfnn(SampleNetworkEstimator):
         self.channels = self.network_inputs = INPUTS[self.inputs]
 
     def new_network(self) -> SampleNetwork:
-        """From a sample to its sideslip angle."""
+        """An untrained network from the inputs of a sample to its sideslip angle."""
         return SampleNetwork(len(self.channels), self.hidden, 1)
 
     @property
     def variant(self) -> str:
-        """Name with the inputs and their normalisation."""
+        """Identifier with the inputs and their normalisation."""
         return self.inputs + NORMALISATION_SUFFIXES[self.normalisation]
 
     @property
@@ -76,7 +76,7 @@ class SideslipFfnn(SampleNetworkEstimator):
         return self.fit_samples(data, training, squared_error, context, index, [self.fit_seed])
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
-        """v = u tan β, each sample by itself.
+        """Estimate v = u tan β [m/s] for each sample by itself.
 
         Parameters
         ----------
@@ -95,4 +95,4 @@ class SideslipFfnn(SampleNetworkEstimator):
         return self.network.c_values()
 
 
-ESTIMATOR = SideslipFfnn
+ESTIMATOR = SideslipFfnn  # class by which the registry finds the family

@@ -14,8 +14,8 @@ from vehest.declared import fitted
 from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
-# of the least squares; beyond it, speed hardly changes and the two numbers cannot be identified
-# separately
+# largest condition number of the regressors; beyond it, speed hardly changes and the two numbers
+# cannot be identified
 MAX_CONDITION_NUMBER = 1e8
 
 
@@ -39,7 +39,9 @@ class StaticMap(Recursive):
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Least squares; raises `DataError`: the car hardly turns, or always at one speed.
+        """b [m] and k [s²/m] by least squares, by name; raises `DataError`: the car hardly turns,
+        or always at one speed.
+
 
         Columns r and -r u² are scaled to a mean square of 1 first; their condition number decides
         whether both numbers can be identified. A number that is given is subtracted.
@@ -67,7 +69,7 @@ class StaticMap(Recursive):
         )
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """r (b - k u²) [m/s]."""
+        """v = r (b - k u²) [m/s] at each sample; there is no state."""
         vx, yaw_rate = samples.T
         return {"vy": yaw_rate * (self.b - self.k * np.square(vx))}, state
 
@@ -79,4 +81,4 @@ class StaticMap(Recursive):
         }
 
 
-ESTIMATOR = StaticMap
+ESTIMATOR = StaticMap  # class by which the registry finds the family

@@ -81,4 +81,4 @@ class VelocityGru(RecurrentVelocityEstimator):
     )
 
 
-ESTIMATOR = VelocityGru
+ESTIMATOR = VelocityGru  # class by which the registry finds the family

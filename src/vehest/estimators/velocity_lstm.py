@@ -103,4 +103,4 @@ class VelocityLstm(RecurrentVelocityEstimator):
     )
 
 
-ESTIMATOR = VelocityLstm
+ESTIMATOR = VelocityLstm  # class by which the registry finds the family

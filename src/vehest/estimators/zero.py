@@ -23,7 +23,7 @@ class Zero(Recursive):
     rate_hz: float = rate(20.0)
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """Zeros [m/s]."""
+        """v = 0 [m/s] at each sample; there is no state."""
         return {"vy": np.zeros(len(samples))}, state
 
     def c_values(self) -> dict[str, Any]:
@@ -31,4 +31,4 @@ class Zero(Recursive):
         return {"about": "v = 0."}
 
 
-ESTIMATOR = Zero
+ESTIMATOR = Zero  # class by which the registry finds the family

@@ -14,7 +14,7 @@ import scipy
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import MIN_BLOCKS, block_labels, block_sums, segments_of
-from vehest.evaluation.metrics import BoolArray, Scored, half_turned
+from vehest.evaluation.metrics import BoolArray, Scored, wrap_to_half_turn
 from vehest.evaluation.regimes import AY_BANDS, Mask, is_long_enough, is_represented
 from vehest.trust.bands import (
     CHANNEL_LEVEL,
@@ -26,16 +26,17 @@ from vehest.trust.bands import (
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95  # level of the interval of a coverage
-IN_REGIMES = ("coverage_90", "width_90", "interval_score")
+REGIME_METRICS = ("coverage_90", "width_90", "interval_score")  # figures that are split by regime
 SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
 
 
-class Banded(NamedTuple):
+class ScoredBand(NamedTuple):
     """Errors of a quantity and its bands at the samples of all ranges at which it is scored."""
 
-    errors: FloatArray  # (N,) [deg] or [m/s]
-    half: FloatArray  # half widths in the same unit, (N, L), of `LEVELS`
-    is_scored: BoolArray  # which of all samples these are, (K,), N of them True
+    errors: FloatArray  # estimate - reference, (N,) [deg for β, m/s for v]
+    half: FloatArray  # half widths in the same unit, (N, L), a column for each of `LEVELS`
+    # whether each of the K samples of all ranges is scored, (K,); N of them are
+    is_scored: BoolArray
 
     @property
     def half_width_90(self) -> FloatArray:
@@ -43,11 +44,11 @@ class Banded(NamedTuple):
         return self.half[:, LEVELS.index(CHANNEL_LEVEL)]
 
 
-def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
+def scored_bands(parts: Sequence[Scored], bands: Bands) -> dict[str, ScoredBand]:
     """Errors and bands of ``vy`` [m/s], at all samples, and ``sideslip`` [deg], at those at which
     it is scored.
 
-    All levels are in proportion to that at 90 %.
+    The half widths of all levels are proportional to that at 90 %.
 
     Parameters
     ----------
@@ -59,13 +60,12 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     Returns
     -------
     dict
-        ``vy`` and ``sideslip`` -> errors, (N,), half widths, (N, levels), and which samples of all
-        parts these are.
+        ``vy`` and ``sideslip`` -> `ScoredBand`.
     """
     whole = Scored.joined(parts)
     errors = {
         "vy": whole.vy - whole.vy_ref,
-        "sideslip": np.degrees(half_turned(whole.sideslip - whole.sideslip_ref)),
+        "sideslip": np.degrees(wrap_to_half_turn(whole.sideslip - whole.sideslip_ref)),
     }
     scale = {"vy": 1.0, "sideslip": np.degrees(1.0)}
     is_scored = {
@@ -75,32 +75,37 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
     banded_errors = {}
     for name, mask in is_scored.items():
         half_width_90 = np.concatenate([part.bands[name] for part in parts])[:, None]
-        half = scale[name] * half_width_90 * getattr(bands, name).beside(CHANNEL_LEVEL)
-        banded_errors[name] = Banded(errors[name][mask], half[mask], mask)
+        half = scale[name] * half_width_90 * getattr(bands, name).ratios_to(CHANNEL_LEVEL)
+        banded_errors[name] = ScoredBand(errors[name][mask], half[mask], mask)
     return banded_errors
 
 
 def band_figures(
-    banded_errors: Mapping[str, Banded],
+    banded_errors: Mapping[str, ScoredBand],
     parts: Sequence[Scored],
     turns: Sequence[FloatArray | None],
     rate_hz: float,
 ) -> dict[str, float]:
-    """Figures of the bands of a test set at ``rate_hz`` [Hz], whose yaw rates ``turns`` [rad/s] are
-    None where not measured.
+    """Metrics of the bands of a test set: name -> value, for β [deg] and, with the suffix ``_vy``,
+    for v [m/s].
 
-    ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and
-    ``crps`` as below; ``coverage_90_p10`` and ``…_p90`` 10 and 90 % quantiles of the coverage of
-    manoeuvres, which are the blocks that bands are calibrated by; ``error_icc`` intraclass
-    correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres
-    these are spread over. Nothing of a quantity that is scored at no sample.
+    ``coverage_…`` is the fraction of errors inside the band; ``width_90`` the mean full width;
+    ``interval_score`` and ``crps`` are those of `interval_score` and `crps_of_levels`;
+    ``coverage_90_p10`` and ``…_p90`` are the 10 and 90 % quantiles of the coverage over manoeuvres,
+    which are the blocks that bands are calibrated by; ``error_icc`` is the intraclass correlation
+    of squared normalised errors within them, and ``band_blocks`` their effective number
+    (`effective_blocks`). A quantity that is scored at no sample has no figures.
 
     Parameters
     ----------
     banded_errors : mapping
-        As `banded` makes it of ``parts``.
+        Result of `scored_bands` for ``parts``.
+    parts : sequence of Scored
+        Ranges or sequences of the test set.
     turns : sequence of FloatArray or None
-        Yaw rate of each part, one a scored sample.
+        Yaw rate of each part at its scored samples [rad/s]; None where it was not measured.
+    rate_hz : float
+        Rate of the samples [Hz].
     """
     manoeuvres = np.concatenate(
         manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0]
@@ -137,10 +142,10 @@ def band_figures(
 
 
 def coverage_intervals(
-    banded_errors: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float
+    banded_errors: Mapping[str, ScoredBand], parts: Sequence[Scored], rate_hz: float
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`;
-    nothing where there are too few.
+    """95 % intervals of coverages, by the blocks of `evaluation.blocks`; none where there are fewer
+    than `MIN_BLOCKS`.
 
     Returns
     -------
@@ -168,10 +173,13 @@ def coverage_intervals(
 
 
 def figures_by_regime(
-    banded_errors: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float
+    banded_errors: Mapping[str, ScoredBand], masks: Sequence[Mapping[str, Mask]], rate_hz: float
 ) -> dict[str, dict[str, float]]:
-    """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only of what is
-    scored at 2 s of samples.
+    """Figures of the bands by lateral acceleration: name in `AY_BANDS` -> metric -> value, for
+    `REGIME_METRICS` of β [deg] and v (``_vy``) [m/s].
+
+    ``masks`` are the regimes of each range (`regimes_of`). A quantity is left out where fewer than
+    `MIN_REGIME_SECONDS` of samples are scored.
     """
     figures: dict[str, dict[str, float]] = {}
     for regime in (regime for regime in AY_BANDS if is_represented(regime, masks, rate_hz)):
@@ -190,14 +198,15 @@ def figures_by_regime(
             )
             figures[regime] |= {
                 f"{metric}{suffix}": float(value)
-                for metric, value in zip(IN_REGIMES, values, strict=True)
+                for metric, value in zip(REGIME_METRICS, values, strict=True)
             }
     return figures
 
 
 def interval_score(errors: FloatArray, half: FloatArray, level: float) -> FloatArray:
-    """Width of each interval, and 2/α times by how far it missed; the lowest on average is the true
-    central interval's.
+    """Interval score of each sample, (N,): the width of its interval, plus 2/α times the distance
+    by which the interval misses the error. On average the true central interval has the lowest
+    score.
 
     Parameters
     ----------
@@ -213,12 +222,12 @@ def interval_score(errors: FloatArray, half: FloatArray, level: float) -> FloatA
 
 
 def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]) -> FloatArray:
-    """Continuous ranked probability score from the quantiles that central intervals end at, and the
-    estimate as the median.
+    """Continuous ranked probability score of each sample, (N,), from the quantiles at the ends of
+    central intervals, and the estimate as the median.
 
-    CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to
-    it. Of a Gaussian, at levels 50, 68, 90 and 95 %, that is 2.6 % too low on average, and within 2
-    σ off by up to 0.045 σ: the tails beyond 97.5 % count as their end.
+    CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, where each known τ represents all that are nearest
+    to it. Of a Gaussian, at levels 50, 68, 90 and 95 %, that is 2.6 % too low on average, and
+    within 2 σ off by up to 0.045 σ: the tails beyond 97.5 % count as their end.
 
     Parameters
     ----------
@@ -227,7 +236,7 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
     half : FloatArray
         Half widths, (N, L).
     levels : Sequence[float]
-        Of the columns, ascending.
+        Coverage of the intervals in each column of ``half``, ascending.
 
     Source: Laio & Tamea, Verification tools for probabilistic forecasts of continuous hydrological
     variables, Hydrology and Earth System Sciences 11, 2007, for the integral; Gneiting & Raftery
@@ -244,11 +253,11 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
 
 
 def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
-    """95 % interval of a proportion that is known by blocks: the exact binomial one of as many
-    samples as the blocks are equivalent to.
+    """95 % interval of a proportion whose samples are dependent within blocks: the exact binomial
+    interval for the effective number of samples.
 
-    These would have the variance that the blocks show, and are fewer for what so few blocks know of
-    it; where all are inside, or none, each block counts as one.
+    That number has the variance that the blocks show, and is reduced because few blocks determine
+    the variance poorly; where all samples are inside, or none, each block counts as one.
 
     Parameters
     ----------

@@ -17,24 +17,26 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.text_files import number_in, read_rows
-from vehest.evaluation.metrics import Scored, half_turned
+from vehest.evaluation.metrics import Scored, wrap_to_half_turn
 from vehest.evaluation.significance import root_intervals, unexplained_interval
 
 SEGMENT_SECONDS = 1.0  # s, length of the segments over which errors are summed
 # ranges or sequences from which on each is a block; of fewer, each is cut into blocks
 MIN_PIECES_AS_BLOCKS = 8
-MIN_BLOCKS = 3  # with fewer blocks no interval is given
+MIN_BLOCKS = 3  # smallest number of blocks with which an interval is given
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Sums over the scored samples of each segment, all of shape (K,)."""
+    """Sums of errors over the scored samples of each of K segments of a test set, (K,) each, from
+    which metrics and their intervals follow without the samples.
+    """
 
     piece: FloatArray  # number of the range, or sequence, that a segment belongs to
     start: FloatArray  # time of its first sample [s]
-    samples: FloatArray  # how many it has
+    samples: FloatArray  # number of its scored samples
     squared_error_vy: FloatArray  # sum of (v̂ - v)² [m²/s²]
-    sideslip_samples: FloatArray  # how many of them have a sideslip that is scored
+    sideslip_samples: FloatArray  # number of these at which sideslip is scored
     squared_error_sideslip: FloatArray  # sum of (β̂ - β)² over these [deg²]
     error_vy: FloatArray  # sum of v̂ - v [m/s]
     vy_ref: FloatArray  # sum of v [m/s]
@@ -50,11 +52,12 @@ class Segments:
 
     @property
     def with_sideslip(self) -> Segments:
-        """Those in which sideslip is scored."""
+        """The segments in which sideslip is scored at one sample or more."""
         chosen = self.sideslip_samples > 0
         return Segments(**{name: getattr(self, name)[chosen] for name in COLUMNS})
 
 
+# arrays of `Segments`, columns of its CSV
 COLUMNS = tuple(field.name for field in fields(Segments))
 
 
@@ -66,7 +69,7 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
     columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
     for position, part in enumerate(parts):
         starts = np.arange(0, len(part.time), steps)
-        turn = half_turned(part.sideslip - part.sideslip_ref)
+        turn = wrap_to_half_turn(part.sideslip - part.sideslip_ref)
         error = part.vy - part.vy_ref
         summed = {
             "samples": np.ones_like(error),
@@ -87,7 +90,9 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
 
 
 def joined(parts: Sequence[Segments]) -> Segments:
-    """Segments of several test sets as of one, whose pieces stay apart."""
+    """Concatenate the segments of several test sets; their pieces are numbered anew, so that each
+    stays one.
+    """
     first = 0.0
     columns = {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS}
     for position, part in enumerate(parts):
@@ -107,7 +112,7 @@ def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
 
 
 def read_segments(path: Path) -> dict[str, Segments]:
-    """Segments of every test set.
+    """Read the segments of every test set, name -> segments, from the CSV of `write_segments`.
 
     Raises
     ------
@@ -125,21 +130,22 @@ def read_segments(path: Path) -> dict[str, Segments]:
 
 
 def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
-    """Number of each segment's block, (K,), by ``losses`` (C, K): a range or sequence each, or
-    stretches of the Politis-White length.
+    """Group segments into blocks that are about independent: each range or sequence is one, or,
+    where these are few, parts of the Politis-White length of each.
 
     Parameters
     ----------
     segments : Segments
-        Segments of a test set, by which range or sequence they are of.
+        K segments of a test set; only the range or sequence that they belong to is used.
     losses : FloatArray
-        Of each segment, a row for every loss; blocks are as long as the one that needs the longest.
+        Loss of each segment, a row for every loss, (C, K); blocks are as long as the loss that
+        needs the longest requires.
 
     Returns
     -------
     ndarray of int
-        From 0 on. From `MIN_PIECES_AS_BLOCKS` ranges or sequences on each is a block; no block
-        reaches across two of them.
+        Number of each segment's block, (K,), from 0 on. From `MIN_PIECES_AS_BLOCKS` ranges or
+        sequences on each is a block; no block reaches across two of them.
     """
     pieces = np.unique(segments.piece)
     if len(pieces) >= MIN_PIECES_AS_BLOCKS:
@@ -192,12 +198,16 @@ def politis_white_length(runs: Sequence[FloatArray]) -> float:
 
 
 def _n_insignificant_lags(n: int) -> int:
-    """Lags in a row that have to be insignificant."""
+    """Number of consecutive lags with insignificant autocorrelation by which the correlation has
+    ended, for n values.
+    """
     return max(5, int(math.sqrt(math.log10(max(n, 2)))))
 
 
 def _pooled_covariances(runs: Sequence[FloatArray]) -> FloatArray:
-    """Autocovariances from lag 0 on, (L + 1,)."""
+    """Autocovariances from lag 0 on, (L + 1,), pooled over uninterrupted runs about their common
+    mean.
+    """
     n = sum(len(run) for run in runs)
     mean = float(np.concatenate(runs).mean())
     deviations = [run - mean for run in runs]
@@ -212,7 +222,9 @@ def _pooled_covariances(runs: Sequence[FloatArray]) -> FloatArray:
 
 
 def _window(covariances: FloatArray, n: int) -> int:
-    """M, twice the lag after which `_beyond` autocorrelations in a row are insignificant."""
+    """M, twice the lag after which `_n_insignificant_lags` autocorrelations in a row are
+    insignificant.
+    """
     small = np.abs(covariances[1:] / covariances[0]) < 2.0 * math.sqrt(math.log10(n) / n)
     settled = [
         lag
@@ -257,14 +269,14 @@ def block_sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
 
 
 def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
-    """95 % intervals over blocks of the drive, of one training: what another drive of this kind
-    would give.
+    """95 % intervals of the metrics of one training, over blocks of the drive: the range within
+    which another drive of this kind would lie.
 
     Returns
     -------
     dict[str, tuple[float, float]]
-        Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer
-        than `MIN_BLOCKS` blocks, and none of ``mse_sideslip``, which counts all samples, where
+        Metric -> lower and upper end, in the units of `accuracy`. A metric with fewer than
+        `MIN_BLOCKS` blocks is left out, and so is ``mse_sideslip``, which counts all samples, where
         sideslip is not scored at some.
     """
     intervals = {}

@@ -83,7 +83,7 @@ SETS = (
     ("vx", "yaw_rate", "ay", "steer"),
     ("vx", "yaw_rate", "ay", "ax", "steer"),
 )
-"""Sets of inputs that reports compare."""
+"""Sets of inputs whose bounds reports compare."""
 
 STIFFNESS_DEVIATION = (
     math.log(15.0 / 6.0) / 4.0
@@ -91,12 +91,13 @@ STIFFNESS_DEVIATION = (
 BLOCK_SECONDS = 1.0  # s over which residuals are averaged to separate slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # s, shortest and longest time constant of slow noise
 MIN_SAMPLES = 20  # samples of all drives together; with fewer there is no floor
-MIN_WHITE_SHARE = 0.01  # of an axle's slow error, so that no measurement is exact
+# smallest variance of an axle's white error over that of its slow error, so that no axle is exact
+MIN_WHITE_SHARE = 0.01
 SAMPLES_TOGETHER = 20_000  # samples whose matrices are in memory at once
 UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
 MIN_POSITIVE = 1e-9  # least standard deviation of a noise or squared speed, so that none is 0
 
-_SPEEDS = ("motor_speed", "wheel_speed_")
+_SPEEDS = ("motor_speed", "wheel_speed_")  # prefixes of channels that count as the speed
 _SILENT = (
     "motor_current",
     "wheel_torque_",
@@ -106,10 +107,14 @@ _SILENT = (
 
 @dataclass(frozen=True)
 class Floor:
-    """A standard deviation over the scored samples of a test set."""
+    """Noise floor or Cramér-Rao bound as a root mean square over the scored samples of a test
+    set.
+    """
 
-    vy: float  # of lateral velocity [m/s]
-    sideslip: float  # of the sideslip angle, where it is scored [deg]; NaN where it is at no sample
+    vy: float  # floor of the error of lateral velocity [m/s]
+    # floor of the error of the sideslip angle, where it is scored [deg]; NaN where it is at no
+    # sample
+    sideslip: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +145,16 @@ class Drive:
 
     @property
     def is_sideslip_scored(self) -> BoolArray:
-        """Whether the car is fast enough."""
+        """Mask (T,) of the samples at which the car is fast enough that sideslip is scored."""
         return is_fast_enough(self.inputs["vx"], self.vy_ref, self.min_sideslip_speed)
 
 
 def drives_of(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Drive]:
-    """The ranges or sequences of a test set, as `score_all` counts them."""
+    """The drives of a test set, one for each range or sequence in the order of `score_all`, for the
+    floors.
+    """
     return [
         drive_of(reference, piece, protocol)
         for reference, piece in pieces_of(spans, recording_of, protocol)
@@ -201,8 +208,8 @@ def inputs_of(channels: Collection[str]) -> frozenset[str] | None:
 
 
 def reference_spread(drives: Sequence[Drive]) -> Floor:
-    """Root mean square of the reference itself, the error of v = 0; of a sideslip within a quarter
-    turn, whichever way the car rolls.
+    """Root mean square of the reference itself, which is the error of the zero-sideslip baseline;
+    the sideslip is atan2(v, |u|), within a quarter turn also in reverse.
     """
     velocity, speed = _joined(drives)
     sideslip = np.degrees(np.arctan2(velocity, np.abs(speed)))
@@ -213,16 +220,17 @@ def reference_spread(drives: Sequence[Drive]) -> Floor:
 
 
 def reference_floor(drives: Sequence[Drive]) -> Floor | None:
-    """White noise of the reference, at the evaluation rate; None where there are too few samples.
+    """Standard deviation of the white noise of the reference at the evaluation rate; None where
+    there are too few samples.
 
-    The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which
+    That of the sideslip is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which
     nothing is known.
 
     Parameters
     ----------
     drives : sequence of Drive
-        Of which the scored samples count; their third differences, less what measured lateral
-        acceleration and yaw rate explain, show the noise.
+        Drives of a test set, of which the scored samples count; their third differences, less what
+        measured lateral acceleration and yaw rate explain, show the noise.
 
     Returns
     -------
@@ -263,8 +271,9 @@ def reference_floor(drives: Sequence[Drive]) -> Floor | None:
 
 
 def white_level(series: Sequence[FloatArray]) -> float:
-    """Standard deviation of the white noise of a smooth signal, from its third differences and not
-    below step/√12; 0 if too short.
+    """Standard deviation of the white noise of a smooth signal, in its unit, from the third
+    differences of its uninterrupted segments, (T,) each; at least the quantisation step over √12,
+    and 0 if all segments are too short.
     """
     third = [np.diff(samples, 3) for samples in series if len(samples) >= 4]
     noise = _robust_deviation(np.concatenate(third)) / math.sqrt(20.0) if third else 0.0
@@ -272,8 +281,8 @@ def white_level(series: Sequence[FloatArray]) -> float:
 
 
 def quantisation_step(samples: FloatArray) -> float:
-    """Step of a signal whose values are multiples of one; 0 where fewer than half of them occur
-    twice, or there is none.
+    """Step of a signal whose values are multiples of one step, in its unit; 0 where fewer than half
+    of the values occur twice, or there is no common step.
     """
     values = np.unique(samples)
     if len(values) < 2 or len(values) > len(samples) // 2:
@@ -284,7 +293,9 @@ def quantisation_step(samples: FloatArray) -> float:
 
 
 def _robust_deviation(samples: FloatArray) -> float:
-    """Standard deviation of a normal distribution about zero with this median of sizes."""
+    """Standard deviation of the zero-mean normal distribution with the samples' median absolute
+    value.
+    """
     return float(np.median(np.abs(samples))) / 0.6744897501960817
 
 
@@ -292,32 +303,32 @@ def _robust_deviation(samples: FloatArray) -> float:
 
 
 class Noise(NamedTuple):
-    """A disturbance in two parts."""
+    """A disturbance as the sum of white noise and a slow Gauss-Markov process."""
 
-    # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    # density of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
     density: float
     deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
-    time_constant: float  # of the slow part [s]
+    time_constant: float  # time constant of the slow part [s]
 
 
 class Axle(NamedTuple):
-    """What the force balance of an axle says of v, fitted to a test set."""
+    """The force balance of an axle as a measurement of v, fitted to a test set."""
 
-    coefficients: FloatArray  # of the columns of `_axle_columns`
-    error: Noise  # what it leaves of v, in m/s
+    coefficients: FloatArray  # coefficients of the columns of `_axle_columns`, (4,) or (5,)
+    error: Noise  # v - what the balance gives [m/s]
 
 
 @dataclass(frozen=True, eq=False)
 class _Levels:
-    """What a bound knows of a test set: processes and noise, read off all its drives together."""
+    """Levels of noise and models that a bound takes as known, from all drives of a test set."""
 
-    velocity: Noise
-    lateral: Noise | None
-    longitudinal: Noise | None
-    speed: float
-    reference: float
-    rear: Axle | None
-    front: Axle | None
+    velocity: Noise  # v itself, without a white part [m/s]
+    lateral: Noise | None  # error of dv/dt by ay [m/s²]; None where ay is not read
+    longitudinal: Noise | None  # error of du/dt by ax [m/s²]; None where ax is not read
+    speed: float  # standard deviation of the measured u [m/s]
+    reference: float  # standard deviation of the reference of v [m/s]
+    rear: Axle | None  # rear axle; None where the car is not known
+    front: Axle | None  # front axle; None where the car is not known or steer is not read
 
 
 def cramer_rao_floor(
@@ -328,10 +339,12 @@ def cramer_rao_floor(
 
     Parameters
     ----------
+    drives : Sequence[Drive]
+        Drives of a test set (`drives_of`), from which the levels of noise are taken as well.
     inputs : Collection[str]
         Some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
     car : bool, default True
-        Whether the car is known to about what a data sheet tells; else kinematics alone is.
+        Whether the car is known as well as by a data sheet; else only kinematics is used.
 
     Returns
     -------
@@ -382,7 +395,7 @@ def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatA
 
 
 def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
-    """Part a disturbance into white noise and a slow Gauss-Markov process, by the covariances of
+    """Split a disturbance into white noise and a slow Gauss-Markov process, by the covariances of
     its means over seconds.
 
     Means of the slow part over τ = 1 s have the covariance d² 2(cosh x - 1)/x² e^(-kx) at a lag of
@@ -393,7 +406,7 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     Parameters
     ----------
     series : Sequence[FloatArray]
-        Uninterrupted stretches of it, (T,) each.
+        Uninterrupted segments of the disturbance, (T,) each.
     rate_hz : float
         Sampling rate [Hz].
     """
@@ -422,20 +435,21 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
-    """A process by its root mean square and the time in which its autocorrelation falls to 1/e.
+    """Fit a Gauss-Markov process: its root mean square, and the time in which its autocorrelation
+    falls to 1/e.
 
     Parameters
     ----------
     series : sequence of FloatArray
-        Samples of uninterrupted stretches, any unit.
+        Samples of uninterrupted segments, (T,) each, in any unit.
     rate_hz : float
-        Their rate [Hz].
+        Sampling rate [Hz].
 
     Returns
     -------
     Noise
         Without a white part; its time constant is one interval at least, and at most the length of
-        the longest stretch [s].
+        the longest segment [s].
     """
     deviation = _rms(series)
     longest = max(len(samples) for samples in series)
@@ -451,8 +465,8 @@ def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
 
 
 def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
-    """Levels of all drives together of what an estimator cannot know: of the reference, of the
-    sensors among ``inputs`` and, with ``car``, of the axles.
+    """Levels of noise of all drives together: of v, the reference, the sensors among ``inputs``
+    and, with ``car``, the axles.
     """
     parts = [drive.scored for drive in drives]
     rate = drives[0].rate_hz
@@ -495,10 +509,10 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
 def _unexplained(
     series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float
 ) -> list[FloatArray]:
-    """Rate of change of a velocity less an expected rate [m/s²], without its part in proportion to
-    a sensor.
+    """Rate of change of a velocity less an expected rate [m/s²], without the part proportional to a
+    sensor; an array (T - 1,) for each triple (velocity, expected rate, sensor) in ``series``.
 
-    That part is the scale of the sensor; roll and pitch of the body act alike.
+    That part is the sensor's scale error; roll and pitch of the body have the same effect.
     """
     residuals = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
     sensor = [_middle(samples) for *_, samples in series]
@@ -513,8 +527,7 @@ def _unexplained(
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
-    """An axle's slip and arm by least squares over all drives, and the noise of what they leave
-    over.
+    """Fit the balance of one axle by least squares over all drives, and the noise of its residuals.
 
     The target is the lateral velocity at the centre of gravity [m/s], for the front axle less that
     of the wheels' heading, δ u.
@@ -534,8 +547,8 @@ def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
 
 
 def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
-    """Arm, three of the slip angle and, in front, an offset of the steering angle: ω, u a, u dω/dt,
-    u a³, u; (T, 4) or (T, 5).
+    """Regressors of v in the balance of an axle, (T, 4) or, in front, (T, 5): ω (lever arm), u a, u
+    dω/dt and u a³ (slip angle), and u (offset of the steering angle).
     """
     u = drive.inputs["vx"]
     yaw_rate = drive.inputs["yaw_rate"]
@@ -545,7 +558,7 @@ def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
 
 
 def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatArray:
-    """Standard deviation of v along a drive [m/s], (T,)."""
+    """Square root of the bound of v's mean squared error along a drive, (T,) [m/s]."""
     model, prior = _model_of(drive, inputs, levels)
     deviation = np.empty(len(drive.vy_ref))
     for begin in range(0, len(deviation), SAMPLES_TOGETHER):
@@ -563,7 +576,8 @@ def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatAr
 def _model_of(
     drive: Drive, inputs: set[str], levels: _Levels
 ) -> tuple[LinearModel[FloatArray], FloatArray]:
-    """The model of the module's docstring in steps, and the prior covariance of its state, v first.
+    """The model of the module's docstring in discrete time, and the prior covariance of its state,
+    whose first element is v.
 
     The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ:
     given z, with the gain K = q/(q + r), v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 -
@@ -585,7 +599,7 @@ def _model_of(
         priors.append(prior)
         return index
 
-    decay, noise = _in_steps(levels.velocity, step)
+    decay, noise = _discretised(levels.velocity, step)
     v = state(
         decay,
         noise,
@@ -594,20 +608,20 @@ def _model_of(
     if levels.lateral is not None:
         white = levels.lateral.density * step + MIN_POSITIVE**2
         gain = noise / (noise + white)
-        offset = state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
+        offset = state(*_discretised(levels.lateral, step), levels.lateral.deviation**2)
         transition[v, v] = decay - gain * (decay - 1.0)
         transition[v, offset] = -gain * step
         noises[v] = noise * (1.0 - gain)
         measured.append(({v: decay - 1.0, offset: step}, noise + white))
     if levels.longitudinal is not None:
         speed = state(1.0, levels.longitudinal.density * step, levels.speed**2)
-        pitch = state(*_in_steps(levels.longitudinal, step), levels.longitudinal.deviation**2)
+        pitch = state(*_discretised(levels.longitudinal, step), levels.longitudinal.deviation**2)
         transition[speed, v] = drive.inputs["yaw_rate"] * step
         transition[speed, pitch] = step
         measured.append(({speed: 1.0}, levels.speed**2))
     for axle, front in ((levels.rear, False), (levels.front, True)):
         if axle is not None:
-            error = state(*_in_steps(axle.error, step), axle.error.deviation**2)
+            error = state(*_discretised(axle.error, step), axle.error.deviation**2)
             stiffness = state(1.0, 0.0, STIFFNESS_DEVIATION**2)
             slip = _axle_columns(drive, inputs, front)[:, 1:4] @ axle.coefficients[1:4]
             white = (
@@ -629,8 +643,8 @@ def _model_of(
     return LinearModel(A, np.zeros(n), np.diag(noises), C, np.zeros(m), R), np.diag(priors)
 
 
-def _in_steps(process: Noise, step: float) -> tuple[float, float]:
-    """Decay over a step and the variance of what is new in it."""
+def _discretised(process: Noise, step: float) -> tuple[float, float]:
+    """Decay of a Gauss-Markov process over a step [s], and the variance of its innovation."""
     decay = math.exp(-step / process.time_constant)
     return decay, process.deviation**2 * (1.0 - decay**2)
 
@@ -639,7 +653,7 @@ def _in_steps(process: Noise, step: float) -> tuple[float, float]:
 
 
 def _middle(samples: FloatArray) -> FloatArray:
-    """Means of neighbouring samples, (T - 1,), as differences have their times."""
+    """Means of neighbouring samples, (T - 1,), which are for the same times as differences."""
     return 0.5 * (samples[1:] + samples[:-1])
 
 
@@ -652,12 +666,12 @@ def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
 
 
 def _is_sideslip_scored(drives: Sequence[Drive]) -> BoolArray:
-    """Which of the scored samples of all drives count for the sideslip, (N,)."""
+    """Mask of the scored samples of all drives, (N,), at which sideslip is scored."""
     return np.concatenate([drive.scored.is_sideslip_scored for drive in drives])
 
 
 def _rms(series: Sequence[FloatArray]) -> float:
-    """Root mean square; NaN of nothing."""
+    """Root mean square over all arrays; NaN without samples."""
     joined = np.concatenate(series)
     return rms(joined) if len(joined) else math.nan
 
@@ -665,6 +679,8 @@ def _rms(series: Sequence[FloatArray]) -> float:
 def _sideslip_deviation(
     deviation: FloatArray, velocity: FloatArray, speed: FloatArray
 ) -> FloatArray:
-    """Standard deviation of atan2(v, u) [deg] to first order, (K,)."""
+    """Standard deviation of atan2(v, u) [deg] to first order, (K,), from that of v [m/s]; at most
+    `UNIFORM_ANGLE_DEVIATION`.
+    """
     slope = np.abs(speed) / np.maximum(np.square(speed) + np.square(velocity), MIN_POSITIVE)
     return np.minimum(np.degrees(deviation * slope), UNIFORM_ANGLE_DEVIATION)

@@ -18,25 +18,25 @@ from vehest.data.recording import DERIVED, Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
-CONDITION = "best_lever_arm"  # what rows of such errors say in the column ``condition``
+CONDITION = "best_lever_arm"  # value of the column ``condition`` in rows of such errors
 MAX_LEVER_ARM = 0.5  # m, ahead of the reference's point or behind it
-METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
+METRICS = ("rmse_vy", "rmse_sideslip", "fvu")  # metrics that are given with the best lever arm
 
 
 def lever_arm_figures(
     parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol
 ) -> dict[str, float]:
-    """Errors of a test set whose references were all measured at unknown points, with the lever arm
-    x that leaves the least.
+    """Errors of a test set whose references were all measured at unknown points, after the lever
+    arm x that minimises them is removed.
 
-    It minimises the mean of (v̂ - v - x·r)² within `LONGEST`: Σ(v̂ - v)r / Σr².
+    x = Σ(v̂ - v)r / Σr² minimises the mean of (v̂ - v - x·r)², and is limited to ±`MAX_LEVER_ARM`.
 
     Returns
     -------
     dict[str, float]
-        Metric -> value, with ``lever_arm``, how far ahead of the reference's point the estimates
-        hold [m]; nothing where a reference's point is known or undeclared, or a recording has no
-        yaw rate.
+        Metric -> value for `METRICS`, and ``lever_arm``, the distance x by which the estimates'
+        point lies ahead of the reference's [m]; empty where a reference's point is known or
+        undeclared, or a recording has no yaw rate.
     """
     yaw_rates = []
     speeds = []

@@ -25,14 +25,14 @@ from vehest.data.recording import Recording
 from vehest.data.resampling import resampled
 from vehest.data.splits import Span
 
-BoolArray = NDArray[np.bool_]
+BoolArray = NDArray[np.bool_]  # array of truth values
 
 # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section
 # V)
 NONLINEAR_AY = 4.0
 
 MIN_SIDESLIP_SPEED = 1.0  # m/s, of a car with the wheelbase below or an unknown one
-REFERENCE_WHEELBASE = 2.7  # m
+REFERENCE_WHEELBASE = 2.7  # m, wheelbase of the car for which `MIN_SIDESLIP_SPEED` holds
 
 REFERENCES = {
     "vx": "vx_ref",
@@ -46,15 +46,15 @@ COVERAGE = {
 }  # number of standard deviations -> fraction of Gaussian errors within them
 
 POLYPHASE: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
-"""Preparation by which recordings come to another rate unless a model's training had another one.
-"""
+"""Preparation by which recordings are resampled unless a model was trained with another one."""
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public
 code).
 """
 
-_NAMES = {
+# unit -> names of metrics in it
+_METRICS = {
     "1": (
         *(
             "fvu",
@@ -85,7 +85,8 @@ _NAMES = {
     "m": ("lever_arm",),
     "s": ("train_seconds", "step_seconds"),
 }
-_OF_BANDS = {
+# unit, with a place for that of the quantity -> names of metrics of bands
+_BAND_METRICS = {
     "1": (
         "coverage_50",
         "coverage_68",
@@ -98,23 +99,26 @@ _OF_BANDS = {
     ),
     "{}": ("width_90", "interval_score", "crps"),  # in the unit of the quantity
 }
-UNITS: dict[str, str] = {name: unit for unit, names in _NAMES.items() for name in names}
+# name of a metric -> its unit
+UNITS: dict[str, str] = {name: unit for unit, names in _METRICS.items() for name in names}
 UNITS |= {
     f"{name}{suffix}": unit.format(of)
     for suffix, of in (("", "deg"), ("_vy", "m/s"))
-    for unit, names in _OF_BANDS.items()
+    for unit, names in _BAND_METRICS.items()
     for name in names
 }
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is scored, and when."""
+    """Rules of an evaluation: which samples are scored, and where estimates start."""
 
-    rate_hz: float = 20.0  # at which every estimate is read [Hz]; held, never interpolated
-    # how long before a range, or before each sequence, an estimator may start [s]
+    # rate of the times at which errors are taken [Hz]; an estimate is held, never interpolated
+    rate_hz: float = 20.0
+    # time before a range, or before each sequence, at which an estimator starts at the earliest [s]
     warm_up_seconds: float = 10.0
-    skip_seconds: float = 1.5  # start of each range, or of each sequence, that is not scored [s]
+    # time from the start of each range, or of each sequence, that is not scored [s]
+    skip_seconds: float = 1.5
     # ranges are cut, from their starts, into sequences of this length without overlap, in each of
     # which an estimate starts anew; a
     # remainder is left out [s]; None leaves ranges whole
@@ -131,8 +135,10 @@ class Protocol:
     min_sideslip_speed: float | dict[str, float] | None = None
 
     def with_wheelbases(self, wheelbases: Mapping[str, float | None]) -> Protocol:
-        """The protocol with a speed for every data set, by its car's wheelbase [m], None where that
-        is not known.
+        """The protocol with a `min_sideslip_speed` for every data set, by its car's wheelbase.
+
+        ``wheelbases`` is data set -> wheelbase [m], None where it is not known. Speeds that are set
+        stay.
         """
         declared_speed = self.min_sideslip_speed
         if not (declared_speed is None or isinstance(declared_speed, dict)):
@@ -148,8 +154,8 @@ class Protocol:
         return MIN_SIDESLIP_SPEED if speed is None else speed
 
     def describe_min_sideslip_speed(self, datasets: Iterable[str]) -> str:
-        """Speed from which on sideslip is scored on these data sets: ``1 m/s``, or ``1 m/s (mine),
-        0.35 m/s (f1)``.
+        """Text of the speed from which on sideslip is scored on these data sets: ``1 m/s``, or
+        ``1 m/s (mine), 0.35 m/s (f1)``.
         """
         speeds: dict[str, list[str]] = {}
         for dataset in dict.fromkeys(datasets):
@@ -171,12 +177,12 @@ class Protocol:
 
     @property
     def sets_elsewhere(self) -> frozenset[str]:
-        """Names in ``elsewhere``."""
+        """Names of the test sets in ``elsewhere``."""
         return frozenset(name.strip() for name in (self.elsewhere or "").split(",")) - {""}
 
     @property
     def piece(self) -> str:
-        """What an estimate is made of in one go, for people: ``range`` or ``sequence``."""
+        """Word for what is estimated in one go: ``range`` or ``sequence``."""
         return "range" if self.sequence_seconds is None else "sequence"
 
     @property
@@ -223,7 +229,7 @@ class Scored:
     is_sideslip_scored: BoolArray  # whether the car is fast enough (`Protocol.min_sideslip_speed`)
     # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     other_states: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    # covariance of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
     covariance: FloatArray | None = None
     covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
     # normalised innovation squared of the filter's update, where the method gives it
@@ -244,7 +250,7 @@ class Scored:
     @property
     def sideslip_error(self) -> FloatArray:
         """Estimate - reference of β within a half turn, (K,) [rad]; at all samples."""
-        return _turned(self.sideslip - self.sideslip_ref)
+        return _unwrap_once(self.sideslip - self.sideslip_ref)
 
     @property
     def is_sideslip_drawn(self) -> BoolArray:
@@ -255,30 +261,30 @@ class Scored:
         return self.is_sideslip_scored & (np.abs(self.sideslip_ref) <= 0.5 * np.pi)
 
     def at(self, chosen: BoolArray | slice) -> Scored:
-        """Lateral velocity and sideslip at some of the samples; without other states, covariances,
-        innovations and bands.
+        """Lateral velocity and sideslip (`SCORED_ARRAYS`) at the chosen samples; without other
+        states, covariances, innovations and bands.
         """
-        arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in SAMPLED}
+        arrays: dict[str, Any] = {name: getattr(self, name)[chosen] for name in SCORED_ARRAYS}
         return Scored(**arrays)
 
     @classmethod
     def joined(cls, parts: Sequence[Scored]) -> Scored:
         """Lateral velocity and sideslip at the samples of all parts, as `at` has them."""
         arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in SAMPLED
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in SCORED_ARRAYS
         }
         return cls(**arrays)
 
 
-SAMPLED = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay", "is_sideslip_scored")
+SCORED_ARRAYS = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay", "is_sideslip_scored")
 """Arrays that every `Scored` has."""
 
 
 def sequences(
     spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Span]:
-    """The stretches that estimates are made of: the ranges, or the sequences that they are cut
-    into.
+    """The segments of recordings that are estimated in one go: the ranges, or the sequences that
+    they are cut into.
 
     Parameters
     ----------
@@ -321,7 +327,8 @@ def sequences(
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol passes at the first sample of a range.
+    """Reference state at the first sample of a range, from which estimates start where the protocol
+    says so (`Protocol.initial_state`).
 
     Returns
     -------
@@ -351,12 +358,13 @@ def score_all(
     recording_of: Callable[[Span], Recording],
     protocol: Protocol,
 ) -> list[Scored]:
-    """Score a test set's estimates.
+    """Score a test set's estimates: a `Scored` for each range or sequence, in the order of
+    `sequences`.
 
     Parameters
     ----------
     estimate_of : callable
-        Place in the test set's `sequences` -> its estimate.
+        Index in the test set's `sequences` -> its estimate.
     spans : sequence of Span
         Ranges of the test set.
     recording_of : callable
@@ -545,7 +553,9 @@ def score_whole(
 
 
 def with_vy_ref(recording: Recording) -> Recording:
-    """The recording; with ``vy_ref`` made of ``sideslip_ref`` where it has only that."""
+    """The recording, with ``vy_ref`` computed from ``vx`` and ``sideslip_ref`` where it has only
+    these.
+    """
     channels = recording.channels.keys()
     if "vy_ref" in channels or not {"vx", "sideslip_ref"} <= channels:
         return recording
@@ -583,7 +593,9 @@ def moves_forward(vy: FloatArray, sideslip: FloatArray, min_speed: float) -> Boo
 
 
 def _require_all(values: FloatArray, problem: str, span: Span) -> None:
-    """Raise `DataError` where a value is NaN; ``problem`` begins the message."""
+    """Raise `DataError` if a value is NaN; the message begins with ``problem`` and names the
+    range.
+    """
     missing = int(np.isnan(values).sum())
     if missing:
         raise DataError(
@@ -593,7 +605,7 @@ def _require_all(values: FloatArray, problem: str, span: Span) -> None:
 
 
 def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
-    """Metrics over all parts together.
+    """Metrics of the errors over all parts (ranges or sequences of a test set) together.
 
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023,
     Section VIII); ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024)
@@ -638,7 +650,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Sizes of errors of vx, vy and yaw rate, times `WEIGHTS`, summed.
+    """Sum over vx, vy and yaw rate of `WEIGHTS` times the size of the error, for each sample.
 
     Parameters
     ----------
@@ -650,7 +662,7 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
     Returns
     -------
     FloatArray
-        Shape (K,).
+        Weighted sums, (K,).
 
     Raises
     ------
@@ -671,9 +683,10 @@ def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> F
 
 
 def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
-    """Figures of the states beside the lateral velocity that all parts have estimates of.
+    """Metrics of the states other than the lateral velocity that all parts have estimates of: name
+    -> value.
 
-    The weighted ones are there only where all states of `WEIGHTS` are.
+    The weighted metrics are there only where all states of `WEIGHTS` are.
     """
     common = set.intersection(*(set(part.errors) for part in parts))
     figures = {
@@ -693,10 +706,11 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
-    """Figures of the estimated covariances and innovations; each only where all parts have them.
+    """Metrics of the consistency of estimated covariances and innovations, name -> value; each only
+    where all parts have them.
 
-    ``nees`` and the coverages are over all states whose covariance is estimated, and of the lateral
-    velocity, respectively.
+    ``nees`` is over all states whose covariance is estimated, the coverages are of the lateral
+    velocity.
     """
     figures = {}
     kinds = {part.covariance_of for part in parts}
@@ -787,13 +801,13 @@ def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
     return float(np.mean(np.square(errors) <= n_sigma**2 * variance))
 
 
-def _turned(angle: FloatArray) -> FloatArray:
-    """The same angle within a half turn [rad]: a car that slides backwards is not a full turn
-    off.
+def _unwrap_once(angle: FloatArray) -> FloatArray:
+    """Differences of angles [rad] with those beyond ±π brought within: an estimate near 180° is not
+    a full turn off a reference near -180°.
     """
-    return np.where(np.abs(angle) > np.pi, half_turned(angle), angle)
+    return np.where(np.abs(angle) > np.pi, wrap_to_half_turn(angle), angle)
 
 
-def half_turned(angle: FloatArray) -> FloatArray:
-    """The same angle from -π up to π [rad]."""
+def wrap_to_half_turn(angle: FloatArray) -> FloatArray:
+    """Angle within [-π, π), equal to the given one but for whole turns [rad]."""
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi

@@ -25,24 +25,24 @@ from vehest.evaluation.significance import (
 from vehest.trust.bands import effective_blocks
 
 Name = tuple[str, str]  # estimator and variant
-
+# whether the RMSE of the first of two estimators is significantly lower or higher
 Verdict = Literal["lower", "higher", "no significant difference"]
-BASELINES = ("zero", "static_map")
+BASELINES = ("zero", "static_map")  # estimators that a recommended one has to beat
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """RMSE of one estimator less that of another, over all seeds of both."""
+    """RMSE(β) of a first estimator less that of a second, over all seeds of both."""
 
-    difference: float  # first - second
+    difference: float  # first - second, in the unit of the RMSE
     low: float  # lower end of its interval, corrected by Holm over all comparisons of the table
-    high: float  # its upper end
-    p_value: float  # adjusted likewise
+    high: float  # upper end of the interval
+    p_value: float  # two-sided, corrected likewise
     verdict: Verdict  # whether the first lies significantly lower or higher than the second
 
     @property
     def reversed(self) -> Comparison:
-        """The second less the first."""
+        """The comparison with first and second swapped."""
         verdict: Verdict = (
             "higher"
             if self.verdict == "lower"
@@ -55,14 +55,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Ranking:
-    """What a test set says of a number of estimators."""
+    """Order of several estimators on a test set by RMSE(β) [deg], with the comparisons of pairs."""
 
-    order: Sequence[Name]  # by RMSE over all seeds, the lowest first
-    rmse: Mapping[Name, float]  # over all seeds of each
-    intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
+    order: Sequence[Name]  # names by RMSE over all seeds, the lowest first
+    rmse: Mapping[Name, float]  # RMSE(β) over all seeds of each [deg]
+    # 95 % interval of the RMSE over blocks and seeds [deg]
+    intervals: Mapping[Name, tuple[float, float]]
     # (first, second) -> comparison, of every pair that was compared, either way round
     pairs: Mapping[tuple[Name, Name], Comparison]
-    n_blocks: int  # resampled blocks; no intervals and comparisons below `MIN_BLOCKS`
+    n_blocks: int  # number of blocks; below `MIN_BLOCKS` there are no intervals and comparisons
     block_seconds: float  # mean time in a block at which sideslip is scored [s]
     # Kish's effective number of blocks, by the squared error of the best estimator
     effective_blocks: float
@@ -91,8 +92,8 @@ class Ranking:
 
     @property
     def winner(self) -> Name | None:
-        """The one that may be called best: below every other candidate, `zero` and `static_map`,
-        each by more than chance.
+        """The estimator with an RMSE significantly below that of every other and of both baselines;
+        None if there is none, a baseline was not compared, or blocks are too few.
         """
         if (
             self.n_blocks < MIN_BLOCKS
@@ -112,8 +113,8 @@ class Ranking:
 
     @property
     def recommendable(self) -> list[Name]:
-        """The best and those without a significant difference to it, as far as they beat every
-        baseline significantly.
+        """The estimator with the lowest RMSE and those without a significant difference to it,
+        except those that do not beat every baseline significantly.
         """
         if not self.order:
             return []
@@ -125,7 +126,9 @@ class Ranking:
 
     @property
     def tied_with_best(self) -> list[Name]:
-        """Those without a significant difference to the best."""
+        """Estimators, in order, without a significant difference to the one with the lowest
+        RMSE.
+        """
         comparisons = [(name, self.pairs.get((self.order[0], name))) for name in self.order[1:]]
         return [
             name
@@ -139,8 +142,8 @@ def rank(
     rate_hz: float,
     claimed_pairs: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Compare estimators on one test set by RMSE(β); without an order, and with NaN, where sideslip
-    is scored at no sample.
+    """Compare estimators on one test set by RMSE(β). Where sideslip is scored at no sample, the
+    ranking has no order, and NaN as RMSE.
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their
     own (`differences_of_blocks`). Corrected together by Holm are: the best against every other,
@@ -149,7 +152,9 @@ def rank(
     Parameters
     ----------
     segments : Mapping[Name, Sequence[Segments]]
-        Of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].
+        Estimator and variant -> segments of each seed, all over the same samples.
+    rate_hz : float
+        Rate of these samples [Hz].
     claimed_pairs : Sequence[tuple[Name, Name]], default ()
         Further pairs to compare, such as those whose order a paper claims; left out where one of
         the two is missing.
@@ -205,8 +210,8 @@ def rank(
 def _pairs(
     order: Sequence[Name], claimed_pairs: Sequence[tuple[Name, Name]]
 ) -> list[tuple[Name, Name]]:
-    """The best with every other, every candidate with every baseline, and claimed pairs; each pair
-    once.
+    """Pairs to compare: the best with every other, every candidate with every baseline, and the
+    claimed pairs; each pair once.
     """
     pairs = [(order[0], second) for second in order[1:]]
     pairs += [
@@ -222,8 +227,8 @@ def _pairs(
 
 
 def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
-    """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is
-    tested.
+    """Comparisons of pairs of losses (`differences_of_blocks`) with Holm's correction: each
+    interval is at the level at which its hypothesis is tested.
     """
     differences = differences_of_blocks(pairs, sizes)
     adjusted = holm([difference.p_value for difference in differences])

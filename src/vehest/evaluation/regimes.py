@@ -28,7 +28,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
-Mask = NDArray[np.bool_]
+Mask = NDArray[np.bool_]  # (K,), one value for each scored sample
 
 STRAIGHT_YAW_RATE = 0.05  # rad/s; a car that turns more slowly drives straight ahead
 AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s², limits of the bands of |ay|
@@ -36,7 +36,7 @@ AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s², limits of the bands of |ay|
 TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}
 SLOPE_SECONDS = 0.5  # s around a sample; the slope of a line through them is its rate of change
 MIN_REGIME_SECONDS = 2.0  # s of samples in a regime; with less it has no errors
-METRICS = ("rmse_vy", "rmse_sideslip")
+METRICS = ("rmse_vy", "rmse_sideslip")  # metrics that are split by regime
 
 AY_BANDS = {
     f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high)
@@ -46,17 +46,18 @@ AY_BANDS = {
 [m/s²].
 """
 
-REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
+# names of the regimes, in the order of tables
+REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
 
 
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:
-    """Which scored samples of a range lie in which regime.
+    """Masks of the scored samples of a range that lie in each regime.
 
     Returns
     -------
     dict[str, Mask]
-        Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration
-        no bands, without both none.
+        Regime -> mask, (K,); without yaw rate neither straight nor turning, without lateral
+        acceleration no bands, without both none.
     """
     first, end = scored_range(reference, span, protocol)
     margin = math.ceil(SLOPE_SECONDS * reference.rate_hz)
@@ -99,7 +100,7 @@ def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def filled(samples: FloatArray) -> FloatArray:
-    """The same with straight lines over gaps (NaN), and zeros where nothing is known."""
+    """Samples with straight lines over gaps (NaN); zeros where no sample is finite."""
     is_finite = np.isfinite(samples)
     if is_finite.all():
         return samples
@@ -112,8 +113,8 @@ def filled(samples: FloatArray) -> FloatArray:
 
 
 def is_represented(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
-    """Whether every range tells a regime, and it has `MIN_REGIME_SECONDS` of samples in all, at
-    ``rate_hz`` [Hz].
+    """Whether every range has the channels that a regime needs, and `MIN_REGIME_SECONDS` of samples
+    at ``rate_hz`` [Hz] lie in it in all.
     """
     return all(regime in mask for mask in masks) and is_long_enough(
         [mask[regime] for mask in masks], rate_hz
@@ -130,14 +131,14 @@ def is_long_enough(chosen: Sequence[Mask], rate_hz: float) -> bool:
 def errors_by_regime(
     parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float
 ) -> dict[str, dict[str, float]]:
-    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at
-    ``rate_hz`` [Hz].
+    """Errors by regime over all parts together, with samples at ``rate_hz`` [Hz].
 
     Returns
     -------
     dict[str, dict[str, float]]
-        Only regimes that every part tells, and of which there are `MIN_REGIME_SECONDS` of samples;
-        RMSE(β) is NaN where it is scored at fewer.
+        Regime -> metric -> value, for `METRICS` and ``share``, the share of the samples that lie in
+        it; only regimes that are represented (`is_represented`). RMSE(β) is NaN where sideslip is
+        scored at too few samples of the regime.
     """
     total = sum(len(part.time) for part in parts)
     figures_of = {}

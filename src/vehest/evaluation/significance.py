@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
+# sums of losses of two estimators that are compared, (S, B) and (S', B): a row for each seed, a
+# column for each block
 Pair = tuple[FloatArray, FloatArray]
 
 CONFIDENCE = 0.95  # level of all intervals; 1 - CONFIDENCE is that of tests
@@ -27,17 +29,17 @@ DRAWN_AT_ONCE = 2_000_000  # block counts of resamples that are in memory at onc
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure, or a difference first - second, and how well it is known."""
+    """A figure, or a difference first - second, with its interval and test."""
 
     value: float  # the figure; of a difference, negative where the first has the lower loss
     low: float  # lower end of the 95 % interval
-    high: float  # its upper end
+    high: float  # upper end
     p_value: float  # two-sided, of no difference; below 0.05 where the interval excludes 0
     error: float = 0.0  # standard error
     dof: float = np.inf  # degrees of freedom of Student's t
 
     def at(self, confidence: float) -> tuple[float, float]:
-        """Both ends at another confidence than 95 %."""
+        """Lower and upper end of the interval at another confidence than 95 %."""
         half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
         return self.value - half, self.value + half
 
@@ -62,7 +64,8 @@ def differences_of_blocks(
     Parameters
     ----------
     pairs : Sequence[Pair]
-        Sum of the losses of each seed over each block, shape (S, B) and (S', B), none negative.
+        Two estimators each: sum of the losses of each seed over each block, (S, B) and (S', B),
+        none negative.
     sizes : FloatArray
         Samples in each block, shape (B,).
 
@@ -88,8 +91,8 @@ def differences_of_blocks(
 def root_intervals(
     candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000
 ) -> list[Interval]:
-    """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared
-    errors, with its interval.
+    """The square root of each estimator's mean loss over blocks and seeds, an RMSE where losses are
+    squared errors, with its interval.
 
     Blocks and seeds are drawn as in `differences_of_blocks`; the interval is symmetric on a
     logarithmic axis, on which the distribution of a root of few blocks is less skewed.
@@ -124,20 +127,20 @@ def unexplained_interval(
     n_resamples: int = 4000,
 ) -> Interval:
     """The fraction of variance unexplained with its interval, as `root_intervals`; all arguments
-    are sums over blocks, (B,).
+    are sums over the samples of each block, (B,).
 
     Parameters
     ----------
     squared_error : FloatArray
-        Of (v̂ - v)².
+        Sums of (v̂ - v)².
     error : FloatArray
-        Of v̂ - v.
+        Sums of v̂ - v.
     squared : FloatArray
-        Of v².
+        Sums of v².
     reference : FloatArray
-        Of v.
+        Sums of v.
     sizes : FloatArray
-        Samples.
+        Numbers of samples.
     """
     drawn = _counts(len(sizes), n_resamples, np.random.default_rng(0))
 
@@ -190,19 +193,20 @@ class Contrast:
         return max(total**2 / spread, 1.0)
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
-        """Both ends of the interval."""
+        """Lower and upper end of the interval of ``value`` at a confidence."""
         half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
         return self.value - half, self.value + half
 
     @property
     def p_value(self) -> float:
-        """Two-sided, of the hypothesis that ``value`` is zero."""
+        """Two-sided p-value of the hypothesis that the true value is zero."""
         if self.error == 0:
             return 0.0 if self.value else 1.0
         return 2.0 * float(scipy.special.stdtr(self.dof, -abs(self.value) / self.error))
 
     def power(self, true_value: float, level: float = 1.0 - CONFIDENCE) -> float:
-        """Probability that the two-sided test at ``level`` finds ``true_value``, on its side.
+        """Probability that the two-sided test at ``level`` rejects zero in the right direction if
+        the true value is ``true_value``.
 
         From the noncentral t distribution (Johnson, Kotz & Balakrishnan, Continuous univariate
         distributions 2, 1995, chapter 31).
@@ -214,7 +218,9 @@ class Contrast:
         return 1.0 - float(scipy.special.nctdtr(self.dof, noncentrality, critical))
 
     def with_blocks(self, n_blocks: int) -> Contrast:
-        """The same contrast as it would be with ``n_blocks`` blocks of this kind."""
+        """The contrast that ``n_blocks`` blocks of this kind would give: the same value, with the
+        variance by blocks scaled.
+        """
         (variance, _), *of_seeds = self.parts
         of_blocks = (variance * self.n_blocks / n_blocks, n_blocks - 1.0)
         return Contrast(self.value, (of_blocks, *of_seeds), n_blocks)
@@ -222,7 +228,8 @@ class Contrast:
     def blocks_needed(
         self, true_value: float, power: float, level: float = 1.0 - CONFIDENCE
     ) -> int | None:
-        """Fewest blocks with which the test at ``level`` finds ``true_value`` with ``power``.
+        """Smallest number of blocks with which the test at ``level`` detects ``true_value`` with
+        the probability ``power``.
 
         Returns
         -------
@@ -251,9 +258,9 @@ def mean_contrast(
 ) -> Contrast:
     """Mean over blocks and seeds, or the difference of two such means over the same blocks.
 
-    Values of seed s and block b are mu + a_s + b_b + e_sb. The variance of the mean over blocks has
-    the parts of b and e in it, that of the mean over seeds the parts of a and e: the latter is
-    reduced by the mean square of e, so that e is not counted twice.
+    The value of seed s and block b is modelled as mu + a_s + b_b + e_sb. The variance of the mean
+    over blocks has the parts of b and e in it, that of the mean over seeds the parts of a and e:
+    the latter is reduced by the mean square of e, so that e is not counted twice.
 
     Parameters
     ----------
@@ -331,15 +338,15 @@ def log_ratio_of_pooled(
 
 @lru_cache(maxsize=4)
 def _counts_of_ratios(n_blocks: int) -> FloatArray:
-    """`_counts`, which are the same for all ratios over as many blocks and take longer than the
-    rest.
+    """`_counts` of the resamples for `log_ratio_of_pooled`, cached, since they are the same for all
+    ratios over as many blocks.
     """
     return _counts(n_blocks, N_RESAMPLES_OF_RATIOS, np.random.default_rng(0))
 
 
 def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
-    """Variance of the mean of (S, B) by its seeds beyond that by single values, and its degrees of
-    freedom.
+    """Part of the variance of the mean of ``values`` (S, B) that is due to the seeds alone, with
+    its degrees of freedom; empty for one seed, or where single values explain all of it.
     """
     n_seeds, n_blocks = values.shape
     if n_seeds < 2:
@@ -356,8 +363,8 @@ def _variance_of_seeds(values: FloatArray) -> list[tuple[float, float]]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p-values adjusted for their number: those below 0.05 hold together with an error of at
-    most 5 %.
+    """p-values adjusted for their number by Holm's method: with a probability of 95 % or more none
+    of the hypotheses rejected at 0.05 is true.
 
     Source: Holm, Scandinavian Journal of Statistics 6 (2), 1979.
     """
@@ -371,7 +378,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:
-    """How often each block is drawn, (n, n_blocks): n_blocks - 1 draws with replacement."""
+    """Number of times that each block is drawn, (n, n_blocks): n_blocks - 1 draws with
+    replacement.
+    """
     counts: FloatArray = generator.multinomial(
         n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n
     ).astype(np.float64)
@@ -379,9 +388,11 @@ def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray
 
 
 def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> FloatArray:
-    """Differences of the roots of mean losses of each resample, (pairs, n_resamples).
+    """Differences of the roots of mean losses, first - second, of each resample, (pairs,
+    n_resamples).
 
-    Pairs of as many seeds share their draws, which are those of each pair alone.
+    Pairs with the same numbers of seeds share their draws, so that the result of a pair does not
+    depend on the others.
     """
     at_once = max(DRAWN_AT_ONCE // len(sizes), 1)
     drawn = np.empty((len(pairs), n_resamples))
@@ -407,8 +418,8 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
 
 
 def _degrees_of_freedom(pair: Pair, sizes: FloatArray) -> float:
-    """Welch-Satterthwaite over the variance between blocks and that between seeds of either
-    estimator.
+    """Degrees of freedom of a difference by Welch and Satterthwaite, from the variance between
+    blocks and that between seeds of either estimator.
     """
     means = [sums.sum(axis=1) / sizes.sum() for sums in pair]
     n_blocks = len(sizes)
@@ -439,7 +450,9 @@ def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
 
 
 def _logarithmic(value: float, drawn: FloatArray, dof: float) -> Interval:
-    """Of a positive figure, symmetric on a logarithmic axis."""
+    """Interval of a positive figure that is symmetric on a logarithmic axis, from the spread of the
+    values that were drawn; without a p-value (NaN).
+    """
     finite = drawn[np.isfinite(drawn) & (drawn > 0)]
     error = float(np.std(np.log(finite / value)))
     factor = float(np.exp(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0) * error))

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
-from vehest.evaluation.metrics import Scored, half_turned
+from vehest.evaluation.metrics import Scored, wrap_to_half_turn
 
 SETTLED_SECONDS = 3.0  # s after the end of a fault, from which on samples count as `after`
-FAULTED = "faulted"
-AFTER = "after"
+FAULTED = "faulted"  # name of the subset of samples while a fault lasts
+AFTER = "after"  # name of the subset of samples after a fault
 
 UNITS = {
     "rmse_sideslip": "deg",
@@ -39,7 +39,7 @@ UNITS = {
 }
 """Metrics under a fault, with units."""
 
-_CLOCK = 1e-6  # s, within which times are the same
+_CLOCK = 1e-6  # s, tolerance within which two times are equal
 
 Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
 Flags = tuple[
@@ -50,7 +50,10 @@ Flags = tuple[
 def errors_under_fault(
     parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]
 ) -> dict[str, dict[str, float]]:
-    """Subset -> metric -> value, over all parts together; a subset without samples is left out.
+    """Errors while faults last and after them, with the errors of the same samples without the
+    fault (``…_nominal``): subset -> metric -> value, over all parts together.
+
+    A subset without samples is left out.
 
     Parameters
     ----------
@@ -58,7 +61,9 @@ def errors_under_fault(
         Estimate under the fault and reference, of each range or sequence; an infinite estimate is a
         sideslip of 90° and an infinite error of the lateral velocity.
     nominal : Sequence[Scored]
-        The same without the fault.
+        The same ranges without the fault.
+    windows : Sequence[Window]
+        Start and end of the fault in each part [s].
     """
     figures = {}
     pairs = list(zip(parts, windows, strict=True))
@@ -77,8 +82,7 @@ def errors_under_fault(
 def flags_under_fault(
     parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float
 ) -> dict[str, float]:
-    """Whether bands contain the error and faults are flagged while they last, over all parts
-    together, at ``rate_hz`` [Hz].
+    """Metrics of bands and health flags while faults last, name -> value, over all parts together.
 
     Errors count where sideslip is scored, flags at all samples.
 
@@ -93,9 +97,11 @@ def flags_under_fault(
     parts : sequence of Scored
         Ranges or sequences that were scored.
     flagged : sequence of Flags
-        Of each the half width of the band [rad], NaN without, and its health, 0 where it is valid.
+        Half width of the band [rad], NaN without one, and health (0: valid) of each part, (K,).
     windows : sequence of Window
-        Of each first and end time of the fault [s].
+        Start and end of the fault in each part [s].
+    rate_hz : float
+        Rate of the samples [Hz].
     """
     inside = []
     valid = []
@@ -103,7 +109,7 @@ def flags_under_fault(
     undetected = []
     for part, (band, health), window in zip(parts, flagged, windows, strict=True):
         during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
-        error = half_turned(part.sideslip - part.sideslip_ref)
+        error = wrap_to_half_turn(part.sideslip - part.sideslip_ref)
         error[~part.is_sideslip_scored] = np.nan
         has_band = during & np.isfinite(band) & part.is_sideslip_scored
         inside.append((np.abs(error) <= band)[has_band])
@@ -132,8 +138,8 @@ def flags_under_fault(
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
-    """Errors over the samples that masks select of all parts: of the sideslip [deg] and of the
-    lateral velocity [m/s].
+    """RMSE and largest error of the sideslip [deg] and RMSE of the lateral velocity [m/s], metric
+    -> value, over the samples that masks select of all parts.
 
     Sideslip is NaN where none of these samples counts for it; its error is turned into ±180°.
     """

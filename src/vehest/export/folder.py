@@ -34,10 +34,11 @@ from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
 from vehest.version import __version__
 
-PRECISIONS = get_args(Precision)
-MIN_ROUNDINGS = 8.0  # roundings of a float, that a channel's innovations have to exceed
+PRECISIONS = get_args(Precision)  # number types in C
+# smallest standard deviation of a channel's innovations, in roundings of a float of its size
+MIN_ROUNDINGS = 8.0
 EXPORT_MARKER = "vehest_estimator.h"
-"""The file that shows a folder to be an export."""
+"""File by which a folder is recognised as an export."""
 FILES = frozenset(
     {
         f"vehest_{part}.{ending}"
@@ -55,7 +56,7 @@ FILES = frozenset(
         "sizes",
     }
 )
-"""All that an export and its Makefile write."""
+"""Names of all files that an export and its Makefile write."""
 
 
 def export_model(

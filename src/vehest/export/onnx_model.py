@@ -19,7 +19,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.estimators.base import Estimator
 from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
-from vehest.estimators.networks.sample_network import STEEPEST
+from vehest.estimators.networks.sample_network import MAX_SIDESLIP
 from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.sideslip_ffnn import SideslipFfnn
@@ -30,7 +30,7 @@ from vehest.training.members import prepare
 OPSET = 18
 """Version of the ai.onnx operators."""
 
-_UNITS = {"vy": "m/s", "vx": "m/s", "yaw_rate": "rad/s", "sideslip": "rad"}
+_UNITS = {"vy": "m/s", "vx": "m/s", "yaw_rate": "rad/s", "sideslip": "rad"}  # output -> unit
 
 
 def write_onnx(estimator: Estimator, path: str | Path) -> None:
@@ -141,13 +141,15 @@ class _WindowStep(_Step):
         )
 
     def forward(self, sample: Tensor, window: Tensor) -> tuple[Tensor, ...]:
-        """Sample (C,) and window (N, C) to vy () and the next window."""
+        """Map sample (C,) and window (N, C) to vy () and the next window."""
         window = torch.cat([window[1:], sample.unsqueeze(0)])
         return self.network(prepare(self.network, window)) + 0.0 * window.sum(), window
 
 
 class _VelocityStep(_Step):
-    """By the cells of the recurrent layers, since onnxruntime has layers in float only."""
+    """Base of the steps of velocity networks: by the cells of the recurrent layers, since
+    onnxruntime has layers in float only.
+    """
 
     def __init__(self, estimator: RecurrentVelocityEstimator, **starts: int) -> None:
         s = estimator.settings
@@ -170,7 +172,7 @@ class _VelocityStep(_Step):
 class _GruStep(_VelocityStep):
     """Step of `VelocityGruNetwork`, with the hidden state ``h`` (H,)."""
 
-    slope: Tensor
+    slope: Tensor  # slope of the velocities' activation (PReLU) below zero, (1,)
 
     def __init__(self, estimator: VelocityGru) -> None:
         super().__init__(estimator, h=estimator.settings.n_states)
@@ -179,7 +181,7 @@ class _GruStep(_VelocityStep):
         )
 
     def forward(self, sample: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-        """Sample (C,) and hidden state to velocities () and the next hidden state."""
+        """Map sample (C,) and hidden state to velocities () and the next hidden state."""
         x, *weights = self._driven(sample)
         h = torch.gru_cell(x, h[None], *weights)[0]
         return *self._velocities(nn.functional.prelu(self.network.read_out(h), self.slope)), h
@@ -193,7 +195,7 @@ class _LstmStep(_VelocityStep):
     measured, 0 for the lateral one.
     """
 
-    is_measured: Tensor
+    is_measured: Tensor  # 1 for each output that is a measured channel, else 0
 
     def __init__(self, estimator: VelocityLstm) -> None:
         s = estimator.settings
@@ -208,7 +210,7 @@ class _LstmStep(_VelocityStep):
     def forward(
         self, sample: Tensor, h: Tensor, c: Tensor, y: Tensor, started: Tensor
     ) -> tuple[Tensor, ...]:
-        """Sample (C,) and states to velocities () and the next states."""
+        """Map sample (C,) and states to velocities () and the next states."""
         first = (
             sample[self.measured] * self.is_measured - self.network.output_mean
         ) / self.network.output_scale
@@ -222,21 +224,22 @@ class _LstmStep(_VelocityStep):
 
 
 class _SampleStep(_Step):
-    """`SampleNetwork` layer by layer, and v = u tan β."""
+    """Step of `SampleNetwork`, layer by layer, and v = u tan β."""
 
     def __init__(self, estimator: SideslipFfnn) -> None:
         super().__init__(estimator.network, ("vy", "sideslip"), {})
         self.speed = estimator.channels.index("vx")
 
     def forward(self, sample: Tensor) -> tuple[Tensor, ...]:
-        """Sample (C,) to vy () [m/s] and sideslip () [rad]; there is no state."""
+        """Map sample (C,) to vy () [m/s] and sideslip () [rad]; there is no state."""
         w1, b1, w2, b2, w3, b3 = (parameter[0] for parameter in self.network.parameters())
         hidden = torch.relu(torch.relu(self.network.scaled(sample) @ w1 + b1) @ w2 + b2)
-        sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-STEEPEST, STEEPEST)
+        sideslip = ((hidden @ w3 + b3)[0] * self.network.unit).clamp(-MAX_SIDESLIP, MAX_SIDESLIP)
         # onnxruntime has no Tan of double
         return sample[self.speed] * torch.sin(sideslip) / torch.cos(sideslip), sideslip
 
 
+# family -> class of its step
 _STEPS: dict[str, Any] = {
     "ksnn": _WindowStep,
     "gru": _WindowStep,
@@ -245,4 +248,4 @@ _STEPS: dict[str, Any] = {
     "velocity_lstm": _LstmStep,
     "sideslip_ffnn": _SampleStep,
 }
-NETWORKS = tuple(_STEPS)
+NETWORKS = tuple(_STEPS)  # families that can be written as ONNX

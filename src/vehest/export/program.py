@@ -52,9 +52,10 @@ from vehest.trust.named_arrays import views
 from vehest.trust.tyre_check import FRICTION_SLIP
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
-"""Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
-NEVER = "UINT32_MAX"
-MAX_RATIO_DENOMINATOR = 1_000_000  # of the ratio of rates
+"""Precision -> largest difference of the outputs of the test vectors from Python's [m/s, rad]."""
+NEVER = "UINT32_MAX"  # C literal of a run length that is never reached
+MAX_RATIO_DENOMINATOR = 1_000_000  # largest denominator of the ratio of rates
+# names of constants of `vehest.trust.health_kernel` that the templates use
 HEALTH_CONSTANTS = (
     *("PLAUSIBLE", "CLIP", "STEP_CLIP", "CALM", "CAP", "INVALID", "CLEAR"),
     *("BRAKING", "SLIPPING", "LOST", "REVERSED", "HOLDS", "LARGER", "SLIDE_SECONDS"),
@@ -62,16 +63,17 @@ HEALTH_CONSTANTS = (
     *("FREE", "MISSING", "FROZEN", "HELD", "JUMP", "OFFSET", "SIGN", "UNIT", "CONTRADICTION"),
     *("OUTSIDE", "SPIN", "LOCKED", "DROPOUT"),
 )
+# names of constants of `vehest.trust.verdict` that the templates use
 VERDICT_CONSTANTS = ("BAND_FACTORS", "WIDEST", "NO_ESTIMATE", "BEYOND_SPEED", "TOO_WIDE")
 CLOCK_CONSTANTS = (
     *("CLOCK_STOPPED", "CLOCK_JUMPED", "CLOCK_UNEVEN", "REPEATED", "STOPPED", "EVEN_INTERVALS"),
     *("MIN_ADVANCE", "FAULT_SECONDS", "RECOVERY_SECONDS", "RESET_SECONDS"),
 )
-"""Constants of the modules of `vehest.trust` that the templates have."""
+"""Names of constants of `vehest.trust.clock` that the templates use."""
 
 
 def brief(value: float) -> str:
-    """A number as people write it, with a decimal point."""
+    """Text of a number with a decimal point, up to twelve digits."""
     text = f"{value:.12g}"
     return text if any(c in text for c in ".en") else f"{text}.0"
 
@@ -126,7 +128,7 @@ def exportable() -> tuple[str, ...]:
 
 
 def channels_of(estimator: Estimator) -> list[tuple[str, str]]:
-    """Channels that an estimator reads, each with its meaning."""
+    """Channels that an estimator reads: name and meaning of each, in ASCII."""
     return [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels]
 
 
@@ -229,7 +231,8 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
 
 
 def guard_table(guard: Guard) -> dict[str, Any]:
-    """Limits of each channel, longest runs, bridged samples, and samples that confirm a new level.
+    """Limits of each channel, longest runs, bridged samples, and samples that confirm a new level,
+    for the template.
 
     A row of limits is low, high, jump, lower and upper stop.
 
@@ -246,12 +249,12 @@ def guard_table(guard: Guard) -> dict[str, Any]:
 
 
 def _endless(values: FloatArray) -> FloatArray:
-    """The same with infinity instead of the numbers that represent it."""
+    """The values with infinity in place of `ENDLESS`."""
     return np.where(np.abs(values) >= ENDLESS, np.copysign(np.inf, values), values)
 
 
 def front_end_table(front: FrontEnd) -> dict[str, Any]:
-    """Sections of the low-pass, and of how many samples how many rows are made.
+    """Sections of the low-pass, and the ratio of rates, for the template.
 
     The ratio of the rates is the nearest fraction with a denominator of at most
     `MAX_RATIO_DENOMINATOR`: ``of`` rows are made of ``every`` samples.

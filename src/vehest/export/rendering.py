@@ -21,14 +21,16 @@ from vehest.data.errors import ConfigurationError
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-Precision = Literal["double", "float"]
+Precision = Literal["double", "float"]  # number type of ``vehest_real`` in C
 
-MAX_FLOAT = float(np.finfo(np.float32).max)
-MIN_FLOAT = float(np.finfo(np.float32).tiny)
+MAX_FLOAT = float(np.finfo(np.float32).max)  # largest float32
+MIN_FLOAT = float(np.finfo(np.float32).tiny)  # smallest normal float32
 MAX_TABLE_COLUMNS = 110  # characters of a line of a table
-_COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
+_COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)  # matches a comment of C
+# matches a floating literal without suffix
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
-_BLANK = re.compile(r"\n{3,}")
+_BLANK = re.compile(r"\n{3,}")  # matches more than one empty line
+# character -> its replacement in ASCII
 _ASCII = {
     "²": "^2",
     "³": "^3",
@@ -108,7 +110,7 @@ def literal(value: float, precision: Precision) -> str:
 
 
 def limit(value: float, precision: Precision) -> str:
-    """A literal of a number that may be infinite.
+    """C literal of a number that may be infinite.
 
     What a float cannot hold becomes infinite or 0.
     """

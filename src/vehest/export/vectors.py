@@ -24,8 +24,9 @@ from vehest.export.program import health_table
 from vehest.trust.contract import GuardedStepper
 
 DRIVE_SECONDS = 12.0  # s, length of the drive that test vectors are made of
+# names of the outputs, columns of the expected values
 COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
-RADIUS = 0.3  # m, of a wheel where nothing was fitted
+RADIUS = 0.3  # m, radius of a wheel where nothing was fitted
 
 
 def replayed(
@@ -53,7 +54,7 @@ def replayed(
 
 
 def in_float64(estimator: Estimator) -> Estimator:
-    """The same estimator with weights in float64, also where it was trained in float32.
+    """The estimator with weights in float64, also where it was trained in float32.
 
     The expected outputs are then as exact as C in double.
     """
@@ -100,7 +101,8 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
 
 
 def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]:
-    """Swerves at a varying speed with noise that is the same on every machine.
+    """Channels of a drive of swerves at a varying speed, (T,) each, with noise that is the same on
+    every machine.
 
     They are as large as 0.3 of the largest values in training.
     """
@@ -130,7 +132,7 @@ def _motion(stepper: GuardedStepper, times: FloatArray) -> dict[str, FloatArray]
 
 
 def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
-    """Largest and usual values of channels in training.
+    """Largest and usual magnitudes of channels in training, each by name.
 
     Round ones of a passenger car where nothing was fitted.
     """
@@ -156,7 +158,7 @@ def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]
 
 
 def _noise(n: int, seed: int) -> FloatArray:
-    """Uniform between -1 and 1, (n,), by a linear congruential generator.
+    """Noise, uniform between -1 and 1, (n,), by a linear congruential generator.
 
     Source: Numerical Recipes, 2007, Section 7.1.
     """

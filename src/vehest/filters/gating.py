@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numba
 
-PATIENCE = 0.5  # s
+PATIENCE = 0.5  # s, time for which a measurement is refused before its gate opens
 
 
 class Gate(NamedTuple):
-    """When a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y - ŷ.
+    """Rule by which a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y -
+    ŷ.
 
     That is the chi-square test of the normalised innovation squared with one degree of freedom,
     measurement by measurement, so that a sensor that fails takes no other one with it. What is
@@ -32,7 +33,7 @@ class Gate(NamedTuple):
 
     @classmethod
     def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:
-        """A gate that opens again after 0.5 s; none: no gate.
+        """A gate that opens again after `PATIENCE`; None without ``deviations``.
 
         Parameters
         ----------

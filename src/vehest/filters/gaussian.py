@@ -15,10 +15,10 @@ Array = TypeVar("Array", "Tensor", NDArray[np.float64])
 
 
 class Gaussian(NamedTuple, Generic[Array]):
-    """A normal distribution of a state, or one a sample."""
+    """Normal distribution of a state, or of a state at each of several samples."""
 
-    mean: Array  # (..., n)
-    covariance: Array  # (..., n, n), symmetric
+    mean: Array  # mean, (..., n)
+    covariance: Array  # covariance, (..., n, n), symmetric
 
 
 class Filtered(NamedTuple, Generic[Array]):
@@ -29,7 +29,7 @@ class Filtered(NamedTuple, Generic[Array]):
     filtered: Gaussian[Array]  # state at each sample after its measurement
     # measurement minus what was expected of it, (..., T, m); 0 where nothing was measured
     innovation: Array
-    # (..., T, m, m); rows and columns of what was not measured are those of the identity, so that
-    # eᵀS⁻¹e counts what was measured only
+    # covariance S of the innovation, (..., T, m, m); rows and columns of what was not measured are
+    # those of the identity, so that eᵀS⁻¹e counts what was measured only
     innovation_covariance: Array
     measured: Tensor | NDArray[np.bool_]  # whether there was a measurement, bool, (..., T, m)

@@ -253,7 +253,7 @@ def _row_times(a, i, b, j):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def make_symmetric(a):  # type: ignore[no-untyped-def]
-    """The mean of a matrix and its transpose, in place."""
+    """Replace a matrix by the mean of itself and its transpose, in place."""
     for i in range(a.shape[0]):
         for j in range(i):
             a[i, j] = a[j, i] = 0.5 * (a[i, j] + a[j, i])

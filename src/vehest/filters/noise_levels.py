@@ -13,8 +13,8 @@ STOP_BAND_DB = 60.0  # attenuation of the high-pass in its stop band
 
 
 def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
-    """Standard deviation of what several recordings of one signal hold above a frequency, taken
-    together.
+    """Standard deviation of one signal above a frequency, over several recordings together, in the
+    signal's unit; as a level of its noise.
 
     A linear-phase FIR filter (Kaiser window) passes from 1.25 times the cut-off on and is 60 dB
     down below 0.75 times of it. Only samples count where the filter reads measured samples alone:

@@ -24,7 +24,7 @@ COVARIANCE_FLOOR = 1e-7
 Eq. 7).
 """
 SCALE = 0.01  # weight of the part that depends on the state; as in the authors' code, like the next
-DEVIATION = 1e-3  # of the random weights of L to begin with; its offsets start at 0
+DEVIATION = 1e-3  # standard deviation of the initial random weights of L; its offsets start at 0
 
 
 class ConstantNoise(nn.Module):
@@ -42,8 +42,8 @@ class ConstantNoise(nn.Module):
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
 
-    unit: Tensor
-    learnt: Tensor
+    unit: Tensor  # unit in which the entries of each row of the factor are learnt, (n,)
+    learnt: Tensor  # whether each entry of the factor is learnt, row by row
 
     def __init__(self, variances: Sequence[float], correlated: bool = True) -> None:
         super().__init__()
@@ -55,7 +55,8 @@ class ConstantNoise(nn.Module):
         self.register_buffer("learnt", (rows == columns) | correlated, persistent=False)
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor | None = None) -> None:
-        """Start from a covariance, and learn in units of ``pace`` times its deviations.
+        """Set the initial covariance, and the units in which entries are learnt: ``pace`` times its
+        standard deviations.
 
         All entries of a row of the factor then have one unit, so that one step of an optimiser
         changes all states alike, whatever their units.
@@ -101,8 +102,8 @@ class StateDependentNoise(nn.Module):
     code.
     """
 
-    unit: Tensor
-    state_unit: Tensor
+    unit: Tensor  # unit in which the entries of each row of the factor are learnt, (n,)
+    state_unit: Tensor  # number by which each state is divided, (k,)
 
     def __init__(self, variances: Sequence[float], n_states: int, correlated: bool = True) -> None:
         super().__init__()
@@ -115,7 +116,7 @@ class StateDependentNoise(nn.Module):
         self.reset()
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
-        """Start the constant part from a covariance, see `ConstantNoise.begin`.
+        """Set the initial covariance of the constant part, see `ConstantNoise.begin`.
 
         Parameters
         ----------
@@ -202,7 +203,9 @@ def with_entropy(covariance: Tensor, min_entropy: float) -> Tensor:
 
 
 def _product(factor: Tensor, n: int, floor: float) -> Tensor:
-    """L Lᵀ + floor · I of the entries of L row by row, (..., n (n + 1) / 2) -> (..., n, n)."""
+    """Covariance L Lᵀ + floor · I, (..., n, n), from the entries of L row by row, (..., n (n + 1) /
+    2).
+    """
     rows, columns = _lower(n)
     lower = factor.new_zeros(*factor.shape[:-1], n, n)
     lower[..., rows, columns] = factor
@@ -216,8 +219,7 @@ def _lower(n: int) -> tuple[Tensor, Tensor]:
 
 
 def compiled_noise(noise: StateDependentNoise, min_entropy: float = -math.inf) -> CompiledNoise:
-    """What `StateDependentNoise` and `with_entropy` return, as a function of arrays of the noise's
-    precision.
+    """Compile a trained `StateDependentNoise`, with `with_entropy`, for filters in use.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ class SigmaRule(NamedTuple):
 
     spread: float  # distance in columns of the factor, positive
     centre_mean: float  # weight of the mean point in means
-    centre_covariance: float  # its weight in covariances
+    centre_covariance: float  # weight of the centre in covariances
     outer_weight: float  # weight of each of the 2n other points, in both
 
 

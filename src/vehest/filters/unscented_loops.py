@@ -42,30 +42,28 @@ class Setting(NamedTuple):
     """
 
     rules: tuple[Any, Any, Any, bool]
-    gated: bool
+    gated: bool  # whether there is a gate
     limit: Any
     patience: int
 
 
 class Tape(NamedTuple):
-    """Values of all samples that the adjoint and the caller need, (T, ..., B).
-
-    ``moved`` are sigma points after the transition, ``expected`` measurements at them, ``centre``
-    the weight of the mean point in covariances, ``repaired`` and ``is_gated_out`` flags.
+    """Values of all samples that the adjoint and the caller need, arrays (T, ..., B) for T samples
+    and B sequences, with S sigma points, n states and m measurements.
     """
 
-    prior_mean: Any
-    prior_covariance: Any
-    post_mean: Any
-    post_covariance: Any
-    moved: Any
-    expected: Any
-    innovation: Any
-    innovation_covariance: Any
-    gain: Any
-    centre: Any
-    repaired: Any
-    is_gated_out: Any
+    prior_mean: Any  # state before the measurement, (T, n, B)
+    prior_covariance: Any  # covariance of the prior, (T, n, n, B)
+    post_mean: Any  # state after the measurement, (T, n, B)
+    post_covariance: Any  # covariance of the posterior, (T, n, n, B)
+    moved: Any  # sigma points after the transition, (T, S, n, B)
+    expected: Any  # measurements expected at the points, (T, S, m, B)
+    innovation: Any  # (T, m, B)
+    innovation_covariance: Any  # (T, m, m, B)
+    gain: Any  # (T, n, m, B)
+    centre: Any  # weight of the mean point in covariances, (T, B)
+    repaired: Any  # whether a covariance had lost its definiteness, (T, B)
+    is_gated_out: Any  # whether the gate refused a measurement, (T, m, B)
 
 
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
@@ -167,25 +165,25 @@ def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
     return CompileResultWAP(function.overloads[kinds])
 
 
-FORWARD = (points_of, moments_of, gate_of, update_of)
-BACKWARD = (points_of, update_adjoint, points_adjoint, moments_adjoint)
+FORWARD = (points_of, moments_of, gate_of, update_of)  # steps that `forward` calls
+BACKWARD = (points_of, update_adjoint, points_adjoint, moments_adjoint)  # steps of `backward`
 Forward = namedtuple(
     "Forward",
     ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"),
 )
-"""What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given;
-numba warns of a plain tuple of these.
+"""Functions that `forward` calls: `FORWARD`, a model's transition and observation, and the numbers
+``car`` that both are passed; numba warns of a plain tuple of these.
 """
 Backward = namedtuple(
     "Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car")
 )
-"""What `backward` calls, likewise: `BACKWARD` and the model's adjoints."""
+"""Functions that `backward` calls: `BACKWARD`, the model's adjoints and their numbers ``car``."""
 
 
 @cache
 def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultWAP, ...]:
-    """The steps of a loop, `FORWARD` or `BACKWARD`, for arrays of a precision, as it takes them
-    where it is compiled.
+    """The steps of a loop, `FORWARD` or `BACKWARD`, compiled for arrays of a precision, so that a
+    compiled loop can call them by address.
 
     It compiles each step once for each precision; later calls return the same objects.
     """

@@ -51,17 +51,21 @@ from vehest.filters.unscented_steps import room
 
 MIN_EIGENVALUE_SHARE = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
-Array = NDArray[Any]
+Array = NDArray[Any]  # array of numbers of either precision
 Function = Callable[[Tensor, Tensor], Tensor]
-"""Of states (..., n) and inputs (..., p); leading dimensions of both are equal or broadcast."""
+"""Function of states (..., n) and inputs (..., p), whose leading dimensions are equal or broadcast:
+the transition f or the observation h.
+"""
 Share = Callable[[Callable[[int, int], None], int], None]
-"""Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
+"""Function of ``work`` and a number of sequences that calls ``work(first, end)`` on ranges of
+these, perhaps on several threads.
+"""
 
 
 class NonlinearFiltered(NamedTuple):
     """Result of a nonlinear filter over a sequence."""
 
-    steps: Filtered[Tensor]
+    steps: Filtered[Tensor]  # states and innovations at each sample
     # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in
     # a scan without repair, made everything from there on NaN
     repaired: Tensor
@@ -79,22 +83,23 @@ class PointModel:
     more rows for each point, in which entries may store numbers for their adjoints.
     """
 
+    # transition, observation, adjoint of the transition, adjoint of the observation
     entries: Sequence[Any]
-    car: Any = None  # what all are given
+    car: Any = None  # numbers of the model, passed to all entries
     is_compiled = (
         False  # whether the entries are, so that the loop over samples runs without Python
     )
-    scratch_rows = 0
-    parameters: Sequence[Tensor] = ()  # what gradients are wanted for
+    scratch_rows = 0  # rows of inputs for each point in which entries store numbers
+    parameters: Sequence[Tensor] = ()  # tensors by which gradients are computed
     # smallest possible value of each state, (n,); none: everything is possible
     lower: Sequence[float] | None = None
 
     def working(self) -> AbstractContextManager[object]:
-        """What the entries are called within, by one thread for all."""
+        """Context within which the entries are called; one thread enters it for all."""
         return nullcontext()
 
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
-        """Gradients of the parameters as the adjoints take them."""
+        """The arrays for the gradients of the parameters, in the form that the adjoints take."""
         return tuple(gradients)
 
 
@@ -186,18 +191,18 @@ class CompiledNoise:
     # called with (states (n, B), inputs (p, B), car, out, first, end), compiled where the model is;
     # writes covariances (k, k, B)
     entry: Any
-    car: tuple[Any, ...]  # what else it is given
+    car: tuple[Any, ...]  # numbers of the noise model, passed to ``entry``
 
 
 StepNoise = Array | CompiledNoise
-"""Of one sample: (1, k, k), or at the state."""
+"""Covariance of noise at one sample: an array (1, k, k), or a function of the state."""
 
 
 def _setting(
     model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None
 ) -> Setting:
-    """Rules of `unscented_steps` for a model and a precision; without a gate its limit is 0 and
-    not used.
+    """The loop's `Setting` for a model and a precision; without a gate its limit is 0 and not
+    used.
     """
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
@@ -333,7 +338,7 @@ def unscented_scan(
 
 
 class UnscentedStepper:
-    """The same filter of one sequence, one sample at a time.
+    """The unscented filter of one sequence, one sample at a time.
 
     Digits are those of `unscented_scan` for the same measurements, since both run the same loop.
 
@@ -342,10 +347,10 @@ class UnscentedStepper:
     model : PointModel
         How points move.
     mean, covariance : Array
-        Of the state at the first sample before its measurement, (n,) and (n, n), of the model's
-        precision.
+        Mean and covariance of the state at the first sample before its measurement, (n,) and (n,
+        n), of the model's precision.
     measurements : int
-        How many there are, m.
+        Number m of measured values.
     rule : SigmaRule
         Which sigma points.
     repair, gate
@@ -358,7 +363,7 @@ class UnscentedStepper:
     state
         The same after it; both are valid until the next step and may be changed.
     innovation, innovation_covariance, gain
-        Of the last update, (m,), (m, m) and (n, m).
+        Results of the last update, (m,), (m, m) and (n, m).
     tape : Tape
         Intermediate values of the last half-step, of one sample and one sequence; what the other
         attributes view.
@@ -399,7 +404,8 @@ class UnscentedStepper:
         process_noise: StepNoise,
         observation_noise: StepNoise,
     ) -> Array:
-        """The filtered mean, (n,), valid until the next step.
+        """Predict and update by one sample; returns the filtered mean, (n,), valid until the next
+        step.
 
         Parameters
         ----------
@@ -431,7 +437,7 @@ class UnscentedStepper:
         self._run(0, self.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: StepNoise) -> None:
-        """Take in the measurement.
+        """Update the state with a measurement.
 
         Parameters
         ----------
@@ -647,8 +653,8 @@ def _forward_by(
     functions: Sequence[CompiledNoise | None],
     like: tuple[Tape, Array] | None = None,
 ) -> Any:
-    """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs,
-    (p, B), where both are compiled.
+    """`forward` bound to a model and noise; it is compiled where both are, for arrays like those of
+    a tape and inputs (p, B).
     """
     entries = [*model.entries[:2]]
     at_states = [at and at.entry for at in functions]
@@ -679,7 +685,7 @@ def _forward_by(
 def _backward_by(
     model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]
 ) -> tuple[Callable[..., None], Any]:
-    """The adjoint's loop with a model, and the gradients as it takes them."""
+    """`backward` bound to a model, and the gradients in the form that it takes."""
     parameter_gradients = model.learnt(gradients)
     if not model.is_compiled or config.DISABLE_JIT:
         uncompiled: list[Any] = [*BACKWARD, *model.entries[2:], model.car]
@@ -696,7 +702,7 @@ def _backward_by(
 
 
 def sequences_last(values: Array) -> Array:
-    """(B, ...) -> (..., B), followed by room for a vector."""
+    """Move sequences to the last dimension, (B, ...) -> (..., B), followed by room for a vector."""
     moved = np.moveaxis(values, 0, -1)
     out: Array = room(moved.shape, values.dtype)
     out[:] = moved
@@ -704,19 +710,25 @@ def sequences_last(values: Array) -> Array:
 
 
 def sequences_first(values: Array, first: int = 0, end: int | None = None) -> Array:
-    """(..., B) -> (B, ...) of some sequences, together in memory."""
+    """Move the sequences ``first`` to ``end`` to the first dimension, (..., B) -> (B, ...), in
+    contiguous memory.
+    """
     return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
 
 
 def _alone_by_time(values: Array) -> Array:
-    """Values of one sequence at one sample as the loop takes them."""
+    """Shape the values of one sequence at one sample, (...), for the loop: (1, ..., 1), followed by
+    room for a vector.
+    """
     out: Array = room((1, *values.shape, 1), values.dtype)
     out[0, ..., 0] = values
     return out
 
 
 def _by_time(tensor: Tensor, scratch_rows: int = 0) -> Array:
-    """(B, T, p, ...) -> (T, p + scratch_rows, ..., B), followed by room for a vector."""
+    """Bring a tensor by sequence into an array by time for the loop, (B, T, p, ...) -> (T, p +
+    scratch_rows, ..., B), followed by room for a vector.
+    """
     moved = tensor.detach().movedim(0, -1)
     steps, rows, *sizes = moved.shape
     out: Array = room((steps, rows + scratch_rows, *sizes), moved.numpy().dtype)
@@ -725,10 +737,12 @@ def _by_time(tensor: Tensor, scratch_rows: int = 0) -> Array:
 
 
 def _by_sequence(values: Array) -> Tensor:
-    """(T, ..., B) -> (B, T, ...), in memory by time."""
+    """Bring an array by time back into a tensor by sequence, (T, ..., B) -> (B, T, ...); in memory
+    it stays ordered by time.
+    """
     return torch.from_numpy(values).movedim(-1, 1).contiguous().transpose(0, 1)
 
 
 def _alone(work: Callable[[int, int], None], sequences: int) -> None:
-    """Do all work in the calling thread."""
+    """A `Share` that does all work in the calling thread."""
     work(0, sequences)

@@ -43,6 +43,7 @@ from numba import types
 from vehest.filters.gating import refuses
 from vehest.lanes import VECTOR_BYTES, choose, load_unfused, most, root, store, store_some, width
 
+# decorator of functions that Python calls
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 ARGUMENTS: dict[str, Any] = {
     "rules": (1, 1, 0, types.boolean),
@@ -62,6 +63,7 @@ ARGUMENTS: dict[str, Any] = {
 """Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have
 three dimensions.
 """
+# decorator of functions that only compiled ones call, inlined there
 piece = numba.njit(
     forceinline=True,
     no_cpython_wrapper=True,
@@ -72,12 +74,12 @@ piece = numba.njit(
 
 
 def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
-    """An array that vectors may be read beyond, not filled or as ``make`` fills it.
+    """Allocate an array followed by room for one vector, which may be read beyond its end.
 
     Parameters
     ----------
     shape : tuple[int, ...]
-        Of the array, C order.
+        Shape of the array, in C order.
     dtype : Any
         Element type.
     make : Any, default np.empty

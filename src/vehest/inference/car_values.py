@@ -28,49 +28,54 @@ from vehest.trust.record import Trust
 
 FORMAT = 1  # version of the record that `vehest identify` writes
 DEVIATION_FACTOR = 1.5
-"""By which the deviations of a record are multiplied before an estimate starts from them."""
+"""Factor by which the standard deviations of a record are multiplied before an estimate starts from
+them.
+"""
 LIMITS = {
     "leakage": (-0.3, 0.3),
     "rear_axle": (-20.0, 20.0),
     "compliance": (2e-4, 0.1),
     "grip": (1.0, 60.0),
 }
-"""Beyond which a number is not one of a car."""
+"""Parameter of a record -> smallest and largest value of a car."""
 ASSUMED = "the wheelbase is assumed to be"
-"""Beginning of the remark that no wheelbase was given."""
+"""Start of the remark that no wheelbase was given."""
 CAR_SETTINGS = {"wheelbase": "m", "cg_to_rear_axle": "m", "imu_to_rear_axle": "m"}
 """Settings of the self-calibrating filter that are values of the car -> unit."""
 DEFAULT_WHEELBASES = {
     family.name: family.settings_type().wheelbase for family in (SelfCalibrating, PriorMap)
 }
 """Estimator that assumes a typical wheelbase where none is given -> that wheelbase [m]."""
-Positive = Annotated[float, Field(gt=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]  # number above 0
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number with its standard deviation, and the drives on which it was identified.
+    """An identified parameter with its standard deviation and the drives on which it was
+    identified.
 
     Where on none, no estimate starts from it.
     """
 
-    value: float
-    deviation: Positive
+    value: float  # identified value
+    deviation: Positive  # standard deviation, in the same unit
+    # drives on which it was identified; none: no estimate starts from it
     identified_on: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class CarRecord:
-    """Numbers of a car; raises `DataError` where one is not of a car.
+    """Identified parameters of a car; raises `DataError` where one cannot be of a car.
 
     Lengths are measured along the car from the rear axle, forwards positive.
     """
 
     wheelbase: Annotated[float, Field(ge=0.05, le=20.0)]  # [m]
-    cg_to_rear_axle: Positive | None  # as given [m]
+    # distance of the centre of gravity from the rear axle, as given [m]
+    cg_to_rear_axle: Positive | None
     # κ: share of the measured ay that is none, because the body rolls or the sensor's gain errs
     leakage: Number
-    rear_axle: Number  # its distance from the inertial unit [m]
+    rear_axle: Number  # distance of the inertial unit from the rear axle, negative behind it [m]
     # C: slip angle of the rear axle over its lateral acceleration, both small [rad s²/m]
     compliance: Number
     grip: Number  # lateral acceleration at the rear axle's limit [m/s²]

@@ -24,12 +24,13 @@ from vehest.estimators.model_files import (
 )
 from vehest.trust.record import TRUST, Trust, read_trust
 
-PRETRAINED = "pretrained"
+PRETRAINED = "pretrained"  # name of the network that comes with vehest
 SELF_CALIBRATING = "self_calibrating"
 """Names of the models that come with vehest, for cars without a model of their own.
 
 A network, and the filter around it.
 """
+# name of a model that comes with vehest -> its folder in the package
 WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
 SHIPPED_NOTES = {
     PRETRAINED: "trained on simulated cars, not on yours; the KS-NN is patented by its authors "
@@ -38,7 +39,7 @@ SHIPPED_NOTES = {
     "is patented by its authors (PCT/IT2023/050058); errors and limits: "
     "docs/estimators/self_calibrating.md",
 }
-"""Notes on these models in one line; their model.yaml says more."""
+"""Name of a model that comes with vehest -> note in one line; its model.yaml says more."""
 CALIBRATION_STAGE = "calibrate"
 """Stage that calibrates models, and its folder in an output root."""
 
@@ -129,7 +130,9 @@ def is_training_recording(model_folder: Path, recording_id: str) -> bool:
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
-    """Method and transforms of a model's training data, which new recordings need too."""
+    """Method and transforms by which a model's training data were resampled, which new recordings
+    need too.
+    """
     return read_description(model_folder).about.downsample.as_plain()
 
 
@@ -182,7 +185,7 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
 
 
 def _calibrates(folder: Path, model: Artefact) -> bool:
-    """Whether a folder holds the calibration of a model.
+    """Whether a folder holds the calibration of a given model.
 
     Raises `DataError` where its manifest is damaged and its name is the model's.
     """

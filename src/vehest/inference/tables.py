@@ -23,9 +23,9 @@ from vehest.data.files import written_aside
 from vehest.data.store import write_estimate_parts
 from vehest.trust.health import reason_in_words
 
-TABLE_SUFFIXES = (".parquet", ".csv")
+TABLE_SUFFIXES = (".parquet", ".csv")  # endings of tables of estimates
 LOG_SUFFIXES = (".mf4", ".mat")
-"""Files of estimates that are tables, and those that are the log with further channels."""
+"""Endings of files of estimates that are the log with further channels."""
 
 
 def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") -> None:
@@ -56,7 +56,7 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path, band: str = "") 
 
 
 def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
-    """Cells of a table of text, with the reasons of health in words.
+    """Cells of a table of text, with the reasons of health as text.
 
     Angles are listed in degrees, too, behind the other columns.
     """

@@ -23,12 +23,12 @@ from vehest.report.style import (
     new_figure,
 )
 
-FOREST_WIDTH = 4.4  # in, narrow enough for a phone
+FOREST_WIDTH = 4.4  # width of the figure, in, narrow enough for a phone
 FOREST_FONT = 8.5  # pt
 MIN_RATIO_FOR_LOG = 8.0  # highest over lowest RMSE, from which the axis is logarithmic
 MAX_POINTS = 500  # points of a cloud of samples, about; of a longer one every n-th is drawn
 AGREEMENT_COLUMNS = 4  # clouds side by side at most; further ones begin a row
-TITLE_CHARACTERS = 25  # of an estimator's name in a line
+TITLE_CHARACTERS = 25  # largest number of characters of an estimator's name in a line
 MARKER_SIZE = 2.2  # pt, of a sample
 FIRST_MARKER_SIZE = 3.6  # pt, of a sample of the cloud that is drawn first
 
@@ -117,7 +117,7 @@ def forest_figure(rows: Sequence[ForestRow]) -> MatplotlibFigure:
 
 
 def _size_with_interval(row: ForestRow, decimals: int) -> str:
-    """An RMSE with its interval in brackets, if it has one."""
+    """Text of an RMSE with its interval in brackets, if it has one."""
     size = fixed(row.rmse, decimals)
     if not math.isfinite(row.low):
         return size
@@ -128,10 +128,10 @@ def _size_with_interval(row: ForestRow, decimals: int) -> str:
 class Cloud:
     """Samples of two quantities, (K,) each, drawn as points."""
 
-    label: str
-    colour: str
-    x: FloatArray
-    y: FloatArray
+    label: str  # name in the legend or title
+    colour: str  # hexadecimal
+    x: FloatArray  # horizontal coordinates, (K,)
+    y: FloatArray  # vertical coordinates, (K,)
 
 
 def clouds_figure(
@@ -200,7 +200,7 @@ def _wrapped(label: str) -> str:
 
 
 def draw_cloud(axes: Any, cloud: Cloud, marker_size: float = MARKER_SIZE) -> None:
-    """Points of a cloud, every n-th so that a figure stays small."""
+    """Draw the points of a cloud, every n-th, so that a figure stays small."""
     step = max(len(cloud.x) // MAX_POINTS, 1)
     axes.plot(
         cloud.x[::step],

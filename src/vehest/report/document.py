@@ -32,28 +32,31 @@ PATENT_NOTE = (
     "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product "
     "may need their licence; the licence of this software grants none."
 )
-"""What every report with a KS-NN ends with."""
+"""Section with which every report with a KS-NN ends."""
 
-REPORT = "report"  # document of a study that one starts with
+REPORT = "report"  # name of the document with which a study starts
 
 MAX_AXIS_RATIO = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150  # resolution of figures as pixels, unless a caller says another
 PNG_COLOURS = 256  # colours of a PNG, the most that a palette may have
+# matches cells that a spreadsheet would read as a formula
 _FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
-_PATH = re.compile(r'\bd="[^"]*"')
-_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
-_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
-_UNWANTED = {"html_inline", "html_block", "image"}
+_PATH = re.compile(r'\bd="[^"]*"')  # matches the path data of an SVG
+_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")  # matches numbers with three decimals or more
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")  # matches valid file names of tables and figures
+_UNWANTED = {"html_inline", "html_block", "image"}  # Markdown tokens that are shown as text
+# matches link schemes other than http, https and mailto
 _SCRIPTED = re.compile(r"(?!https?:|mailto:)[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _APPENDIX = re.compile(r"\A## Appendix: (.)")  # the page lists these under "Appendices"
+# matches links to other documents, which the page replaces
 _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 
 @dataclass(frozen=True)
 class Column:
-    """How a column of a table is shown; its CSV file keeps every digit."""
+    """Column of a table and the format of its numbers; its CSV file keeps every digit."""
 
-    header: str  # what it is called, unit included
+    header: str  # title of the column, unit included
     digits: int = (
         3  # significant digits of its typical value, from which the decimals of all follow
     )
@@ -66,10 +69,10 @@ class Column:
 
 @dataclass(frozen=True)
 class ModelLink:
-    """Where the model behind a row of a table is."""
+    """Place of the model behind a row of a table."""
 
-    folder: str  # relative to the page
-    command: str  # that runs it
+    folder: str  # folder of the model, relative to the page
+    command: str  # command that runs it
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,7 @@ class Figure:
     interactive: str = ""  # `explorer_json` of what the page draws in its place
 
 
-Block: TypeAlias = "str | Table | Figure"
+Block: TypeAlias = "str | Table | Figure"  # part of a document: Markdown, a table or a figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +118,8 @@ class Document:
     # name -> table that is written beside the others without being shown; text may link to
     # ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # how many of the first blocks the page shows, the sections after them being folded appendices;
-    # None: all
-    # up to the first heading that begins with "Appendix"
+    # number of first blocks that the page shows, the sections after them being folded appendices;
+    # None: all up to the first appendix
     open_blocks: int | None = None
 
     def __post_init__(self) -> None:
@@ -283,7 +285,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
 
 
 def _number_cells(values: list[Any], column: Column) -> list[str]:
-    """Numbers of a column as text, whole numbers without decimals."""
+    """Texts of the numbers of a column, those of integers without decimals."""
     if all(isinstance(value, int) for value in values):
         return [fixed(value, 0) for value in values]
     numbers = [
@@ -413,7 +415,9 @@ def _markdown(document: Document) -> str:
 
 
 def _in_pipes(cell: str) -> str:
-    """A cell on one line that cannot end the table's column, or be HTML or a link."""
+    """Text of a cell for a Markdown table, on one line, that cannot end the column or be HTML or a
+    link.
+    """
     line = printable(" ".join(cell.split()))
     return (
         line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
@@ -421,7 +425,8 @@ def _in_pipes(cell: str) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files.
+    """Markdown as it is, unless it has HTML, pictures, or links with a scheme other than http,
+    https and mailto; then these, and all other links, are shown as text.
 
     What it contains of them is shown as text.
     """
@@ -440,7 +445,7 @@ def _harmless(text: str) -> str:
 
 
 def _spoken(caption: str) -> str:
-    """First sentence of a caption, without marks that mean something in Markdown."""
+    """Alternative text of a figure: first sentence of a caption, without marks of Markdown."""
     plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", caption)
     plain = re.sub(r"[*`\[\]<>|]", "", plain).replace("\n", " ").strip()
     return re.split(r"(?<=\.)\s", plain, maxsplit=1)[0]
@@ -504,7 +509,7 @@ def _page(document: Document, images: Mapping[str, bytes]) -> str:
 
 
 def _open_blocks(document: Document) -> int | None:
-    """How many blocks the page shows before its appendices.
+    """Number of blocks that the page shows before its appendices.
 
     Those of `Document.open_blocks`, else all up to the first appendix.
     """
@@ -526,7 +531,7 @@ def without_formula(cell: Any) -> Any:
 
 
 def _page_table(table: Table) -> dict[str, Any]:
-    """A table as the page's template reads it: cells with bars, links to models, and the CSV as
+    """Values of a table for the page's template: cells with bars, links to models, and the CSV as
     data.
     """
     headers, rows, numeric = formatted(table)
@@ -555,8 +560,8 @@ def _page_table(table: Table) -> dict[str, Any]:
 def bars_of(
     values: Sequence[float], lows: Sequence[float], highs: Sequence[float]
 ) -> list[dict[str, Any] | None]:
-    """Where values and the ends of their intervals lie on one axis from zero, in per cent of its
-    length; none where a value is missing.
+    """Positions of values and of the ends of their intervals on one axis from zero, in per cent of
+    its length; None where a value is missing.
 
     The axis ends at the highest, but at `MAX_AXIS_RATIO` times the median value where one lies far
     beyond; what is longer is ``cut``.

@@ -61,22 +61,26 @@ CHANNEL_LABELS = {
     "handwheel": "handwheel",
 }
 """Measured channels that are drawn, in this order, with their labels."""
+# code of health, except valid -> its name and colour
 HEALTH = {1: ("degraded", "#e69f00"), 2: ("invalid", "#6b1414")}
-VALID_COLOUR = "#dfe4e8"
-CHANNEL_COLOUR = "#33373b"
-COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")  # β to the right, none, to the left
-HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}  # in
+VALID_COLOUR = "#dfe4e8"  # colour of valid samples in the panel of health
+CHANNEL_COLOUR = "#33373b"  # colour of measured channels
+# colours of the course with β to the right, none, and to the left
+COURSE_COLOURS = ("#0072b2", "#b9bec4", "#d55e00")
+# kind of panel -> its height, in
+HEIGHTS = {"sideslip": 1.75, "health": 0.13, "vy": 1.15, "channel": 0.62, "course": 2.45}
 
-DASHES = ("solid", "dashed", "dotted", "dashdot")  # of estimates by the same estimator
+DASHES = ("solid", "dashed", "dotted", "dashdot")  # dashes of estimates by the same estimator
 NOTEBOOK_DPI = 110  # resolution of the figure in a notebook
-MIN_AXIS = 0.1  # deg, of estimate over reference
-Draw = Callable[[Axes], None]
+MIN_AXIS = 0.1  # deg, smallest half width of the axes of estimate over reference
+Draw = Callable[[Axes], None]  # draws a panel into axes
 
 
 class DriveFigure(Figure):
     """A figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
+        """The figure as PNG, for a notebook."""
         return png_of(self, NOTEBOOK_DPI)
 
 
@@ -84,14 +88,14 @@ class DriveFigure(Figure):
 class Drive:
     """Signals of a drive on one clock, (T,) each."""
 
-    title: str
+    title: str  # title of the figure
     time: FloatArray  # [s]
-    time_label: str
-    recording: Recording | None
-    reference: Traces | None
-    estimates: Sequence[Traces]
-    band: Band | None  # of the first estimate
-    health: FloatArray | None  # of the first estimate
+    time_label: str  # label of the time axis
+    recording: Recording | None  # recording with the measured channels; None: none
+    reference: Traces | None  # reference v and β; None: none
+    estimates: Sequence[Traces]  # estimated v and β
+    band: Band | None  # 90 % band of the first estimate
+    health: FloatArray | None  # health code of the first estimate, (T,)
 
     @property
     def has_motion(self) -> bool:
@@ -252,7 +256,9 @@ def _reference_of(recording: Recording | None) -> Traces | None:
 
 
 def _time_panels(drive: Drive) -> list[tuple[str, Draw]]:
-    """Height, as in `HEIGHTS`, and drawing of each panel over time, from above."""
+    """Key of the height in `HEIGHTS` and drawing function of each panel over time, from top to
+    bottom.
+    """
     panels: list[tuple[str, Draw]] = []
     if drive.has_motion:
         panels.append(("sideslip", partial(_draw_motion, drive, "sideslip")))
@@ -302,7 +308,9 @@ def _draw_channel(drive: Drive, name: str, axes: Axes) -> None:
 
 
 def _panels_below(drive: Drive, estimates: Sequence[Estimate]) -> list[Draw]:
-    """Drawings of the course, and of estimate over reference, of those that there are."""
+    """Drawing functions of the course and of estimate over reference, as far as they can be
+    drawn.
+    """
     recording = drive.recording
     if recording is None:
         return []

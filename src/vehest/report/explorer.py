@@ -26,7 +26,7 @@ GAP = 65_535  # code of a missing value
 
 
 def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray | None]) -> str:
-    """What the page reads of the signals of a test set, as JSON that cannot end a script element.
+    """JSON of all signals of a test set for the page, which cannot end a script element.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
 
 
 def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
-    """Values of a channel and their unit as people read them: angles in degrees."""
+    """Values of a channel and their unit for display: angles in degrees."""
     channel = CHANNELS[name]
     if channel.is_angular:
         return np.degrees(values), {"rad": "deg", "rad/s": "deg/s"}[channel.unit]
@@ -91,8 +91,8 @@ def in_display_unit(name: str, values: FloatArray) -> tuple[FloatArray, str]:
 def reckoned_course(
     vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading
-    along x; after NaN it starts anew.
+    """Course of the car, x and y (K,) [m], by integrating velocities from the origin, heading along
+    x; after NaN it starts anew.
 
     ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two
     samples.

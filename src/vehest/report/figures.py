@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 STATIC_POINTS = 500  # points of a line in `traces_figure`, about
 MIN_UNIX_SECONDS = 1e8  # s, from which on times count from 1970
 MAX_POINTS = 2000  # points of a line over a whole drive, about
-MIN_SAMPLES_IN_BIN = 20  # of lateral acceleration; a bin with fewer shows no error
+# smallest number of samples in a bin of lateral acceleration with which it shows an error
+MIN_SAMPLES_IN_BIN = 20
 LABEL_STEP = 0.05  # least distance of two labels, as a share of the axis
 SIDESTEP = 0.005  # shift of intervals that would cover each other, as a share of the axis
 # the reference under the estimates: wide enough to show on both sides of a line
@@ -44,9 +45,9 @@ class Traces:
     """Time series of one source on the common grid; NaN breaks a line."""
 
     label: str  # name of the source
-    line: Line
+    line: Line  # colour, dash and marker
     vy: FloatArray  # lateral velocity [m/s], shape (K,)
-    sideslip: FloatArray  # [deg], shape (K,)
+    sideslip: FloatArray  # sideslip angle [deg], shape (K,)
 
 
 def traces_figure(
@@ -104,9 +105,9 @@ def traces_figure(
 class Band:
     """Half widths of the calibrated 90 % bands of one estimate, NaN where there is none."""
 
-    estimate: Traces
-    vy: FloatArray  # [m/s], shape (K,)
-    sideslip: FloatArray  # [deg], shape (K,)
+    estimate: Traces  # the estimate that the band belongs to
+    vy: FloatArray  # half width for v [m/s], shape (K,)
+    sideslip: FloatArray  # half width for β [deg], shape (K,)
 
 
 def zoom_figure(
@@ -161,7 +162,7 @@ def zoom_figure(
 
 
 def _looks(line: Line) -> dict[str, Any]:
-    """Colour, dash and width of an estimate's line, as matplotlib's arguments."""
+    """Arguments of matplotlib for colour, dash and width of an estimate's line."""
     return {"color": line.colour, "linestyle": line.dash, "linewidth": 1.0}
 
 
@@ -316,10 +317,10 @@ class Reliability:
     """Coverages of one estimator's bands, each of shape (L,); NaN where not known."""
 
     label: str  # name of the estimator
-    line: Line
-    coverage: FloatArray  # fraction of errors inside
-    low: FloatArray  # lower end of its interval
-    high: FloatArray  # upper end
+    line: Line  # colour and marker
+    coverage: FloatArray  # share of errors inside the band of each level
+    low: FloatArray  # lower end of the interval of each coverage
+    high: FloatArray  # upper end of the interval of each coverage
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
@@ -387,7 +388,9 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
 
 
 def spread_heights(heights: Sequence[float], step: float, top: float) -> list[float]:
-    """Heights moved down as far as needed to stand a step apart below ``top``, in their order."""
+    """Move heights of labels down as far as needed, so that they are at least a step apart and
+    below ``top``; order is kept.
+    """
     placed = [0.0] * len(heights)
     last = top + step
     for position in np.argsort([-height for height in heights], kind="stable"):
@@ -452,7 +455,7 @@ def legend_above(figure: Any, axes: Any) -> None:
 
 
 def _legend_width(labels: Sequence[str], columns: int) -> float:
-    """About how wide a legend of 7 pt gets [in]; its entries fill one column after another."""
+    """Approximate width of a legend of 7 pt [in]; its entries fill one column after another."""
     widths = [
         max(len(label) for label in column)
         for column in np.array_split(np.array(labels, dtype=object), columns)

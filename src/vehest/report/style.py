@@ -17,21 +17,25 @@ if TYPE_CHECKING:
 
 MatplotlibFigure: TypeAlias = "Figure"
 
-SINGLE_COLUMN = 3.5  # in, one column of a two-column journal
-DOUBLE_COLUMN = 7.16  # in, both columns
-MISSING = "–"
+SINGLE_COLUMN = 3.5  # width of one column of a two-column journal, in
+DOUBLE_COLUMN = 7.16  # width of both columns, in
+MISSING = "–"  # text of a missing value
 
-REFERENCE_COLOUR = "#000000"
-REFERENCE_GREY = "#8c9096"  # of a wide line of the reference below estimates, 3:1 on white
-LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
+REFERENCE_COLOUR = "#000000"  # colour of a line of the reference
+REFERENCE_GREY = "#8c9096"  # colour of a wide line of the reference below estimates, 3:1 on white
+# colours of KS-NN with linear feedback, without and with bias
+LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")
+# colours of KS-NN with nonlinear feedback, without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
+# colours of estimators whose family declares no line
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
 
 _DARK_PAPER = 0x1A  # grey of the page in its dark scheme, as in templates/page.css
 _DARK_INK = 0xE6  # grey of the text there
-_DASHES = ("solid", "dashed", "dotted", "dashdot")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+_DASHES = ("solid", "dashed", "dotted", "dashdot")  # dashes by which equal lines are distinguished
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")  # markers by which equal lines are distinguished
 
+# settings of matplotlib for all figures
 _PAPER = {
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
@@ -70,14 +74,14 @@ _PAPER = {
 
 @dataclass(frozen=True)
 class Line:
-    """How one estimator is drawn, the same in every figure."""
+    """Look of an estimator's line, the same in every figure."""
 
     colour: str  # hexadecimal, readable on white
     dash: str = "solid"  # ``solid``, ``dashed``, ``dotted`` or ``dashdot``
     marker: str = "o"  # matplotlib's marker, where points are drawn
 
 
-REFERENCE = Line(REFERENCE_COLOUR)
+REFERENCE = Line(REFERENCE_COLOUR)  # look of the reference
 
 
 def line_of(estimator: str, variant: str = "") -> Line:
@@ -169,7 +173,7 @@ def new_figure(width: float, height: float) -> Iterator[MatplotlibFigure]:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """A number to some significant digits, never in exponents between 1e-4 and 1e6.
+    """Text of a number with some significant digits, without an exponent between 1e-4 and 1e6.
 
     `MISSING` if it is not finite.
     """
@@ -207,7 +211,7 @@ def decimals_for(values: Sequence[float], digits: int = 3) -> int:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """A number with a fixed count of decimals, thousands set apart.
+    """Text of a number with a fixed number of decimals and grouped thousands.
 
     `MISSING` if it is not finite.
     """
@@ -215,6 +219,8 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def _grouped(value: float, decimals: int) -> str:
-    """A number with decimals, a narrow space between thousands from 10,000 on, and a minus sign."""
+    """Text of a number with decimals, a narrow space between thousands from 10,000 on, and a minus
+    sign.
+    """
     text = f"{value:,.{decimals}f}" if abs(value) >= 1e4 else f"{value:.{decimals}f}"
     return text.replace(",", "\N{NARROW NO-BREAK SPACE}").replace("-", "\N{MINUS SIGN}")

@@ -25,6 +25,7 @@ from vehest.run.inspect_data import Lines, reading
 from vehest.run.printing import TerminalTable
 from vehest.sources.base import car_of, open_source, read_single
 
+# files of an alignment's folder: report, table of parameters, transforms
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml")
 
 
@@ -64,8 +65,8 @@ def align_recording(
         return align(recording, settings)
 
 
-def in_words(alignment: Alignment, out: Path | None) -> Lines:
-    """An alignment for a terminal; ``out`` is where it was written.
+def alignment_lines(alignment: Alignment, out: Path | None) -> Lines:
+    """Lines and tables for a terminal on an alignment; ``out`` is the folder where it was written.
 
     Returns
     -------
@@ -100,14 +101,14 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
 
 
 def override_of(alignment: Alignment) -> str:
-    """The transforms as an override that Hydra reads."""
+    """The transforms of an alignment as one override in Hydra's grammar."""
     transforms = [dict(transform) for transform in alignment.transforms]
     text = yaml.safe_dump(transforms, default_flow_style=True, width=math.inf, sort_keys=False)
     return f"downsample.transforms={text.strip()}"
 
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
-    """All figures as plain values, SI units throughout.
+    """Results of an alignment as plain values for JSON, in SI units.
 
     Returns
     -------
@@ -190,7 +191,7 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
 
 def _recording_of(source: str, config: Config, recording_id: str | None) -> Recording:
-    """The recording of a data set by its id, or the only one; or that of a file, whose id must
+    """Read the recording of a data set by its id, or the only one; or that of a file, whose id must
     agree.
     """
     if source in choices("dataset"):
@@ -210,7 +211,7 @@ def _recording_of(source: str, config: Config, recording_id: str | None) -> Reco
 
 
 def _parameters(alignment: Alignment) -> TerminalTable:
-    """Parameters for people: degrees and milliseconds, as many digits as the uncertainty
+    """Table of the parameters in degrees and milliseconds, with as many digits as the uncertainty
     warrants.
     """
     rows = []
@@ -235,7 +236,7 @@ def _report(alignment: Alignment) -> str:
     """
     from vehest.report.document import as_text
 
-    printed = in_words(alignment, None)[:-1]  # without the override, which stands below
+    printed = alignment_lines(alignment, None)[:-1]  # without the override, which stands below
     cutoff_hz = alignment.settings.cutoff_at(alignment.recording.rate_hz)
     parts = [
         f"# Alignment of {as_text(alignment.recording.id)}",
@@ -255,13 +256,13 @@ def _report(alignment: Alignment) -> str:
 
 
 def _markdown(table: TerminalTable) -> str:
-    """A table in Markdown, numbers to the right."""
+    """Text of a table in Markdown, with numbers aligned to the right."""
     lines = [table.header, [":--", *("--:" for _ in table.header[1:-1]), ":--"], *table.rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _transforms(alignment: Alignment) -> str:
-    """The transforms as they belong under ``downsample`` in a configuration."""
+    """YAML of the transforms, as they are placed under ``downsample`` in a configuration."""
     return yaml.safe_dump(
         {"transforms": [dict(transform) for transform in alignment.transforms]},
         sort_keys=False,
@@ -270,7 +271,9 @@ def _transforms(alignment: Alignment) -> str:
 
 
 def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
-    """A parameter's values and contributions to its uncertainty, as names of columns."""
+    """Values of a parameter and the contributions to its uncertainty, column of the table ->
+    value.
+    """
     plain = {
         key: getattr(parameter, key)
         for key in ("name", "value", "uncertainty", "low", "high", "unit")

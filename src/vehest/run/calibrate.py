@@ -24,10 +24,11 @@ from vehest.inference.models import CALIBRATION_STAGE as STAGE
 from vehest.inference.models import calibration_label
 from vehest.run.train import digests_of_spans, stored_recording
 from vehest.run.versions import code_of
-from vehest.trust.calibration import Stretch, learn_trust
+from vehest.trust.calibration import CalibrationRange, learn_trust
 from vehest.trust.record import read_trust, write_trust
 
-WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
+# s of recording before a range with which its estimate starts, as far as there are any
+WARM_UP_SECONDS = 10.0
 
 
 def plan_calibrate(
@@ -87,17 +88,16 @@ def _write(
     cars: Mapping[str, CarValues],
     folder: Path,
 ) -> None:
-    """Calibrate a model.
-
-    Write trust.yaml into ``folder``, with the reason where bands or health are missing.
+    """Calibrate a model and write trust.yaml into ``folder``, with the reason where bands or health
+    are missing.
     """
 
-    def stretch(span: Span) -> Stretch:
+    def stretch(span: Span) -> CalibrationRange:
         recording = read_recording(stored_recording(data, span)).cut(
             span.start - WARM_UP_SECONDS, span.stop
         )
         recording = replace(recording, car=cars.get(span.dataset, UNKNOWN_CAR))
-        return Stretch(
+        return CalibrationRange(
             recording, max(span.start, recording.start_time), span.dataset, span.describe()
         )
 
@@ -113,7 +113,7 @@ def _write(
 
 
 def calibration_figures(folder: Path) -> dict[str, float]:
-    """Figures of a calibration for tracking; none where there are no bands.
+    """Metrics of a calibration for tracking, name -> value; empty where there are no bands.
 
     Parameters
     ----------

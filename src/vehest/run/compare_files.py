@@ -44,7 +44,7 @@ from vehest.run.printing import (
     SCORE_HEADER,
     TerminalTable,
     complain,
-    finding_in_words,
+    describe_finding,
     note,
     score_cells,
 )
@@ -55,7 +55,7 @@ from vehest.studies.kit.standing import standing_columns, verdict_sentences
 MIN_COMMON_SECONDS = 5.0  # s that reference and all estimates must have in common; less is refused
 MIN_RATE_HZ = 1.0  # Hz; a reference that is sampled more slowly is refused
 BASELINES = ("zero", "static_map")  # rows of every comparison
-RATE_HZ = 20.0  # Hz, at which estimates are scored, unless the recording has less
+RATE_HZ = 20.0  # Hz, rate at which estimates are scored, unless that of the recording is lower
 
 
 def compare_files(
@@ -100,7 +100,7 @@ def compare_files(
     with use_limits(options.limits):
         drive = read_single(options.dataset, recording)
         findings = [
-            finding_in_words(finding)
+            describe_finding(finding)
             for finding in refuse_errors(
                 drive, options.dataset.get("accept") or (), f"'{recording}'"
             )
@@ -149,7 +149,7 @@ def compare_files(
 
 
 def _check_rows(names: Sequence[str]) -> None:
-    """Refuse two estimates of one name."""
+    """Raise `ConfigurationError` where two estimates have the same name."""
     for name, count in Counter(names).items():
         if count > 1:
             raise ConfigurationError(
@@ -173,7 +173,7 @@ def named_by_estimator(
 
 
 def _check_columns(columns: Sequence[NamedColumn], files: Sequence[Path]) -> None:
-    """Refuse a column of ``--column`` that no file has."""
+    """Raise `ConfigurationError` for a column of ``--column`` that no file has."""
     if not columns:
         return
     names = list(dict.fromkeys(chain.from_iterable(names_of_table(file) for file in files)))
@@ -297,7 +297,9 @@ def compare_estimates(
 
 
 def _with_exclusions(verdict: str, trained_here: Collection[str], *, has_others: bool) -> str:
-    """The verdict, preceded by which models it leaves out; no verdict if only baselines remain."""
+    """The verdict, preceded by a sentence on the models that it leaves out; without others than
+    baselines, no verdict.
+    """
     names = listed([f"'{name}'" for name in trained_here])
     were = "was" if len(trained_here) == 1 else "were"
     if not has_others:
@@ -334,7 +336,9 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
 
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
-    """v = 0, and the static map where the car turns enough to fit one."""
+    """Estimates of the baselines: v = 0, and the static map where the car turns enough to fit
+    one.
+    """
     velocities = {"zero": np.zeros(len(reference))}
     if "yaw_rate" in reference:
         with suppress(DataError):

@@ -31,35 +31,39 @@ from vehest.run.study import Job, failure_messages
 from vehest.run.train import TrainJob, estimator_rate, model_artefact, plan_train
 from vehest.run.training_differences import Differences, difference_text, differences_of
 from vehest.run.usable import lack
-from vehest.studies.reference_minutes import start_in_words
+from vehest.studies.reference_minutes import describe_start
 
+# reason for a training that is missing since it was stopped or out of time
 NO_TIME = "not done yet: its training was stopped or out of time; vehest run goes on with it"
-NOT_TRAINED = "not trained yet"
-RATE_TOLERANCE = 1e-9  # relative, between two rates that are the same
+NOT_TRAINED = "not trained yet"  # reason for a training that is missing since it was not begun
+RATE_TOLERANCE = 1e-9  # relative difference up to which two rates are equal
 
 Note = tuple[str, str]
-"""Estimator, or ``evaluation``, whose rate was lowered, and how its sentence continues."""
+"""A lowered rate: the estimator, or ``evaluation``, and the rest of the sentence that is printed on
+it.
+"""
 
 
 @dataclass
 class Comparison:
-    """Jobs on one split, and what becomes of them.
+    """A comparison: jobs on one split, their planned trainings and, in the end, their trained and
+    evaluated members.
 
     Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of
     a study are all evaluated under the faults of all.
     """
 
-    jobs: Sequence[Job]
+    jobs: Sequence[Job]  # trainings with their evaluations, as configured
     groups: Sequence[Group] = ()  # trainings that fit one batch
     facts: Sequence[str] = ()  # budgets of trainings, preparation of recordings, lowered rates
     evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
-    data_titles: Mapping[str, str] = field(default_factory=dict)
+    data_titles: Mapping[str, str] = field(default_factory=dict)  # data set -> title in the report
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
     # key of a training -> its trained and evaluated member
     finished: Mapping[str, Member] = field(default_factory=dict)
     # key of a training -> options in which it differs from others of its variant and seed
     differences: Mapping[str, Differences] = field(default_factory=dict)
-    reason_unfinished: str = NO_TIME
+    reason_unfinished: str = NO_TIME  # reason that is stated for trainings without a member
 
     @property
     def usable(self) -> list[Job]:
@@ -74,7 +78,7 @@ class Comparison:
 
     @property
     def unfinished(self) -> list[str]:
-        """Trainings for which no time was left, by name."""
+        """Names of the trainings that have no member yet, for lack of time."""
         trainings = [job.training for job in self.usable if job.training is not None]
         remaining = [training for training in trainings if training.plan.key not in self.finished]
         return list(
@@ -86,7 +90,7 @@ class Comparison:
 
     @property
     def failed(self) -> dict[str, str]:
-        """Name of what is left out -> why."""
+        """Name of each training that is left out -> the reason."""
         return {
             name: failure.message for name, failure in named_failures(self.jobs)
         } | dict.fromkeys(self.unfinished, self.reason_unfinished)
@@ -180,7 +184,9 @@ class Comparison:
         return self.groups
 
     def _groups(self, split: Split, force: frozenset[str], *, evaluated: bool) -> list[Group]:
-        """Combinations of a sweep that differ in their fault alone share a training."""
+        """Groups of trainings that fit one batch; combinations of a sweep that differ only in their
+        fault share a training.
+        """
         of_training: dict[str, tuple[TrainJob, list[Job]]] = {}
         for job in self.usable:
             if job.training is not None:
@@ -206,7 +212,7 @@ class Comparison:
         ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
-        """Take what became of the trainings: key of each -> its member, or why it failed.
+        """Take the results of the trainings into ``finished`` and the jobs' failures.
 
         Parameters
         ----------
@@ -233,7 +239,9 @@ class Comparison:
 def _fit_to_recordings(
     job: Job, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]
 ) -> list[Note]:
-    """Lower the rates of a job to those of recordings; it fails where these lack something."""
+    """Lower the rates of a job to those of recordings and return notes on it; the job fails where
+    these lack something.
+    """
     job.config, notes = lower_rate(job.config, "evaluation", slowest(contents))
     try:
         job.config, more = lower_rate(job.config, "estimator", slowest(contents))
@@ -247,7 +255,7 @@ def _fit_to_recordings(
 
 
 def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSummary:
-    """The recording with the lowest rate of all data sets.
+    """Summary of the recording with the lowest rate among all data sets.
 
     Parameters
     ----------
@@ -332,7 +340,7 @@ def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Con
 
 
 def print_notes(notes: Iterable[Note], runner: Runner) -> None:
-    """Print rates that were lowered, each once."""
+    """Print notes on lowered rates, each once."""
     for subject, text in notes:
         key = "evaluation.rate_hz" if subject == "evaluation" else "estimator.rate_hz"
         line = ("note", "rate", subject, f"{text}; {key}=… chooses a lower rate")
@@ -343,7 +351,7 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
 def plan_training(
     config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]
 ) -> TrainJob:
-    """A training, be it from scratch or from another model's weights, whose digest is then one of
+    """Plan a training from scratch, or from another model's weights, whose digest is then one of
     its inputs; see `plan_train`.
 
     Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
@@ -369,7 +377,9 @@ def plan_training(
 
 
 def _check_label(job: Job, training: TrainJob, labels: dict[Any, str]) -> None:
-    """Refuse a combination of a sweep that is the same training as another one."""
+    """Raise `ConfigurationError` for a combination of a sweep that is the same training as another
+    one.
+    """
     if job.label:
         twin = labels.setdefault((training.plan.key, faults_of(job.config)), job.label)
         if twin != job.label:
@@ -385,14 +395,14 @@ def name_in_part(part: str, name: str, parts: Collection[str]) -> str:
 
 def label_of(training: TrainJob) -> str:
     """Name of a training in messages, with the model that it starts from, which its folder's name
-    does not say.
+    does not contain.
     """
-    return training.plan.label + start_in_words(training.training)
+    return training.plan.label + describe_start(training.training)
 
 
 def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
-    """Failures of one comparison by name; jobs that differ in their seed alone and failed alike
-    have one name.
+    """Failures of one comparison as (name, failure); jobs that differ only in their seed and failed
+    alike have one name.
     """
     jobs_of_failure: dict[Failure, list[Job]] = {}
     for job in jobs:
@@ -404,7 +414,7 @@ def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
 
 
 def _names(jobs: Iterable[Job]) -> list[str]:
-    """Names of jobs; those that differ in their seed alone have one."""
+    """Names of jobs; those that differ only in their seed have one."""
     seeds: dict[str, list[str]] = {}
     for job in jobs:
         stem = job.label
@@ -419,7 +429,7 @@ def _names(jobs: Iterable[Job]) -> list[str]:
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:
-    """How recordings came to the rates that estimators work at.
+    """A sentence on how recordings were brought to the rates that estimators work at.
 
     Parameters
     ----------
@@ -448,7 +458,7 @@ def resampling_fact(configs: Sequence[Config]) -> str:
 
 
 def training_facts(configs: Sequence[Config]) -> list[str]:
-    """The budget of each training scheme, a line each.
+    """Lines on the budget of each training scheme.
 
     Options that move no number are left out; estimators with equal options share a line.
     """

@@ -26,10 +26,11 @@ from rich.text import Text
 
 from vehest.data.errors import printable
 
-WARNING = "warn"
+WARNING = "warn"  # status of a warning
 REUSED = "skip"  # status of an existing artefact, also in records of finished studies
 RUNNING = "run"  # status of a stage that is running
-PLAN = "plan"  # stage before those of a study: libraries and configurations are loaded
+# name of the stage before those of a study, in which libraries and configurations are loaded
+PLAN = "plan"
 MARKS = {
     WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
@@ -43,15 +44,20 @@ MARKS = {
     RUNNING: ("running", "cyan"),
     "again": ("again", "yellow"),
 }
-"""Status -> its word and colour."""
+"""Status -> the word that is printed and its colour."""
 
 MAX_BARS = 16  # progress bars at a time; further names get none
 MAX_SILENT_SECONDS = 5.0
-"""After this time a stage that is still running gets a line, so that nobody takes it for a hang."""
+"""s after which a stage that is still running gets a line, so that it is not mistaken for a
+hang.
+"""
 
 
 class _Console(Console):
+    """rich's console, which raises `BrokenPipeError` instead of ending the process."""
+
     def on_broken_pipe(self) -> None:
+        """Raise `BrokenPipeError` where the reader of the stream has closed it."""
         raise BrokenPipeError  # which rich would turn into an exit
 
 
@@ -175,7 +181,7 @@ class Messages:
 
 
 def _status_line(status: str, stage: str, label: str, detail: str = "") -> Text:
-    """A status, stage, label and detail as one line with colours."""
+    """A line of status, stage, label and detail with colours."""
     word, colour = MARKS[status]
     suffix = (f" {printable(detail)}" if detail else "", "dim")
     return Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", suffix)

@@ -29,11 +29,11 @@ EXTRAS = {
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that was checked."""
+    """Result of one check of the environment."""
 
-    level: Literal["ok", "warning", "error"]
-    name: str
-    message: str
+    level: Literal["ok", "warning", "error"]  # severity
+    name: str  # name of the part that was checked
+    message: str  # the result, with the remedy where something is wrong
 
 
 def examine() -> Iterator[Item]:

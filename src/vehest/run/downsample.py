@@ -11,13 +11,13 @@ from vehest.data.resampling import resampled, transforms_of
 from vehest.data.store import read_recording, write_recording
 from vehest.run.versions import code_of
 
-STAGE = "downsample"
+STAGE = "downsample"  # name of the stage
 
 
 def plan_downsample(
     ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path
 ) -> StagePlan:
-    """The artefact of a downsampling.
+    """Plan the artefact of a data set's recordings at another rate.
 
     Parameters
     ----------

@@ -41,20 +41,21 @@ from vehest.inference.reading import vehicle_of, without_references
 from vehest.inference.tables import LOG_SUFFIXES, check_table_name, write_estimate_table
 from vehest.run.estimate_log import check_log_name, write_log
 from vehest.run.estimate_summary import point_of_estimate
-from vehest.run.printing import complain, finding_in_words, note
+from vehest.run.printing import complain, describe_finding, note
 from vehest.sources.base import car_of, source_of_file
 from vehest.trust.contract import GuardedRun
 from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, describe_band, is_other_vehicle
 
-MIN_LOG_RATE_HZ = 5.0  # of a log that is brought to a faster model; a slower one misses the motion
+# Hz, smallest rate of a log that is brought to a faster model; a slower one misses the motion
+MIN_LOG_RATE_HZ = 5.0
 MAX_WHEELBASE_OVER_RADIUS = (
     0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
 )
 # vx² over gravity and wheelbase that a hundredth of a drive may exceed before the wheelbase is
 # doubted; 170 on real race cars
 MAX_FROUDE_NUMBER = 400.0
-CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
+CONTRADICTIONS = ("sign", "unit")  # names of the checks that compare channels with each other
 
 
 def estimate_file(
@@ -158,7 +159,7 @@ def estimate_file(
             write_estimate_table(estimates, out, band)
     for remark in remarks:
         note(remark)
-    findings = [finding_in_words(finding) for finding in merged_findings(report.findings)]
+    findings = [describe_finding(finding) for finding in merged_findings(report.findings)]
     for finding in findings:
         complain(f"warning: {finding}")
     return {
@@ -276,10 +277,8 @@ def findings_of(
 
 
 def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Finding]:
-    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a
-    wheelbase [m].
-
-    None: not known.
+    """Check a wheelbase against a drive: a finding where the car, above 1 m/s, turns too sharply or
+    is too fast for any car of that wheelbase.
 
     Parameters
     ----------
@@ -359,7 +358,7 @@ class _Report:
         self.reasons: Counter[float] = Counter()
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
-        """The parts, once they are checked.
+        """Pass on the parts of a drive after their findings have been collected.
 
         Raises `DataError` as `findings_of` does, and where it is strict.
 
@@ -371,7 +370,7 @@ class _Report:
         for part, of_all_channels in parts:
             findings = findings_of(part, self.model, self.accepted, of_all_channels)
             if self.strict and findings:
-                raise DataError(f"{self.strict}: {finding_in_words(findings[0])}")
+                raise DataError(f"{self.strict}: {describe_finding(findings[0])}")
             self.findings.append(findings)
             self.seconds += part.duration
             if self.health is not None:
@@ -381,7 +380,8 @@ class _Report:
             yield part
 
     def counted(self, parts: Iterable[Estimate]) -> Iterator[Estimate]:
-        """The parts of the estimate, once they count; raises `DataError` where all are empty.
+        """Pass on the parts of the estimate after they have been counted for the figures; raises
+        `DataError` where all are empty.
 
         Parameters
         ----------
@@ -415,7 +415,7 @@ class _Report:
             raise too_short_error(self.model, self.last.recording_id, self.seconds)
 
     def summary(self) -> dict[str, Any]:
-        """Figures of the estimate, for people and scripts.
+        """Figures of the estimate, for the terminal and for JSON.
 
         Returns
         -------
@@ -466,14 +466,13 @@ class _Report:
 
     @property
     def outside_training(self) -> str:
-        """Share of the drive outside the range of the training, and its channels.
-
-        Empty if there is none.
+        """Text on the share of the drive outside the range of the training, with the channels;
+        empty if there is none.
         """
         return domain_verdict(self.health, self.outside) if self.health is not None else ""
 
     def verdict(self) -> str:
-        """The share of valid samples and what makes others invalid, in a line."""
+        """One line on the share of valid samples and on what makes others invalid."""
         if self.health is None:
             bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"

@@ -17,13 +17,12 @@ from vehest.data.recording import Recording
 from vehest.sources.limited import read_limited
 from vehest.trust.health import reason_in_words
 
-PREFIX = "vehest_"
-HEALTH = ("valid", "degraded", "invalid")
+PREFIX = "vehest_"  # start of the names of the channels that are added to a log
+HEALTH = ("valid", "degraded", "invalid")  # texts of the codes 0, 1 and 2 of health
 
 
 def check_log_name(log: Path, out: Path) -> None:
-    """Raises `ConfigurationError` where a log cannot be written in the format that a name asks
-    for.
+    """Raise `ConfigurationError` where a log cannot be written in the format that a name requires.
 
     Parameters
     ----------
@@ -101,7 +100,7 @@ def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) ->
 
 
 def _texts(name: str, values: FloatArray) -> dict[int, str]:
-    """Texts of the codes of health and its reason."""
+    """Code -> text, for the codes of health or of its reason that occur in ``values``."""
     if name == "health":
         return dict(enumerate(HEALTH))
     return (

@@ -22,7 +22,7 @@ LABEL_WIDTH = 10  # characters before the text of a line
 
 
 def point_of_estimate(model: Estimator, model_folder: Path) -> str:
-    """The point of the car to which v and β belong.
+    """Text of the point of the car to which v and β belong.
 
     A trained model estimates them at the reference point of its training data, which is the centre
     of gravity unless a data set states that it is unknown. The self-calibrating filter has a
@@ -51,7 +51,7 @@ def point_of_estimate(model: Estimator, model_folder: Path) -> str:
 
 
 def describe_point(model: SelfCalibrating) -> str:
-    """The reference point of the self-calibrating filter, with its place in the car."""
+    """Text of the reference point of the self-calibrating filter, with its place in the car."""
     if model.point == "rear_axle":
         return "rear axle"
     if model.point == "cg":
@@ -69,7 +69,7 @@ def describe_point(model: SelfCalibrating) -> str:
 
 
 def has_unknown_reference_point(dataset: str) -> bool:
-    """Whether a file of conf/dataset states that the place of its reference sensor is not known."""
+    """Whether a file of conf/dataset states that the place of its reference sensor is unknown."""
     with suppress(ConfigurationError):
         config = compose_config("ingest", [f"dataset={dataset}"])
         return bool(config["dataset"].get("reference_point") == "unknown")
@@ -102,7 +102,9 @@ def summary_lines(outcome: Mapping[str, Any]) -> list[str]:
 
 
 def _valid(outcome: Mapping[str, Any]) -> str:
-    """Share of valid samples, and what it rests on where the model has no calibration."""
+    """Text of the share of valid samples, and of what it rests on where the model has no
+    calibration.
+    """
     share = f"{outcome['valid_percent']:.3g} % of the estimated samples"
     if not outcome["has_calibration"]:
         return f"{share}, by gaps and speeds alone: the model has no calibration"
@@ -110,7 +112,7 @@ def _valid(outcome: Mapping[str, Any]) -> str:
 
 
 def describe_use(outcome: Mapping[str, Any]) -> str:
-    """Which samples may be used, how far off they may be, and what limits the others.
+    """Text on which samples may be used, how large their errors may be, and what limits the others.
 
     Returns
     -------
@@ -144,8 +146,8 @@ def describe_use(outcome: Mapping[str, Any]) -> str:
 
 
 def _grouped(reasons: Sequence[str]) -> list[str]:
-    """Reasons that differ in the channel alone as one: ``outside the range of the training: |vx|,
-    |ay|``.
+    """Merge reasons that differ only in the channel into one: ``outside the range of the training:
+    |vx|, |ay|``.
     """
     channels: dict[str, list[str]] = {}
     for reason in reasons:
@@ -157,7 +159,9 @@ def _grouped(reasons: Sequence[str]) -> list[str]:
 
 
 def _range(outcome: Mapping[str, Any]) -> str:
-    """Share outside the range of the training, and for how long health flags it beyond that."""
+    """Text on the share of the drive outside the range of the training, and on when a sample is
+    valid again; empty if there is none.
+    """
     if not outcome["outside_training"]:
         return ""
     return (
@@ -167,14 +171,16 @@ def _range(outcome: Mapping[str, Any]) -> str:
 
 
 def _columns(out: Path) -> str:
-    """What a table has, after its name; empty for a log with further channels."""
+    """Text on the columns of a written table, after its name; empty for a log with further
+    channels.
+    """
     if out.suffix.lower() in LOG_SUFFIXES:
         return ""
     return " (vy [m/s], sideslip [rad], sideslip_deg [deg], half widths of the band, health)"
 
 
 def _sideslip(outcome: Mapping[str, Any]) -> str:
-    """Range of the sideslip angle where the car moves forward and fast enough."""
+    """Text of the range of the sideslip angle where the car moves forward and fast enough."""
     low, high = (outcome["sideslip_deg"][end] for end in ("min", "max"))
     if low is None:
         return f"never forward at {outcome['min_sideslip_speed']:.3g} m/s or more"
@@ -182,7 +188,7 @@ def _sideslip(outcome: Mapping[str, Any]) -> str:
 
 
 def _band(outcome: Mapping[str, Any]) -> str:
-    """The half width of the 90 % band, after the range of the sideslip angle."""
+    """Text of the half width of the 90 % band, appended to the range of the sideslip angle."""
     band = outcome.get("band_sideslip_deg")
     if not band:
         return ", without a band"

@@ -31,7 +31,7 @@ from vehest.sources.tables import TextLayout, column_names, is_parquet
 from vehest.sources.unit_spellings import plain_unit
 
 CHANNELS_OF_QUANTITIES = {"time": "time", "vy": "vy_ref", "sideslip": "sideslip_ref"}
-"""Quantity that ``--column`` names -> time, or the channel that its column is read as."""
+"""Quantity that ``--column`` names -> ``time``, or the channel as which its column is read."""
 SPELLINGS = {
     "time": ("time", "t", "timestamp", "zeit"),
     "vy_ref": ("vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"),
@@ -46,18 +46,20 @@ SPELLINGS = {
         "betahat",
     ),
 }
-"""Time, or channel that a quantity is read as -> names of its column, spaces, underscores, case and
-units aside.
+"""``time``, or channel as which a column is read -> accepted names of the column, without spaces,
+underscores, case and units.
 """
 OF_VEHEST = frozenset({"band_vy", "band_sideslip", "health_reason"})
-"""Columns that estimates of vehest have, and those of other tools do not."""
+"""Columns that only estimates of vehest have, by which these are recognised."""
+# ``time``, or channel -> unit where neither the column's name nor the user states one
 DEFAULT_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
+# unit of time in a column's name -> as vehest spells it
 TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-AUTO = "auto"
+AUTO = "auto"  # value of ``--shift`` for a shift by correlation
 
 
 def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
-    """Columns from ``QUANTITY=COLUMN`` words.
+    """Parse the ``QUANTITY=COLUMN`` words of ``--column``.
 
     Parameters
     ----------
@@ -86,7 +88,7 @@ def parse_columns(words: Sequence[str]) -> list[NamedColumn]:
 
 
 def parse_shift(text: str) -> float | None:
-    """Seconds of ``--shift``, None for ``auto``.
+    """Parse ``--shift``: seconds, or None for ``auto``.
 
     Parameters
     ----------
@@ -185,7 +187,7 @@ def read_estimate_table(
 
 
 def names_of_table(file: Path) -> list[str]:
-    """Names of a table's columns.
+    """Names of a table's columns, in their order.
 
     Raises
     ------
@@ -203,7 +205,9 @@ def _layout(file: Path) -> TextLayout:
 def _columns_of(
     file: Path, names: Sequence[str], columns: Sequence[NamedColumn]
 ) -> dict[str, dict[str, str | int]]:
-    """Time and channels of a table with column, unit and sign, as a data set declares them."""
+    """Entries for time and channels of a table, each with column, unit and sign, as a data set
+    declares them.
+    """
     declared: dict[str, dict[str, str | int]] = {}
     for named in columns:
         place = named.find(names)
@@ -220,8 +224,8 @@ def _columns_of(
 
 
 def _plain_names(name: str) -> set[str]:
-    """A column's name without case, blanks, underscores and what is in brackets, with and without
-    the unit that it ends in.
+    """A column's name without case, blanks, underscores and brackets, both with and without the
+    unit that it ends in.
     """
     bare = re.sub(r"[\[(].*?[\])]", "", name).strip()
     forms = {bare, re.sub(r"[_\s]+[^_\s]+$", "", bare) if unit_in_name(bare) else bare}
@@ -231,7 +235,7 @@ def _plain_names(name: str) -> set[str]:
 
 
 def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
-    """What a table lacks, the accepted names, and how to name a column."""
+    """Message on what a table lacks, on the accepted names, and on how to name a column."""
     if is_time:
         lacks = f"no column time [s] (accepted names: {', '.join(SPELLINGS['time'])}"
         remedy = "--column time=NAME"
@@ -243,7 +247,7 @@ def _missing_columns(file: Path, names: Sequence[str], is_time: bool) -> str:
 
 
 def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
-    """The unit that is stated or in a column's name, or the default.
+    """Unit of a column: the stated one, that in the column's name, or the default.
 
     Parameters
     ----------
@@ -289,7 +293,7 @@ def unit_of(quantity: str, name: str, file: Path, stated: str = "") -> str:
 
 
 def _seconds(file: Path, table: Recording, drive: Recording, shift: float | None) -> float:
-    """Seconds to add to the times of a table; a shift that was estimated is printed."""
+    """Seconds to add to the times of a table; an estimated shift is printed."""
     if shift is not None:
         return shift
     (channel,) = table.channels

@@ -31,7 +31,12 @@ from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
-from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
+from vehest.evaluation.bands import (
+    band_figures,
+    coverage_intervals,
+    figures_by_regime,
+    scored_bands,
+)
 from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
@@ -62,20 +67,22 @@ from vehest.trust.bands import Bands, with_bands
 from vehest.trust.faults import is_fault
 from vehest.trust.record import Trust, read_trust
 
-STAGE = "evaluate"
-METRICS = "metrics.csv"
-BLOCKS = "blocks.csv"
-TIMES = ("train_seconds", "step_seconds")
+STAGE = "evaluate"  # name of the stage
+METRICS = "metrics.csv"  # name of the table of metrics in an evaluation's folder
+BLOCKS = "blocks.csv"  # name of the table of segments in an evaluation's folder
+TIMES = ("train_seconds", "step_seconds")  # metrics that are times, which have a file of their own
 TIMED_STEPS = 200  # online steps at most, of which the median time is reported
+# figures of the fit that are listed among the metrics
 FIT_FIGURES = ("n_parameters", "epochs", "train_seconds")
+# metrics that are computed on the training ranges
 TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
-COLUMNS = METRIC_COLUMNS[1:]
+COLUMNS = METRIC_COLUMNS[1:]  # columns of the table of metrics: `METRIC_COLUMNS` without the study
 ALL_UNITS = UNITS | UNITS_UNDER_FAULT  # metric -> unit
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
-    """How estimates are scored.
+    """Rules of scoring by the section ``evaluation`` of a configuration.
 
     Parameters
     ----------
@@ -141,19 +148,21 @@ def evaluation_options(protocol: Protocol, faults: Sequence[FaultSettings]) -> d
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How models are evaluated: on which validation range and tests, and under which faults too."""
+    """Settings of an evaluation: on which validation range and tests models are scored, how, and
+    under which faults.
+    """
 
-    split: Split
+    split: Split  # ranges; the validation and the tests are scored
     data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
     references: Mapping[str, Artefact]  # data set -> recordings at the evaluation rate
     kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
-    protocol: Protocol
-    output: Path
-    faults: tuple[FaultSettings, ...] = ()
+    protocol: Protocol  # protocol by which estimates are scored
+    output: Path  # output root
+    faults: tuple[FaultSettings, ...] = ()  # faults under which tests are scored, too
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
 
     def of(self, model: Artefact, calibration: Artefact | None) -> tuple[StagePlan, Write]:
-        """The evaluation of a model, as `artefacts.make` takes it.
+        """Plan the evaluation of a model, as `artefacts.make` takes it.
 
         Parameters
         ----------
@@ -244,32 +253,35 @@ class Evaluation:
         ).without_references()
 
     def state(self, piece: Span) -> dict[str, float] | None:
-        """The state that the protocol passes to an estimator at the start of a piece, if any."""
+        """The state that the protocol passes to an estimator at the start of a piece, quantity ->
+        value [SI]; None if there is none.
+        """
         return (
             reference_state(self.reference(piece), piece) if self.protocol.initial_state else None
         )
 
     def score(self, spans: Sequence[Span], estimates: Sequence[Estimate]) -> list[Scored]:
-        """Estimates of a test set beside the reference."""
+        """Score the estimates of a test set against the reference, one a range or sequence."""
         return score_all(estimates.__getitem__, spans, self.reference, self.protocol)
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:
-    """Everything that is scored: the tests, and the validation range, on which seeds are chosen."""
+    """Name -> ranges of everything that is scored: the tests, and the validation range, on which
+    seeds are chosen.
+    """
     return {**({VALIDATION: split.validation} if split.validation else {}), **split.tests}
 
 
 def scored_spans(split: Split) -> list[Span]:
-    """The ranges of all test sets."""
+    """The ranges of all test sets, the validation range included."""
     return [span for spans in test_sets(split).values() for span in spans]
 
 
 def _write(
     evaluation: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path
 ) -> None:
-    """Estimate and score every range, under faults too.
-
-    Write estimates, metrics and, in a file of their own, times into ``folder``.
+    """Estimate and score every range, under faults too, and write estimates, metrics and, in a file
+    of their own, times into ``folder``.
     """
     estimator = load_model(model.folder)
     protocol = evaluation.protocol
@@ -332,8 +344,8 @@ def _rows_of_parts(
     scored: Sequence[Scored],
     bands: Bands | None,
 ) -> list[dict[str, Any]]:
-    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of
-    bands, over all samples and by regime.
+    """Rows of the metrics with the best lever arm, by regime (except on validation), and of
+    bands.
     """
     protocol = evaluation.protocol
     masks = []
@@ -354,7 +366,7 @@ def _rows_of_parts(
         for regime, figures in errors_by_regime(scored, masks, protocol.rate_hz).items():
             rows += _rows(head, figures, subset=regime)
     if bands is not None:
-        within = banded(scored, bands)
+        within = scored_bands(scored, bands)
         intervals = coverage_intervals(within, scored, protocol.rate_hz)
         rows += _rows(head, band_figures(within, scored, turns, protocol.rate_hz), intervals)
         for regime, figures in figures_by_regime(within, masks, protocol.rate_hz).items():
@@ -370,8 +382,8 @@ def _rows_under_faults(
     nominal: Sequence[Scored],
     trust: Trust | None,
 ) -> list[dict[str, Any]]:
-    """Rows of each fault, under a condition of its own, over all samples and over those while it
-    lasts.
+    """Rows of the metrics under each fault, with its condition, for the subsets while it lasts and
+    after it.
     """
     if not evaluation.faults:
         return []
@@ -419,7 +431,9 @@ def _rows(
     intervals: Mapping[str, tuple[float, float]] | None = None,
     **columns: str,
 ) -> list[dict[str, Any]]:
-    """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
+    """Rows of `COLUMNS`, one for each metric in ``figures``, with the ends of its interval;
+    ``columns`` replace those of the head.
+    """
     rows = []
     for metric, value in figures.items():
         low, high = (
@@ -441,7 +455,9 @@ def _rows(
 def _estimates(
     estimator: Estimator, evaluation: Evaluation, pieces: Sequence[Span]
 ) -> list[Estimate]:
-    """An estimate each; sequences in one go, since a method may then take them all at once."""
+    """Estimate each piece; sequences are passed at once, since a method may process them
+    together.
+    """
     batches = (
         [pieces]
         if evaluation.protocol.sequence_seconds is not None
@@ -459,8 +475,8 @@ def _estimates(
 def _floors(
     estimator: Estimator, evaluation: Evaluation, spans: Sequence[Span]
 ) -> dict[str, float]:
-    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as
-    they are known.
+    """Metrics of the reference's noise and, for a causal estimator, of the bound for its inputs,
+    name -> value, as far as they can be computed.
     """
     drives = drives_of(spans, evaluation.reference, evaluation.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
@@ -491,9 +507,8 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
 def training_rows(
     evaluation: Evaluation, model: Artefact, estimator: Estimator
 ) -> list[dict[str, Any]]:
-    """Errors on the training ranges.
-
-    None where the reference has gaps there or nothing was learnt.
+    """Rows of the metrics on the training ranges; empty where the reference has gaps there or
+    nothing was trained.
 
     Parameters
     ----------
@@ -529,7 +544,8 @@ def training_rows(
 
 
 def read_metrics(folder: Path, file: str = METRICS) -> pd.DataFrame:
-    """Metrics (METRICS) or times (TIMINGS) in the folder of an evaluation, with `COLUMNS`.
+    """Read the metrics (METRICS) or times (TIMINGS) in the folder of an evaluation, a table with
+    `COLUMNS`.
 
     Raises
     ------
@@ -557,7 +573,7 @@ def test_figures(folder: Path) -> dict[str, float]:
 
 
 def fault_figures(folder: Path) -> dict[str, float]:
-    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` ->
+    """Metrics of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` ->
     value.
     """
     return {

@@ -31,7 +31,7 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
-NONE = {"name": "none"}
+NONE = {"name": "none"}  # choice of ``fault`` without a fault
 DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 
 
@@ -39,25 +39,27 @@ DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 class FaultSettings:
     """One choice of ``fault``; conf/fault explains its keys."""
 
-    name: str
-    channel: str
+    name: str  # kind of fault, one of `vehest.trust.faults.KINDS`
+    channel: str  # channel that it affects
+    # severity, by which one of the kind's sizes is chosen
     severity: Annotated[Severity, "mild, medium or severe"]
-    size: float | None = None  # instead of the severity's
-    # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    size: float | None = None  # size that replaces the severity's
+    # time of its start after the start of each range [s]; None: drawn, within `DRAWN_START`
     start: float | None = None
-    duration: float | None = None  # [s]; None: to the end of the range
-    seed: int = 0
+    duration: float | None = None  # length of the fault [s]; None: to the end of the range
+    seed: int = 0  # seed of all random draws
 
     def __post_init__(self) -> None:
         self.within(0.0, 100.0, 0)
 
     @property
     def condition(self) -> str:
-        """Its name in an evaluation."""
+        """Name of the fault in the column ``condition`` of an evaluation."""
         return self._fault.condition
 
     @property
     def _fault(self) -> Fault:
+        """The fault without its time, which checks kind, channel and size."""
         return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
 
     def within(self, start: float, length: float, position: int) -> Fault:
@@ -134,7 +136,9 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
 
 
 def chosen_fault(config: Config) -> FaultSettings | None:
-    """The choice of ``fault``, if any; the figures of a sweep are those under it."""
+    """The choice of ``fault`` of a configuration; None without one. The metrics of a sweep are
+    those under it.
+    """
     chosen = config.get("fault") or NONE
     return None if chosen == NONE else _settings(chosen)
 

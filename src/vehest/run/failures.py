@@ -12,16 +12,16 @@ from vehest.data.files import no_room
 
 @dataclass(frozen=True)
 class Failure:
-    """A job or command that failed."""
+    """Failure of a job or command, for its message and exit code."""
 
-    message: str  # one line
-    detail: str = ""  # traceback of a defect
-    exit_code: int = 1  # of a command that runs this job alone
+    message: str  # one line on what failed and how to remedy it
+    detail: str = ""  # traceback of a defect; else empty
+    exit_code: int = 1  # exit code of a command that runs this job alone
 
 
 def failure_of(error: Exception) -> Failure:
-    """The failure behind an exception that a job or command raised; a defect unless the user or the
-    machine can change it.
+    """Turn an exception that a job or command raised into a failure: a defect with traceback,
+    unless the user or the machine can change it.
 
     Returns
     -------
@@ -42,7 +42,9 @@ def failure_of(error: Exception) -> Failure:
 
 
 def _of_machine(error: Exception) -> MissingError | None:
-    """The error in words where the machine is short of something or a file cannot be reached."""
+    """Error with a message for the user where the machine is short of memory, disk or files, or a
+    file cannot be reached; None for another error.
+    """
     full = no_room(error)
     if full is not None:
         target = f"'{full.filename}'" if full.filename else "where results and temporary files go"

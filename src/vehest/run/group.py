@@ -26,7 +26,9 @@ from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
 from vehest.trust.health import SLOW_KERNEL
 
-FLOOR_KERNEL = "vehest.filters.kalman_scan:_scan"  # of the floors that an evaluation gives
+# entry that an evaluation compiles for noise floors
+FLOOR_KERNEL = "vehest.filters.kalman_scan:_scan"
+# takes the progress of a training, or what a group waits for
 Report = Callable[[Progress | Waiting], None]
 
 
@@ -34,15 +36,17 @@ Report = Callable[[Progress | Waiting], None]
 class Member:
     """A training with its model, calibration and evaluation, as far as they exist."""
 
-    job: TrainJob
-    model: Artefact | None = None
-    evaluation: Artefact | None = None
+    job: TrainJob  # the training
+    model: Artefact | None = None  # trained model; None: not trained yet
+    evaluation: Artefact | None = None  # evaluation of the model; None: not evaluated yet
+    # calibration of the model; None: not calibrated, or without a validation range
     calibration: Artefact | None = None
-    finished: bool = False  # nothing of it is missing
+    # whether training, calibration and evaluation are done, as far as they are planned
+    finished: bool = False
 
     @property
     def made(self) -> list[Artefact]:
-        """What exists of it, in the order in which it was made."""
+        """The artefacts of the member that exist, in the order in which they are made."""
         return [
             artefact
             for artefact in (self.model, self.calibration, self.evaluation)
@@ -52,18 +56,18 @@ class Member:
 
 @dataclass(frozen=True)
 class Group:
-    """Members that fit one batch, and what is to be done with them."""
+    """Trainings that fit one batch, with the calibration and evaluation of their models."""
 
-    jobs: Sequence[TrainJob]
-    split: Split  # whose validation range members are calibrated on
-    evaluation: Evaluation | None = None  # none if they are only trained
-    force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
-    label: str = ""  # what members have in common; the estimator and its variant if empty
+    jobs: Sequence[TrainJob]  # the trainings
+    split: Split  # split on whose validation range the models are calibrated
+    evaluation: Evaluation | None = None  # evaluation of the models; None: they are only trained
+    force: frozenset[str] = frozenset()  # stages that are run although their artefacts exist
+    label: str = ""  # name in messages; if empty, the estimator and its variant
     cars: Mapping[str, CarValues] = field(default_factory=dict)  # data set -> values of its car
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the group in messages."""
         seeds = [str(job.seed) for job in self.jobs]
         label = self.label or self.jobs[0].plan.label.rsplit("-seed", 1)[0]
         return f"{label} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
@@ -184,8 +188,8 @@ def _member(
 
 
 def compile_lock(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
-    """While kernels of calibration and evaluation are not in the compile cache, one process
-    compiles them, and others wait for it.
+    """Lock under which one process compiles the kernels of calibration and evaluation while others
+    wait; without effect once they are in the compile cache.
 
     The lock lies in the output root; ``should_stop`` is called while waiting.
     """
@@ -209,7 +213,9 @@ def locked_jobs(
 
 
 def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
-    """Jobs that can go on together: those whose checkpoints, if any, stand at the same epoch."""
+    """Group jobs that can continue together: those whose checkpoints, if any, are of the same
+    epoch.
+    """
     batches: dict[int, list[TrainJob]] = {}
     for job in jobs:
         batches.setdefault(resume_epoch(job.plan.checkpoint_folder), []).append(job)

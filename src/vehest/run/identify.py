@@ -36,15 +36,17 @@ from vehest.inference.car_values import (
 from vehest.inference.estimation import prepared_recording
 from vehest.inference.models import SELF_CALIBRATING, open_model
 from vehest.run.estimate import findings_of
-from vehest.run.printing import TerminalTable, complain, finding_in_words, note
+from vehest.run.printing import TerminalTable, complain, describe_finding, note
 from vehest.sources.base import car_of
 
-IDENTIFIED_SHARE = (
-    0.5  # of the prior's variance: a number is identified on a drive that leaves less
-)
+# share of the prior's variance; a parameter is identified on a drive after which less remains
+IDENTIFIED_SHARE = 0.5
+# parameter -> index of its state in the filter
 STATE_ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
+# channel -> index of the state that is its offset
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
-UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
+UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}  # parameter -> unit
+# parameter -> its meaning
 MEANINGS = {
     "leakage": "share of ay that is gravity of the rolling body",
     "rear_axle": "distance of the inertial unit from the rear axle, negative behind it",
@@ -62,13 +64,13 @@ YAW_RATE_LATENESS_SECONDS = 0.03
 
 
 class Normal(NamedTuple):
-    """A number's mean and standard deviation, and what a yaw rate that is late by
-    `YAW_RATE_LATENESS_SECONDS` adds to the mean.
+    """Mean and standard deviation of a parameter, and the change of the mean by a yaw rate that is
+    late by `YAW_RATE_LATENESS_SECONDS`.
     """
 
-    mean: Any
-    deviation: Any
-    of_lateness: Any = 0.0
+    mean: Any  # mean, in the parameter's unit
+    deviation: Any  # standard deviation
+    of_lateness: Any = 0.0  # change of the mean by the lateness of the yaw rate
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
@@ -109,7 +111,7 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         if drive.id in drives:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
         for finding in findings_of(drive, model, options.dataset.get("accept") or ()):
-            complain(f"warning: {drive.id}: {finding_in_words(finding)}")
+            complain(f"warning: {drive.id}: {describe_finding(finding)}")
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)
     for remark in remarks:
@@ -124,11 +126,9 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
     return record
 
 
-def in_words(record: CarRecord) -> TerminalTable:
-    """A record for a terminal.
-
-    A row a number: value, deviation, unit, how much the drives excited it, on which drives it was
-    identified, and what it means.
+def record_table(record: CarRecord) -> TerminalTable:
+    """Table of a car's record for a terminal, with a row for each parameter: value, deviation,
+    unit, how much the drives excited it, on which drives it was identified, and what it means.
     """
     numbers = {name: getattr(record, name) for name in LIMITS}
     numbers |= {
@@ -157,14 +157,15 @@ def in_words(record: CarRecord) -> TerminalTable:
 
 
 def _excitation(deviation: float, at_start: float) -> str:
-    """How much the drives have excited a number: the share of the prior's variance that they
-    removed.
+    """Text of how much the drives have excited a parameter: the share of the prior's variance that
+    they removed.
     """
     return f"{100.0 * max(0.0, 1.0 - (deviation / at_start) ** 2):.0f} %"
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
-    """Numbers after a drive, grip by its logarithm, and mean offsets.
+    """Run the filter over a drive: the parameters at its end, grip by its logarithm, and mean
+    offsets.
 
     Parameters
     ----------
@@ -205,7 +206,9 @@ def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Norm
 
 
 def _final_state(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
-    """Means and deviations after samples of the model's channels, (T, C)."""
+    """Run the filter over samples of the model's channels, (T, C): parameter -> mean and standard
+    deviation at the end.
+    """
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
     numbers = {
@@ -235,9 +238,8 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
 
 
 def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float]:
-    """Of log a_max, over the filters that have one.
-
-    The bank resolves half a step between its limits.
+    """Mean and standard deviation of log a_max over the filters of the bank, by their weights; the
+    bank resolves half a step between its limits.
     """
     logs = np.log(model.grips)
     weights = np.exp(log_weights[: len(model.grips)] - log_weights.max())

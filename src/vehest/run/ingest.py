@@ -33,20 +33,19 @@ from vehest.run.versions import code_of
 from vehest.sources.base import SIMULATED, Source, open_source
 from vehest.trust.health import SLOW_KERNEL, compile_health
 
-STAGE = "ingest"
-PARTS_PREFIX = ".parts-"
-MAX_ID_BYTES = 200  # bytes
-MAX_NAMES = 6  # of recordings in an error
+STAGE = "ingest"  # name of the stage
+PARTS_PREFIX = ".parts-"  # start of the name of a folder with recordings of an unfinished ingest
+MAX_ID_BYTES = 200  # bytes of a recording's id, at most, since it is the name of a file
+MAX_NAMES = 6  # recordings that an error names, at most
 Report = Callable[
     [int, int, str], None
 ]  # recordings done, recordings in all, name of one that was begun
-PROSE = frozenset(
-    {"path", "title", "licence", "citation", "download", "car"}
-)  # of a data set's configuration; samples do not depend on it
+# keys of a data set's configuration on which samples do not depend
+PROSE = frozenset({"path", "title", "licence", "citation", "download", "car"})
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """The artefact of an ingest.
+    """Plan the artefact of a data set's recordings.
 
     Parameters
     ----------
@@ -167,8 +166,8 @@ def write_ingest(
 
 
 def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataError:
-    """The first failure with its recording, the names of other recordings that failed, and its exit
-    code.
+    """Error of an ingest: the first failure with its recording and exit code, and the names of
+    other recordings that failed.
     """
     (recording_id, first), *further_failures = failures
     place = f"data set '{dataset}', recording '{recording_id}'"
@@ -183,7 +182,7 @@ def _error_of(dataset: str, failures: Sequence[tuple[str, Failure]]) -> DataErro
 
 
 def make_part(description: str, recording_id: str, parts: Path, *_: object) -> None:
-    """Make one recording in a worker; the source is opened once a process."""
+    """Make one recording in a worker process, in which the source is opened once."""
     _make(_opened(description), recording_id, parts)
 
 
@@ -208,7 +207,9 @@ def _make(source: Source, recording_id: str, folder: Path) -> None:
 
 
 def parts_of(plan: StagePlan) -> Path:
-    """Folder of the recordings that are made, beside the artefact, while others are not."""
+    """Folder of the finished recordings of an ingest while others are missing, beside the
+    artefact's folder.
+    """
     return plan.folder.with_name(f"{PARTS_PREFIX}{plan.folder.name}")
 
 
@@ -278,9 +279,8 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
 
 
 def _datasets_with_download() -> list[str]:
-    """Names of the data sets whose files can be fetched.
-
-    Those whose configuration cannot be read are left out.
+    """Names of the data sets whose files can be downloaded; those whose configuration cannot be
+    read are left out.
     """
     names = []
     for name in choices("dataset"):
@@ -291,7 +291,7 @@ def _datasets_with_download() -> list[str]:
 
 
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
-    """Fetch a data set's missing files and record or compare the others' checksums.
+    """Download a data set's missing files, and record or compare the checksums of the others.
 
     Raises as `Download.fetch`, or `ConfigurationError`.
 

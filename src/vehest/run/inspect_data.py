@@ -31,17 +31,17 @@ from vehest.data.store import read_recording
 from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.named_files import require_dataset_or_file
 from vehest.run.printing import TerminalTable
-from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
+from vehest.run.usable import SCORED, absent_channels, all_usabilities, usability_lines
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.tabular import unused_columns
 
 # Time stamps between these count from 1970.
 MIN_UNIX_SECONDS = 6e8  # s, in 1989
 MAX_UNIX_SECONDS = 4e9  # s, in 2096
-MAX_LISTED_COLUMNS = 40  # of a table that are listed
-SPREAD = ("min", "mean", "max", "std")
+MAX_LISTED_COLUMNS = 40  # largest number of columns of a table that are listed
+SPREAD = ("min", "mean", "max", "std")  # statistics of a channel that are listed
 
-Lines = list[str | TerminalTable]
+Lines = list[str | TerminalTable]  # lines and tables for a terminal
 
 
 def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
@@ -86,7 +86,8 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines, list[str]]:
 
 
 def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
-    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal.
+    """Describe the recordings of a data set or file, with statistics of their channels: plain
+    values for JSON, and lines for a terminal.
 
     Raises `VehestError`.
 
@@ -98,10 +99,10 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
         Of conf/ingest.yaml or conf/estimate.yaml.
     """
     with reading(source, overrides) as config:
-        recordings = [_described(read()) for _, read in _readers(source, config)]
+        recordings = [_plain_summary(read()) for _, read in _readers(source, config)]
     lines: Lines = []
     for recording in recordings:
-        period = _stretch(recording["start"], recording["end"])
+        period = _describe_time_range(recording["start"], recording["end"])
         about = (
             f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, "
             f"{recording['rate_hz']:g} Hz, {period}"
@@ -119,7 +120,8 @@ def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lin
 
 
 def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], Lines]:
-    """Findings of the checks, for JSON and for a terminal.
+    """Run the checks on all recordings of a data set or file: rows for JSON, and lines for a
+    terminal.
 
     A recording that cannot be read is an error too.
 
@@ -174,7 +176,7 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
         raise DataError(f"'{source}' contains no recordings")
     rows = all_usabilities(recordings, config["dataset"])
     missing = absent_channels(SCORED, recordings).to_estimate
-    lines = usable_in_words(rows)
+    lines = usability_lines(rows)
     if missing:
         lines.append(f"missing channels that every score requires: {' and '.join(missing)}")
     if columns:
@@ -198,7 +200,8 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
 
 @contextmanager
 def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
-    """The configuration that reads a data set or a file, while its limits hold.
+    """Context with the configuration that reads a data set or a file, and with its limits in
+    effect.
 
     Yields
     ------
@@ -220,9 +223,8 @@ def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
 
 
 def _contents(source: str, config: Config) -> list[RecordingSummary]:
-    """Summaries of the recordings, from the store where they are ingested.
-
-    Of a slow source the first alone.
+    """Summaries of the recordings, from the store where they are ingested; of a slow source only of
+    the first.
     """
     ingested = find(plan_ingest(config)) if source in choices("dataset") else None
     if ingested is not None:
@@ -232,9 +234,8 @@ def _contents(source: str, config: Config) -> list[RecordingSummary]:
 
 
 def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Recording]]]:
-    """Names of the recordings and functions that read them.
-
-    From the store where a slow source is ingested.
+    """Names of the recordings and functions that read them, from the store where a slow source is
+    ingested.
     """
     if source not in choices("dataset"):
         yield Path(source).name, partial(read_single, config["dataset"], Path(source))
@@ -250,7 +251,7 @@ def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Re
         )
 
 
-def _described(recording: Recording) -> dict[str, Any]:
+def _plain_summary(recording: Recording) -> dict[str, Any]:
     """Rate, start, end, channels with their statistics, provenance and origin of a recording, as
     plain values.
     """
@@ -280,8 +281,8 @@ def _spread(samples: FloatArray) -> dict[str, float]:
         }
 
 
-def _stretch(start: float, end: float) -> str:
-    """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
+def _describe_time_range(start: float, end: float) -> str:
+    """Text of start and end of a recording [s]; for unix time the date, and seconds from it on."""
     if not MIN_UNIX_SECONDS < start < MAX_UNIX_SECONDS:
         return f"{start:.6g} s to {end:.6g} s"
     return (
@@ -291,8 +292,8 @@ def _stretch(start: float, end: float) -> str:
 
 
 def _is_here(dataset: dict[str, Any]) -> str:
-    """``yes``, ``no``, or ``no root`` where VEHEST_DATA is not set; simulated data are always
-    here.
+    """Whether the files of a data set are available: ``yes``, ``no``, or ``no root`` where
+    VEHEST_DATA is not set; simulated data always are.
     """
     if dataset.get("source") == "simulated":
         return "yes"

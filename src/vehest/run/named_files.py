@@ -15,8 +15,8 @@ from vehest.data.files import missing_file
 
 
 def require_paths(paths: Iterable[str | Path | None]) -> None:
-    """Refuse paths where there is nothing; what is there but cannot be read is reported by its
-    reader.
+    """Raise an error for paths that do not exist; one that exists but cannot be read is reported by
+    its reader.
 
     Parameters
     ----------

@@ -10,23 +10,25 @@ from collections.abc import Sequence
 
 from vehest.configuration.composition import Config, key_of, quoted
 
-LOCATION = ("root", "output")  # keys of where raw files come from and results go
-DEFAULT_OUTPUT = "outputs"
+LOCATION = ("root", "output")  # configuration keys of the folders of raw files and of results
+DEFAULT_OUTPUT = "outputs"  # output root where none is given
 
 
 def command_line(command: str, words: Sequence[str]) -> str:
-    """A command of vehest with its words, quoted for a shell where they need it."""
+    """Text of a command of vehest with its words, quoted for a shell where necessary."""
     return shlex.join(["vehest", *command.split(), *words])
 
 
 def location_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides of a command that say where raw files come from and results go."""
+    """Those overrides of a command that set where raw files are read from and results are written
+    to.
+    """
     return [override for override in overrides if key_of(override) in LOCATION]
 
 
 def location_of_config(config: Config) -> list[str]:
-    """Overrides that say where a configuration reads and writes, where the environment says
-    otherwise.
+    """Overrides that set where a configuration reads and writes, where it departs from the
+    environment.
     """
     usual = {
         "root": os.environ.get("VEHEST_DATA"),
@@ -37,5 +39,5 @@ def location_of_config(config: Config) -> list[str]:
 
 
 def overrides_of_config(overrides: Sequence[str], config: Config) -> list[str]:
-    """Those overrides whose group or key a command with this configuration has."""
+    """Those overrides whose group or key exists in a configuration."""
     return [override for override in overrides if key_of(override).split(".")[0] in config]

@@ -23,7 +23,7 @@ from vehest.run.estimate_tables import read_estimate_table
 
 
 def _page(figure: MatplotlibFigure) -> bytes:
-    """A figure as a page of HTML of its own."""
+    """A figure as a self-contained HTML page."""
     title = as_text(figure.axes[0].get_title(loc="left"))
     caption = "Sideslip angle with band and health, lateral velocity, measured channels, course."
     return page_of(Document(title, [Figure("drive", caption, figure)]))
@@ -35,7 +35,7 @@ WRITERS: dict[str, Callable[[MatplotlibFigure], bytes]] = {
     ".svg": svg_of,
     ".html": _page,
 }
-"""Ending of a file -> the figure in its format."""
+"""Suffix of a file -> function that returns a figure in its format."""
 
 
 def check_plot_name(out: Path) -> None:
@@ -51,7 +51,9 @@ def check_plot_name(out: Path) -> None:
 
 
 def check_plot_of_estimate(out: Path, picture: Path) -> None:
-    """Raise `ConfigurationError` where an estimate at ``out`` cannot be drawn to a path."""
+    """Raise `ConfigurationError` where an estimate at ``out`` cannot be drawn to the path
+    ``picture``.
+    """
     check_plot_name(picture)
     if out.suffix.lower() != ".parquet":
         raise ConfigurationError(

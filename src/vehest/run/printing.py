@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from vehest.alignment.findings import Finding
     from vehest.studies.sweep import SweepArtefacts
 
+# header of the columns of `score_cells`
 SCORE_HEADER = (
     "RMSE(β) [deg]",
     "95 % interval [deg]",
@@ -38,21 +39,19 @@ SCORE_HEADER = (
 class TerminalTable:
     """Cells, header and title of a table that `emit` prints; ``title`` may be empty."""
 
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    title: str = ""
+    header: Sequence[str]  # titles of the columns
+    rows: Sequence[Sequence[str]]  # cells of each row
+    title: str = ""  # line above the table; may be empty
 
 
 @dataclass(frozen=True)
 class TerminalSummary:
-    """Tables of a study, a note below them (may be empty), the file of its report, and the figures
-    of ``--json`` as JSON.
-    """
+    """Summary of a finished study for the terminal."""
 
-    tables: tuple[TerminalTable, ...]
-    note: str
-    page: str
-    figures: str
+    tables: tuple[TerminalTable, ...]  # tables that are printed
+    note: str  # text below the tables; may be empty
+    page: str  # file of the report
+    figures: str  # JSON that ``--json`` prints
 
 
 class OutputClosed(Exception):
@@ -60,9 +59,8 @@ class OutputClosed(Exception):
 
 
 def open_streams() -> None:
-    """Replace streams that were closed at the start by a null device.
-
-    Let the others show any character, as an escape if need be.
+    """Replace standard streams that were closed at the start by a null device, and let the others
+    print any character, as an escape if need be.
     """
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
@@ -150,7 +148,7 @@ def echo(text: str, keep: str = "") -> None:
 
 
 def complain(text: str) -> None:
-    """Print on standard error, unless it is closed."""
+    """Print a line on standard error, unless it is closed."""
     try:
         typer.echo(text, err=True)
     except OSError:
@@ -163,20 +161,19 @@ def note(text: str) -> None:
 
 
 def silence(stream: Any) -> None:
-    """Discard the rest of a broken stream, so that leaving does not complain about it."""
+    """Redirect a broken stream to a null device, so that the exit raises no further error."""
     with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
 
 
-def finding_in_words(finding: Finding) -> str:
-    """A finding, with the channel that it is about."""
+def describe_finding(finding: Finding) -> str:
+    """Text of a finding, preceded by the channel that it is about."""
     return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
 def as_json_text(outcome: Any) -> str:
-    """An outcome as JSON.
-
-    Numbers that are not finite become null, unprintable characters their escapes.
+    """Text of plain values as JSON, with null for numbers that are not finite, and escapes for
+    unprintable characters.
     """
 
     def plain(value: Any) -> Any:
@@ -195,7 +192,7 @@ def as_json_text(outcome: Any) -> str:
 
 
 def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
-    """The overview of a study in parts, or of recordings alone."""
+    """Summary of a study in parts, or of recordings alone, by its overview."""
     rows = [[_cell(value) for value in row] for row in overview.itertuples(index=False)]
     table = TerminalTable([str(name) for name in overview.columns], rows)
     return _summary([table], [], {"overview": _records(overview)}, left_out)
@@ -257,7 +254,7 @@ def _summary(
     figures: dict[str, Any],
     left_out: Mapping[str, str],
 ) -> TerminalSummary:
-    """Tables with notes, reasons for what is left out and the verdict below them."""
+    """Summary with notes, reasons for what is left out and the verdict below the tables."""
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
     note = "\n".join([*notes, *missing, *figures.get("verdict", [])])
     return TerminalSummary(
@@ -269,7 +266,9 @@ def _summary(
 
 
 def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
-    """A row a combination with settings, seeds, mean and half interval on validation and tests."""
+    """Summary of a sweep: a row for each combination with settings, seeds, mean and half interval
+    on validation and tests.
+    """
     from vehest.studies.sweep import table_of
 
     kinds = " and ".join(
@@ -297,7 +296,7 @@ def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
 
 
 def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
-    """Cells of a ranked estimate under `SCORE_HEADER`."""
+    """Cells of a ranked estimate for the columns `SCORE_HEADER`."""
     low = row["rmse_sideslip_low"]
     high = row["rmse_sideslip_high"]
     interval = f"{low:.3f} … {high:.3f}" if low > 0 else "–"
@@ -310,13 +309,15 @@ def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows with null in place of numbers that are not finite."""
+    """Rows of a table as mappings, with None in place of numbers that are not finite."""
     rows: list[dict[str, Any]] = json.loads(table.to_json(orient="records"))
     return rows
 
 
 def _cell(value: Any) -> str:
-    """A value as a cell: numbers with four significant digits, a dash for what is not finite."""
+    """Text of a value in a table: numbers with four significant digits, a dash for what is not
+    finite.
+    """
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "–"
     return str(value)

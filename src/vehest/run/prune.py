@@ -28,12 +28,12 @@ from vehest.run.run_cache import FINISHED
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.versions import VERSIONS, code_of
 
-CHECKPOINTS = "checkpoints"
-OUTDATED = "its code has changed"
-DAMAGED = "it is damaged"
-ORPHANED = "its inputs are gone"
-SUPERFLUOUS = "its model is there, or listed"
-LEFT_OVER = "left by a process that was killed"
+CHECKPOINTS = "checkpoints"  # folder of checkpoints in an output root
+OUTDATED = "its code has changed"  # reason for the removal of an artefact or leftover
+DAMAGED = "it is damaged"  # reason, likewise
+ORPHANED = "its inputs are gone"  # reason, likewise
+SUPERFLUOUS = "its model is there, or listed"  # reason for the removal of a checkpoint
+LEFT_OVER = "left by a process that was killed"  # reason for the removal of an unfinished folder
 
 
 def unused_artefacts(output: Path) -> list[dict[str, Any]]:
@@ -79,8 +79,7 @@ def unused_artefacts(output: Path) -> list[dict[str, Any]]:
 
 
 def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
-    """Remove files and folders, each renamed first so that no half is found.
-
+    """Remove files and folders, each renamed first, so that no process finds a half of one;
     ``on_removed`` is called after each.
 
     Parameters
@@ -108,7 +107,9 @@ def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> 
 
 
 def _artefacts(output: Path) -> dict[Path, Artefact | None]:
-    """Artefacts whose manifest gives their own name; none where one is damaged otherwise."""
+    """Folder -> its artefact, for folders whose manifest gives their own name; None for one that is
+    damaged.
+    """
     artefacts: dict[Path, Artefact | None] = {}
     for folder in (folder for stage in VERSIONS for folder in _entries(output / stage)):
         with suppress(VehestError, KeyError, TypeError):
@@ -121,9 +122,8 @@ def _artefacts(output: Path) -> dict[Path, Artefact | None]:
 
 
 def _reason(artefact: Artefact | None, present: set[str]) -> str:
-    """Why an artefact cannot be reused.
-
-    Empty where it can, and where its estimator or study is not installed.
+    """Reason why an artefact cannot be reused; empty where it can, and where its estimator or study
+    is not installed.
     """
     if artefact is None:
         return DAMAGED
@@ -143,7 +143,7 @@ def _reason(artefact: Artefact | None, present: set[str]) -> str:
 
 
 def _entries(place: Path) -> list[Path]:
-    """Files and folders in a folder, by name; no links."""
+    """Files and folders in a folder, sorted by name, without links."""
     return (
         [path for path in sorted(place.iterdir()) if not path.is_symlink()]
         if place.is_dir() and not place.is_symlink()

@@ -43,10 +43,10 @@ from vehest.run.table_records import changes_of_tables
 from vehest.run.train import estimator_rate, training_options
 from vehest.run.versions import code_of, is_of_other_stages
 
-CODE = "code"
-DATA = "data"
-CAUSES = (CODE, CONFIGURATION, DATA)
-MAX_NAMED = 6  # changes of a cause that are named; further ones are counted
+CODE = "code"  # cause of a change: versions of code
+DATA = "data"  # cause of a change: raw files
+CAUSES = (CODE, CONFIGURATION, DATA)  # possible causes of a change of a published study
+MAX_NAMED = 6  # largest number of changes of a cause that are named; further ones are counted
 STALE_LIST = "stale.yaml"
 """File in results/: studies that may still be stale, each with the reason and what will end it."""
 
@@ -119,7 +119,7 @@ def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
 
 
 def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, dict[str, str]]]:
-    """Keys of a comparison, one an estimator and stage."""
+    """Keys of a comparison: pairs of name and key, one for each estimator and stage."""
     first = configs[0]
     faults = union_of_faults(map(faults_of, configs))
     protocol = stages.protocol(first, dataset_names(first["split"]))
@@ -154,12 +154,14 @@ def _of_jobs(configs: Sequence[Config], stages: Stages) -> Iterator[tuple[str, d
 
 
 def _hash(content: Any) -> str:
-    """Sixteen hexadecimal digits of a plain value."""
+    """First sixteen hexadecimal digits of the hash of plain values."""
     return hash_of(content)[:16]
 
 
-def in_words(verdict: Mapping[str, Any]) -> str:
-    """The state of a study in one line."""
+def describe_verdict(verdict: Mapping[str, Any]) -> str:
+    """One line on the state of a published study: up to date, stale with its causes, or not
+    known.
+    """
     words = []
     for cause in CAUSES:
         named = [change["what"] for change in verdict["changes"] if change["cause"] == cause]
@@ -276,7 +278,7 @@ def check_listed(overrides: Sequence[str], messages: Messages) -> list[dict[str,
 
 
 def _stale_list() -> dict[str, str]:
-    """Study -> why it may still be stale.
+    """Content of `STALE_LIST`: study -> why it may still be stale.
 
     Raises `ConfigurationError` for anything but text by study.
     """
@@ -291,7 +293,9 @@ def _stale_list() -> dict[str, str]:
 
 
 def _pipeline_of(study: str) -> Study | None:
-    """The pipeline whose outcome goes to results/STUDY; the one of the same name first."""
+    """The pipeline that is published in results/STUDY, that of the same name first; None where
+    there is none.
+    """
     for name in sorted(pipeline_names(), key=lambda name: name != study):
         try:
             pipeline = read_study(name)
@@ -305,8 +309,8 @@ def _pipeline_of(study: str) -> Study | None:
 
 
 def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
-    """State, changes and note of one study: of its tables where a command outside pipelines made
-    them, else of its pipeline.
+    """Compare one published study: its tables where a command outside pipelines made them, else its
+    pipeline. Returns state, changes and note.
     """
     published = published_in(RESULTS / study)
     state = "not known"
@@ -347,7 +351,7 @@ def _outcome(
     note: str = "",
     n_not_trained: int = 0,
 ) -> dict[str, Any]:
-    """A verdict as plain values."""
+    """The result of a comparison as plain values."""
     return {
         "study": study,
         "state": state,
@@ -358,9 +362,8 @@ def _outcome(
 
 
 def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
-    """Pairs of what differs from when results were published and its cause.
-
-    A note on what was not compared.
+    """Pairs of what differs from when results were published and the cause, and a note on what was
+    not compared.
     """
     stages = Stages(
         Path(str(next(iter(jobs.values()))[0].config["output"])),

@@ -22,19 +22,20 @@ from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json, write_json
 from vehest.run.console import Messages
 
-RESULTS = Path("results")
-PAGE_ENDING = ".html"
-PROVENANCE = "provenance.json"
-PUBLISHED_WEIGHTS = "weights.safetensors"
+RESULTS = Path("results")  # folder of published studies in the repository
+PAGE_ENDING = ".html"  # suffix of pages, which are not published
+PROVENANCE = "provenance.json"  # name of the record of how results were made
+PUBLISHED_WEIGHTS = "weights.safetensors"  # name of the file of weights
+# folders of the repository whose files determine results
 SOURCES_OF_RESULTS = ("src", "conf", "pipelines")
 DIGITS = 6  # significant digits of numbers in published tables
 
 
 @dataclass(frozen=True)
 class Publication:
-    """A study whose report goes to results/<study>."""
+    """Record of a study's report in results/STUDY."""
 
-    study: str
+    study: str  # name of the study
     # name of a part or data set that the study went on without -> the same for people
     absent: Mapping[str, str]
     keys: Keys  # `vehest.run.published.keys_of_study`
@@ -43,12 +44,12 @@ class Publication:
 
 @dataclass(frozen=True)
 class TableRecord:
-    """How a table that no pipeline publishes was made (`vehest.run.table_records`)."""
+    """Record of how a table that no pipeline publishes was made (`vehest.run.table_records`)."""
 
     __pydantic_config__ = FURTHER_KEYS
-    command: str
-    commit: str
-    without_keys: str = ""  # what of the table was made before keys were recorded; empty: nothing
+    command: str  # command that makes the table
+    commit: str  # commit of the repository at which it was made
+    without_keys: str = ""  # part of the table that was made before keys were recorded; empty: none
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,12 @@ class Published:
 
     __pydantic_config__ = FURTHER_KEYS
     kinds: dict[str, str] = field(default_factory=dict)  # data set -> ``real`` or ``simulated``
-    parts: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()  # names of the parts
     absent: tuple[str, ...] = ()  # parts or data sets that it went on without
     keys: Keys = field(default_factory=dict)  # empty where they were not recorded yet
     n_not_trained: int = 0  # trainings that the report names as missing
-    tables: dict[str, TableRecord] = field(default_factory=dict)  # of a folder without a pipeline
+    # records of the tables of a folder without a pipeline
+    tables: dict[str, TableRecord] = field(default_factory=dict)
 
 
 def published_in(folder: Path) -> Published | None:
@@ -137,8 +139,8 @@ def publish_study(
 
 
 def uncommitted_changes() -> str:
-    """Files that determine results and differ from the last commit, in words; empty where there are
-    none, or no git checkout.
+    """Text on files that determine results and differ from the last commit; empty where there are
+    none, or outside of a git checkout.
 
     Returns
     -------
@@ -181,7 +183,7 @@ def check_results_folder(folder: Path) -> None:
 
 
 def _contents(report: Artefact) -> dict[str, bytes]:
-    """Files of a report that are published: name -> content."""
+    """Files of a report that are published, name -> content."""
     names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]
     return {name: published_content(report.folder / name) for name in names}
 
@@ -230,7 +232,9 @@ def published_content(file: Path) -> bytes:
 
 
 def _rounded(cell: str) -> str:
-    """A number with more digits than `DIGITS` rounded; whole numbers and text as they are."""
+    """Text of a number with more digits than `DIGITS`, rounded; whole numbers and other text
+    unchanged.
+    """
     try:
         value = float(cell)
     except ValueError:

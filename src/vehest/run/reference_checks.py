@@ -12,9 +12,9 @@ from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.recording import Recording
 
 CHECKS_OF_SIGNS_AND_UNITS = ("impossible", "sign", "unit", "stuck")
-"""What concerns how a channel was written.
+"""Checks of how a channel was written, whose findings on references are warned of.
 
-That a reference departs from the kinematics is for `vehest data check` to say.
+Departures of a reference from the kinematics are left to `vehest data check`.
 """
 
 

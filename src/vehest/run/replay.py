@@ -29,7 +29,8 @@ from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import describe_band, is_other_vehicle
 
-# of the bus from the model's, relative; with more, samples are filtered and thinned out
+# relative difference between the bus's and the model's rate, beyond which samples are low-passed
+# and resampled
 MAX_RATE_DIFFERENCE = 1e-6
 
 
@@ -52,9 +53,8 @@ def replay_log(
     write_dbc: Path | None = None,
     quiet: bool = True,
 ) -> dict[str, Any]:
-    """Replay a log and let a model estimate.
-
-    Returns its figures. The options are those of ``vehest replay``; raises `VehestError`.
+    """Replay a log of a CAN bus and run a model on it online, as ``vehest replay`` does; returns
+    the figures that it prints. Raises `VehestError`.
 
     Parameters
     ----------
@@ -145,8 +145,8 @@ def replay_log(
 def _signals(
     described: Mapping[str, Any] | None, dbc: Path | None, signals: str, model: Estimator
 ) -> BusSignals:
-    """The signals of a model's channels: from the configuration of a data set, if any, or by their
-    names in a DBC.
+    """The signals of a model's channels on the bus: from the configuration of a data set, if there
+    is one, else by their names in a DBC.
     """
     named = [word for word in signals.split(",") if word.strip()]
     if described is not None:
@@ -161,7 +161,9 @@ def _signals(
 
 
 def _speed(text: str) -> float | None:
-    """Factor of the log's time, None for ``max``; raises `ConfigurationError` otherwise."""
+    """Factor of the log's time from text, None for ``max``; raises `ConfigurationError`
+    otherwise.
+    """
     with suppress(ValueError):
         if text == "max" or 0 < float(text) < math.inf:
             return None if text == "max" else float(text)

@@ -64,14 +64,14 @@ from vehest.studies.artefacts import (
     write_frame,
 )
 from vehest.studies.kit.timings import timings_of_study
-from vehest.studies.reference_minutes import start_in_words
+from vehest.studies.reference_minutes import describe_start
 from vehest.studies.registry import study_module
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build
 
-STAGE = "report"
-SWEEP = "sweep"
-OVERVIEW = "tables/overview.csv"
-SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
+STAGE = "report"  # name of the stage
+SWEEP = "sweep"  # name of the stage for sweeps
+OVERVIEW = "tables/overview.csv"  # file of a report's overview, for the terminal
+SCORES = ("rmse_sideslip", "rmse_vy", "fvu")  # metrics of a sweep's table
 
 
 def draw_report(
@@ -82,8 +82,8 @@ def draw_report(
     trials: Sequence[Trial],
     search_remarks: Sequence[str],
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a
-    comparison are named as absent.
+    """Draw a study's report, unless it exists, and return it with a summary for the terminal; parts
+    without a comparison are named as absent.
 
     Trials of searches are in no part, so that a report is the same whether they were trained here
     or published before. The weights of an incomplete study include all that were published before,
@@ -224,11 +224,11 @@ def template_digests(name: str) -> dict[str, str]:
 def _write(
     artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path
 ) -> None:
-    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a
-    comparison metrics.csv and timings.csv.
+    """Draw the study into ``folder``: report.md, report.html, tables, figures and provenance; of a
+    comparison also metrics.csv and timings.csv.
 
-    On one thread, as groups are trained, so that it has the same last digits whether trainings came
-    before or not.
+    It runs on one thread, as trainings do, so that the last digits do not depend on whether
+    trainings came before.
     """
     from vehest.report.document import write_documents
 
@@ -268,8 +268,8 @@ def _write(
 def _recordings(
     comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact]
 ) -> dict[str, str]:
-    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate,
-    or shown.
+    """``DATASET/RECORDING`` -> digest of every recording that is scored, at the evaluation rate, or
+    shown.
     """
     digests = {}
     for part in comparisons.values():
@@ -284,7 +284,7 @@ def _recordings(
 
 
 def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
-    """What a study's module may look at of one part: models, metrics, references and facts."""
+    """Input of a study's module for one part: models, metrics, references and facts."""
     models = []
     tables = []
     for member in part.members:
@@ -299,7 +299,7 @@ def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts
                 estimator=estimator.name,
                 variant=variant,
                 title=estimator.full_title
-                + start_in_words(member.job.training)
+                + describe_start(member.job.training)
                 + difference_text(differences),
                 seed=member.job.seed,
                 model_folder=member.model.folder,
@@ -348,9 +348,8 @@ def with_distinct_titles(models: Sequence[EvaluatedModel]) -> list[EvaluatedMode
 
 
 def _timings_of(part: PartArtefacts) -> pd.DataFrame:
-    """Times of trainings, their phases and online steps, with `METRIC_COLUMNS` [s].
-
-    In no published file.
+    """Times of trainings, their phases and online steps of one part, a table with `METRIC_COLUMNS`
+    [s]; they are in no published file.
     """
     tables = []
     for model in part.models:
@@ -369,14 +368,15 @@ def _timings_of(part: PartArtefacts) -> pd.DataFrame:
 
 
 def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
-    """Tables of models as one, with METRIC_COLUMNS."""
+    """Concatenate the tables of models into one with METRIC_COLUMNS."""
     return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
 
 
 def draw_sweep(
     study: Study, comparison: Comparison, runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a sweep of `sweep_of`, unless its report is there, and sum it up for the terminal.
+    """Draw the report of a sweep (`sweep_of`), unless it exists, and return it with a summary for
+    the terminal.
 
     A failed job has a row with its reason.
     """
@@ -432,7 +432,7 @@ def draw_sweep(
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:
-    """The column layout of `SweepArtefacts.jobs`, a row a job."""
+    """Table of all jobs of a sweep in the layout of `SweepArtefacts.jobs`."""
     split = comparison.evaluation.split
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []
@@ -460,9 +460,8 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
 def _figures(
     member: Member | None, sets: Sequence[str], fault: FaultSettings | None
 ) -> dict[str, Any]:
-    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one.
-
-    NaN where it failed.
+    """Metrics of a job, ``METRIC.SET`` -> value, while its fault lasts where it has one; NaN where
+    the job failed.
     """
     columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
     if member is None or member.model is None or member.evaluation is None:

@@ -45,32 +45,33 @@ if TYPE_CHECKING:
 
 FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 5  # version of the records, a part of their keys
+# matches references ``${RESOLVER:NAME}`` of OmegaConf in a configuration
 _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 
 @dataclass(frozen=True)
 class Ran:
-    """A study or sweep that is done."""
+    """Outcome of a study or sweep that was run."""
 
-    summary: TerminalSummary
-    folder: Path  # of its report
+    summary: TerminalSummary  # text that is printed
+    folder: Path  # folder of its report
     skipped: bool  # whether the report existed already
     published: Path | None = None  # folder in results/
-    failed: JobsFailedError | None = None  # error to end with
+    failed: JobsFailedError | None = None  # error with which the command ends; None: none
 
 
 @dataclass(frozen=True)
 class Record:
-    """A finished study."""
+    """Record of a finished study, by which it is recognised as up to date."""
 
-    inputs: str  # of its `RunCache`
+    inputs: str  # hash of what determines its keys, `RunCache.inputs`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
-    # folder in the output root, key and digest, which is in later keys; the report last
+    # folder in the output root, key and digest of each artefact; the report last
     made: tuple[tuple[str, str, str], ...]
-    # that the next run in full would print too: status, stage, label, detail
+    # lines that a run in full would print too: status, stage, label, detail
     notes: tuple[tuple[str, str, str, str], ...]
-    summary: TerminalSummary
-    publication: Publication | None
+    summary: TerminalSummary  # text that is printed
+    publication: Publication | None  # publication of the report; None: it is not published
     store: str  # MLflow's local store in the output root; empty where there is none
 
 
@@ -111,8 +112,8 @@ class RunCache:
         self.inputs = self._inputs()
 
     def load(self) -> tuple[Record, list[Artefact]] | None:
-        """The finished study and its artefacts, if nothing has changed since and all of it is
-        there.
+        """The record of a finished study and its artefacts, if nothing has changed since and all of
+        them exist; else None.
 
         Returns
         -------
@@ -141,9 +142,9 @@ class RunCache:
         return (record, artefacts) if is_complete else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
-        """The finished study, notes printed first, published as a run in full would.
+        """Print and publish a finished study as a run in full would, from its record.
 
-        None without a valid record, or under force.
+        Returns None without a valid record, or under ``force``.
 
         Parameters
         ----------
@@ -234,7 +235,7 @@ class RunCache:
             runner.messages.warn(f"{error}; the next run looks at everything again")
 
     def _inputs(self) -> str:
-        """Hash of everything that determines keys but raw files; empty where something else may
+        """Hash of everything that determines keys except raw files; empty where something else may
         determine them, such as a resolver other than ``oc.env``.
         """
         try:
@@ -259,7 +260,7 @@ class RunCache:
 
 
 def _configuration(pipeline: str) -> Iterator[Path]:
-    """Files of the configuration and of the pipeline, with the one that it is based on."""
+    """Yield the files of the configuration and of a pipeline, with the one that it is based on."""
     for folder in [*conf_folders(), packaged("pipelines")]:
         yield from sorted(folder.rglob("*.yaml"))
     pipeline_file = find_pipeline(pipeline) if pipeline else None
@@ -270,8 +271,8 @@ def _configuration(pipeline: str) -> Iterator[Path]:
 
 
 def _code() -> Iterator[Path]:
-    """Folders, or files, of vehest and of every package that offers it estimators, sources or
-    studies.
+    """Yield the folders or files of the code of vehest and of every package that provides
+    estimators, sources or studies.
     """
     points = metadata.entry_points()
     packages = {

@@ -36,7 +36,7 @@ from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import parts_of, plan_ingest, recording_file, write_ingest
 from vehest.run.launchers.local import LocalLauncher
-from vehest.run.printing import finding_in_words
+from vehest.run.printing import describe_finding
 from vehest.run.reference_checks import reference_findings
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from vehest.run.launchers.base import Launcher
 
 Value = TypeVar("Value")
-ALL = "all groups"  # bar above those of trainings
+ALL = "all groups"  # name of the progress bar above those of trainings
 
 
 @dataclass(eq=False)
@@ -62,17 +62,21 @@ class Stages:
     In a dry run `DryRunStop` is raised where something would have to be made.
     """
 
-    output: Path
-    messages: Messages
-    stop: StopSignals
+    output: Path  # output root
+    messages: Messages  # prints progress
+    stop: StopSignals  # signals that ask to stop
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
-    dry_run: bool = False
-    artefacts: dict[Path, Artefact] = field(default_factory=dict)  # used so far, by folder
+    dry_run: bool = False  # whether stages are only listed
+    # artefacts that were used so far, by folder
+    artefacts: dict[Path, Artefact] = field(default_factory=dict)
+    # results of `_once`, by kind and argument
     _results: dict[tuple[str, str], Any] = field(default_factory=dict)
 
     def _once(self, kind: str, of: Any, make: Callable[[], Value]) -> Value:
-        """The value of ``make``, which is called the first time alone."""
+        """Return the result of ``make``, which is called only the first time for this kind and
+        argument ``of``.
+        """
         key = kind, json.dumps(of, sort_keys=True)
         if key not in self._results:
             self._results[key] = make()
@@ -86,7 +90,7 @@ class Stages:
         )
 
     def ingest(self, config: Config) -> Artefact:
-        """The recordings of a data set at their native rate.
+        """Make the recordings of a data set at their native rate.
 
         ``config`` is composed for ``ingest``. Raises as `ensure`, `plan_ingest` and `write_ingest`.
         """
@@ -103,15 +107,15 @@ class Stages:
     def downsample(
         self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]
     ) -> Artefact:
-        """The ingested recordings of a data set at another rate [Hz]; ``options`` are
-        ``downsample`` of a configuration.
+        """Make the recordings of a data set at another rate [Hz]; ``options`` are ``downsample`` of
+        a configuration.
         """
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self.ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
 
     def dataset_config(self, name: str, config: Config) -> Config:
-        """The configuration of a data set's ingest, with the root and output of another
-        command's.
+        """Compose the configuration of a data set's ingest, with the root and output of
+        ``config``.
         """
         root = [] if config.get("root") is None else [f"root={quoted(config['root'])}"]
         return self._once(
@@ -143,13 +147,13 @@ class Stages:
             self._once("files", name, partial(look, name))
 
     def _ingested(self, name: str, config: Config) -> Artefact:
-        """The ingested recordings of a data set, looked for once a run."""
+        """The ingested recordings of a data set, made or found once a run."""
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
         """The split of a configuration.
 
-        Where it names or cuts recordings by rules, its data sets are ingested for it.
+        Where its rules name or cut recordings, the data sets are ingested for it.
         """
 
         def recordings_of(name: str) -> Mapping[str, Reader]:
@@ -201,7 +205,7 @@ class Stages:
             return  # which the plan of a training or an evaluation says
         for finding in reference_findings(read_recording(ingested.folder / file)):
             self.messages.warn(
-                f"data set '{dataset}', recording '{recording}': {finding_in_words(finding)}; "
+                f"data set '{dataset}', recording '{recording}': {describe_finding(finding)}; "
                 "every score against this reference is wrong if that is so"
             )
 
@@ -213,7 +217,7 @@ class Stages:
         }
 
     def cars(self, config: Config, datasets: Iterable[str]) -> dict[str, CarValues]:
-        """Values of the cars of data sets."""
+        """Data set -> values of its car."""
 
         def car(name: str) -> CarValues:
             return car_of(self.dataset_config(name, config)["dataset"])
@@ -221,8 +225,8 @@ class Stages:
         return {name: self._once("car", name, partial(car, name)) for name in datasets}
 
     def protocol(self, config: Config, datasets: Iterable[str]) -> Protocol:
-        """How estimates are scored, with the lowest speed of sideslip on each data set, by its
-        car.
+        """Rules of scoring, with the lowest speed at which sideslip is scored on each data set, by
+        its car.
         """
         cars = self.cars(config, datasets)
         return protocol_from_config(config["evaluation"]).with_wheelbases(
@@ -232,9 +236,10 @@ class Stages:
     def evaluation(
         self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()
     ) -> Evaluation:
-        """How a configuration is evaluated, also under ``faults``: against references that are
-        resampled like everything, but never filtered further. ``data`` are the recordings of each
-        data set at the estimator's rate.
+        """Settings of the evaluation of a configuration, also under ``faults``.
+
+        References are resampled like all channels, but never filtered further. ``data`` are the
+        recordings of each data set at the estimator's rate.
         """
         split = self.split(config)
         protocol = self.protocol(config, split.datasets)
@@ -308,13 +313,16 @@ class Runner(Stages):
     """Trains, calibrates and evaluates groups by a launcher, and tracks what was made."""
 
     tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # logs nothing
-    launcher: Launcher = field(default_factory=LocalLauncher)
+    launcher: Launcher = field(default_factory=LocalLauncher)  # launcher by which trainings run
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
-    weights: PublishedWeights | None = None  # published ones, used instead of training
-    publishes_to: PublishedWeights | None = None  # to which finished trainings are added
+    weights: PublishedWeights | None = None  # published weights that are used instead of training
+    # published weights to which finished trainings are added
+    publishes_to: PublishedWeights | None = None
     origins: dict[str, str] = field(default_factory=dict)  # key of a training -> its origin
-    train_first: str = ""  # command to run first where a training is missing; empty to train here
-    evaluates_trained: bool = False  # with ``train_first``: calibrate and evaluate existing models
+    # command that has to be run first where a training is missing; empty: train here
+    train_first: str = ""
+    # whether, with ``train_first``, existing models are calibrated and evaluated
+    evaluates_trained: bool = False
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
         """Train and evaluate groups, side by side where there are cores; where members of a group
@@ -377,8 +385,8 @@ class Runner(Stages):
         return members, failures
 
     def _without_trainings(self, groups: Sequence[Group]) -> list[Group]:
-        """Those jobs of groups that take no time to train: the model exists, or is learnt at
-        once.
+        """Groups with only those jobs that need no training: the model exists, or is fitted in
+        closed form.
         """
         reduced = [
             replace(
@@ -392,8 +400,8 @@ class Runner(Stages):
         return [group for group in reduced if group.jobs]
 
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
-        """Take models that are published under the key of a training, or under its origin, and are
-        not there.
+        """Write the missing models of trainings that are published under their key, or under their
+        origin.
         """
         published = [
             (plan, key)
@@ -442,7 +450,7 @@ class Runner(Stages):
         return hash_of({**job.plan.keyed_content, "inputs": inputs})
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
-        """Print what groups are going to do; a dry run ends here."""
+        """Print which groups will be run; a dry run ends here."""
         if self.dry_run:
             labels = [job.plan.label for group in waiting for job in group.jobs]
             for label in labels:
@@ -470,7 +478,9 @@ class Runner(Stages):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
 
     def _received(self, outcome: Sequence[Member]) -> dict[str, Member]:
-        """Members by the keys of their trainings, printed and tracked."""
+        """Print and track the members of a finished group; returns them by the keys of their
+        trainings.
+        """
         for member in outcome:
             if member.finished and not self.dry_run:
                 member.job.plan.drop(member.job.plan.checkpoint_folder)
@@ -483,7 +493,7 @@ class Runner(Stages):
                 )
             for artefact in member.made:
                 self.artefacts[artefact.folder] = artefact
-                status, detail = _in_words(artefact)
+                status, detail = _describe_outcome(artefact)
                 self.messages.line(status, artefact.stage, artefact.label, detail)
                 if artefact.stage == TRAIN and read_fit_metrics(artefact.folder).get(
                     "ended_by_divergence"
@@ -493,9 +503,8 @@ class Runner(Stages):
         return {member.job.plan.key: member for member in outcome}
 
     def _publish_weights(self, members: Iterable[Member]) -> None:
-        """Add the models of finished trainings to the published weights, if they are to be.
-
-        Once there is no room, no more.
+        """Add the models of finished trainings to the published weights, if they are to be
+        published, until there is no room.
         """
         models = [
             member.model
@@ -514,7 +523,7 @@ class Runner(Stages):
     def _report(
         self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None
     ) -> None:
-        """Draw the progress of a group, or print for whom it waits."""
+        """Update the progress bar of the group with index ``at``, or print what it waits for."""
         name = groups[at].name
         if isinstance(news, Waiting):
             self.messages.end(TRAIN, name)
@@ -531,8 +540,10 @@ class Runner(Stages):
             bars.step(name, news.epoch, news.max_epochs, note)
 
 
-def _in_words(artefact: Artefact) -> tuple[str, str]:
-    """How a model, a calibration or an evaluation ended, and its result."""
+def _describe_outcome(artefact: Artefact) -> tuple[str, str]:
+    """Status and result of a finished model, calibration or evaluation, for its line on the
+    console.
+    """
     if artefact.skipped:
         return REUSED, "up to date"
     if artefact.status == "interrupted":

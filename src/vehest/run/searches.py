@@ -31,7 +31,8 @@ from vehest.run.train import TrainJob, training_options
 from vehest.run.versions import code_of
 from vehest.studies.artefacts import Trial, nominal_rows, write_frame
 
-SEARCHES = "searches.csv"
+SEARCHES = "searches.csv"  # name of the table of trials in results/STUDY
+# columns of that table
 TRIAL_COLUMNS = (
     "search",
     "name",
@@ -45,15 +46,15 @@ TRIAL_COLUMNS = (
     "chosen",
 )
 OriginOf = Callable[[TrainJob], str]
-"""A training -> its origin: `vehest.run.runner.Runner.origin`."""
-DIGITS = 6  # significant ones of a validation value, as in published CSV files
+"""Function that returns the origin of a training (`vehest.run.runner.Runner.origin`)."""
+DIGITS = 6  # significant digits of a validation value, as in published CSV files
 
 
 def published_values(
     study: Study, comparisons: Mapping[str, Comparison], origin_of: OriginOf, path: Path
 ) -> dict[str, float]:
-    """Validation value of each trial of those searches that a published file has in full, with
-    today's origins.
+    """Published validation values of the trials, for those searches of which a file has all trials
+    with today's origins.
 
     Parameters
     ----------
@@ -99,8 +100,8 @@ def trials_of(
     origin_of: OriginOf,
     published: Mapping[str, float],
 ) -> list[Trial]:
-    """The trials of every search of which all have a value: a published one, or that of their
-    evaluation.
+    """The trials of every search for which all values are known: published, or from their
+    evaluations.
 
     Parameters
     ----------
@@ -139,8 +140,7 @@ def trials_of(
 def remarks_on(
     study: Study, comparisons: Mapping[str, Comparison], trials: Sequence[Trial]
 ) -> list[str]:
-    """A line for each part and search where the part trains what was searched for, with other
-    options than those chosen.
+    """Sentences on parts that train what was searched for, with other options than the chosen ones.
 
     What was searched for is a job that differs from the trials in nothing but the options that they
     try, and the seed.
@@ -183,9 +183,8 @@ def _options(study: Study, name: str) -> tuple[str, ...]:
 def _planned_trial(
     study: Study, name: str, comparisons: Mapping[str, Comparison], origin_of: OriginOf
 ) -> Trial | None:
-    """A trial before it has a value.
-
-    None where its recordings are not here or it cannot be trained.
+    """A trial before its value is known; None where its recordings are not available or it cannot
+    be trained.
     """
     if name not in comparisons:
         return None
@@ -216,7 +215,7 @@ def _planned_trial(
 
 
 def _validation_value(comparison: Comparison, trial: Trial) -> float:
-    """Value of the metric that chooses, over all samples of the validation range."""
+    """Value of the search's metric over all samples of the validation range."""
     evaluation = comparison.members[0].evaluation
     assert evaluation is not None
     table = nominal_rows(read_metrics(evaluation.folder))
@@ -230,7 +229,9 @@ def _validation_value(comparison: Comparison, trial: Trial) -> float:
 
 
 def settings_to_compare(config: Config, tried: Collection[str] = ()) -> dict[str, Any]:
-    """What determines a training, without its seed and the dotted keys that are tried."""
+    """Configuration of everything that determines a training, without its seed and the dotted keys
+    that are tried.
+    """
     options = training_options(config)
     content = {key: options[key] for key in ("estimator", "training")} | {"split": config["split"]}
     for key in tried:

@@ -32,8 +32,9 @@ COMMENT_COLUMN = 45  # column, from 0, at which the comment of a line of YAML be
 class SettingLine:
     """A setting or a group of settings: its value, its comment, and the settings of a group."""
 
-    value: Any
-    comment: str
+    value: Any  # value of the setting
+    comment: str  # text, unit and bounds
+    # name -> line of the settings in a group; None: a single setting
     group: Mapping[str, SettingLine] | None = None
 
 
@@ -60,7 +61,7 @@ def setting_lines(settings: Any, skipped: Collection[str] = ()) -> dict[str, Set
 
 
 def as_commented_yaml(lines: Mapping[str, SettingLine], indent: str = "") -> Iterator[str]:
-    """The lines of a file of conf/."""
+    """Lines of YAML for a file of conf/, with ``indent`` before each."""
     for name, line in lines.items():
         if line.group is None:
             yield _line(f"{indent}{name}: {value_as_yaml(line.value)}", line.comment)
@@ -70,7 +71,7 @@ def as_commented_yaml(lines: Mapping[str, SettingLine], indent: str = "") -> Ite
 
 
 def config_as_commented_yaml(config: Config) -> str:
-    """A configuration as YAML, the settings of its estimator and training with the comments of
+    """YAML of a configuration, in which the settings of estimator and training have the comments of
     conf/.
     """
     comments = {}
@@ -153,7 +154,7 @@ def _unit(declared: Declaration) -> str:
 
 
 def _values(field: Field[Any]) -> Iterator[str]:
-    """Values or bounds that a setting may have."""
+    """Texts of the values or bounds that a setting may have."""
     declared = declaration(field)
     if declared is None:
         return
@@ -174,9 +175,7 @@ def _values(field: Field[Any]) -> Iterator[str]:
 
 
 def value_as_yaml(value: Any) -> str:
-    """A value as YAML reads it back: whole numbers without a point, so that they are spelled as
-    people do.
-    """
+    """Text of a value in YAML; whole numbers have no decimal point."""
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         return str(int(value))
     if isinstance(value, float):

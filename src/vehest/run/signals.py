@@ -13,7 +13,7 @@ from types import FrameType
 
 
 class Stopped(BaseException):
-    """A signal, by its number, asked vehest to stop."""
+    """Raised where a signal, whose number it has, asked vehest to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -21,7 +21,7 @@ class Stopped(BaseException):
 
 
 class DryRunStop(Exception):
-    """A dry run met a stage that waits for one that has not run."""
+    """Raised where a dry run meets a stage that needs the result of one that has not run."""
 
 
 class StopSignals:
@@ -48,7 +48,7 @@ class StopSignals:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Listen, and restore the former handlers afterwards.
+        """Context that records signals, and restores the former handlers afterwards.
 
         Raises `Stopped` in place of an exception after a signal: compiled modules turn one into
         another, and what a signal ends may fail.
@@ -73,7 +73,7 @@ class StopSignals:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Only record a first signal in here; a second one stops at once."""
+        """Context in which a first signal is only recorded; a second one stops at once."""
         self._deferred = True
         try:
             yield
@@ -90,8 +90,8 @@ class StopSignals:
 
 @contextmanager
 def blocked_signals() -> Iterator[None]:
-    """Start processes in here that are to leave SIGINT and SIGTERM to this one: they inherit that
-    this thread blocks both.
+    """Context in which processes can be started that leave SIGINT and SIGTERM to this one: they
+    inherit that both signals are blocked.
 
     A handler that they install themselves comes too late for a Ctrl-C while they start.
     """

@@ -44,26 +44,31 @@ from vehest.run.train import TrainJob
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, override_text, short_names
 
+# text on what a pipeline's file must have, for messages
 FORMS = (
     "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; "
     "datasets, each once"
 )
+# groups of the configuration that all jobs of a part must share
 SHARED_KEYS = ("split", "evaluation", "downsample")
+# groups of the configuration that cannot be swept
 SINGLE_VALUED = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
+# sweeps, each a list of overrides
 Sweeps = Annotated[
     tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"
 ]
+# settings of faults that are evaluated
 Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
-Names = Annotated[tuple[str, ...], "a list of names"]
+Names = Annotated[tuple[str, ...], "a list of names"]  # list of names
 
 
 @dataclass(frozen=True)
 class Search:
     """Candidates of which the one with the lowest metric on the validation range is chosen."""
 
-    candidates: Sweeps = ()
-    metric: str = "rmse_sideslip"
+    candidates: Sweeps = ()  # sweeps over the candidates
+    metric: str = "rmse_sideslip"  # metric that chooses
 
 
 @dataclass(frozen=True)
@@ -73,31 +78,35 @@ class Part:
     Docs/cli.md says what the keys mean.
     """
 
-    split: str = ""
-    sweeps: Sweeps = ()
-    title: str = ""
-    optional: bool = False
+    split: str = ""  # name of the split
+    sweeps: Sweeps = ()  # sweeps of trainings
+    title: str = ""  # title in the report
+    optional: bool = False  # whether the part is left out where raw files are missing
+    # overrides of all jobs of the part
     overrides: Annotated[tuple[str, ...], "a list of overrides"] = ()
-    search: Search | None = None  # of a trial: its own options alone
+    search: Search | None = None  # search over candidates; of a trial, only its own options
 
 
 @dataclass(frozen=True)
 class PipelineFile:
     """A pipeline's file; docs/cli.md says what the keys mean."""
 
-    study: str = ""
-    report: str = ""
-    title: str = ""
-    about: str = ""
-    publish: bool = False
+    study: str = ""  # name of the study
+    report: str = ""  # name of the study module that draws it
+    title: str = ""  # title of the report
+    about: str = ""  # paragraph of the report on what is compared
+    publish: bool = False  # whether its report is published in results/
+    # overrides of ``evaluation`` for all jobs
     evaluation: dict[str, int | float | bool | str | Faults | None] = field(default_factory=dict)
-    split: str = ""
-    sweeps: Sweeps = ()
+    split: str = ""  # name of the split, of a study without parts
+    sweeps: Sweeps = ()  # sweeps of trainings, of a study without parts
+    # name -> part
     parts: Annotated[dict[str, Part], "a mapping from names to what each has"] = field(
         default_factory=dict
     )
-    datasets: Names = ()
-    optional_datasets: Names = ()
+    datasets: Names = ()  # data sets of a study of recordings alone
+    optional_datasets: Names = ()  # data sets that are left out where raw files are missing
+    # name of the pipeline on top of which this file is read; None: none
     based_on: str | None = None
 
 
@@ -108,9 +117,9 @@ class Study(PipelineFile):
     The only part of a study that is not in parts is called ``""``, and has no title.
     """
 
-    file: Path = Path()
-    command: str = ""  # that makes it, without where data come from and results go
-    words: tuple[str, ...] = ()  # of the command that runs it here, all of them
+    file: Path = Path()  # path of its pipeline file
+    command: str = ""  # command that makes it, without locations of data and results
+    words: tuple[str, ...] = ()  # words of the command that runs it here
     # part of the file with a search -> its trials, each a part here
     searches: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -135,15 +144,15 @@ class Study(PipelineFile):
 class Job:
     """One training and its evaluation."""
 
-    # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
+    # configuration as composed for ``train`` or ``eval``; rates may be lowered to those of
+    # recordings
     config: Config
-    # its settings as a sweep names them; empty for the estimator's name and variant
-    label: str = ""
-    # keys that a sweep varies -> its own values
+    label: str = ""  # settings as a sweep names them; empty for the estimator's name and variant
+    # keys that a sweep varies -> the job's values
     values: Mapping[str, Value] = field(default_factory=dict)
-    combination: int = 0  # of these values
-    failure: Failure | None = None  # why it cannot be done, or failed
-    training: TrainJob | None = None  # once it is planned
+    combination: int = 0  # index of the combination of these values in the sweep
+    failure: Failure | None = None  # reason why it cannot be done, or failed
+    training: TrainJob | None = None  # the planned training; None before it is planned
 
 
 Jobs = Mapping[
@@ -152,7 +161,7 @@ Jobs = Mapping[
 
 
 def failure_messages(jobs: Iterable[Job]) -> str:
-    """Why jobs failed, each reason once; empty where none failed."""
+    """Text of why jobs failed, each reason once; empty where none failed."""
     return "; ".join(dict.fromkeys(job.failure.message for job in jobs if job.failure is not None))
 
 
@@ -254,7 +263,7 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
 
 
 def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
-    """A part with a search as parts, one a candidate."""
+    """Trials of a part with a search, each as a part of its own: name -> part."""
     search = part.search
     assert search is not None
     subject = f"'{file}': the search '{name}'"
@@ -288,9 +297,9 @@ def _trials_of(name: str, part: Part, file: Path) -> dict[str, Part]:
 def _content_of(
     name: str, overrides: Sequence[str] = (), *, as_base: bool = False
 ) -> tuple[Path, dict[str, Any]]:
-    """A pipeline's file and its content, on top of that of the one it is based on.
+    """Path of a pipeline's file, and its content on top of that of the pipeline it is based on.
 
-    ``overrides``: those of the command, for the text of an error.
+    ``overrides`` are those of the command, for the text of an error.
     """
     file = require_pipeline(name, overrides)
     try:
@@ -316,7 +325,7 @@ def _content_of(
 
 
 def _merged(base: Any, changes: Any) -> Any:
-    """The keys of two mappings and of mappings in them; what changes to null is left out."""
+    """Merge two mappings recursively; keys that ``changes`` sets to null are left out."""
     if not isinstance(base, dict) or not isinstance(changes, dict):
         return changes
     changed = {key: _merged(base.get(key), value) for key, value in changes.items()}
@@ -328,7 +337,7 @@ def _merged(base: Any, changes: Any) -> Any:
 
 
 def _as_override(value: Any) -> str:
-    """A plain value in Hydra's grammar; text in quotes, since nan would be a number."""
+    """Text of a plain value in Hydra's grammar; strings are quoted, since nan would be a number."""
     if isinstance(value, tuple):
         return f"[{','.join(map(_as_override, value))}]"
     if isinstance(value, dict):
@@ -337,7 +346,7 @@ def _as_override(value: Any) -> str:
 
 
 def _folds_of(part: Part, file: Path) -> dict[str, Part]:
-    """A comparison on a split that is cross-validated as parts, a fold each."""
+    """Folds of a comparison on a split that is cross-validated, each as a part: name -> part."""
     folds = compose_config("train", [f"split={part.split}"])["split"].get("folds")
     number = folds.get("number", FoldsFile.number) if isinstance(folds, dict) else None
     if not isinstance(number, int) or number < 1:
@@ -477,7 +486,7 @@ def _part_jobs(
 
 
 def content_overrides(overrides: Sequence[str]) -> list[str]:
-    """Those overrides that change the results: not where data come from, where results go, or
+    """Those overrides that change results, without locations of data and results, and without
     tracking.
     """
     return [
@@ -572,8 +581,8 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
-    """The job of one combination, with the values that are swept; refused ones have a failure and
-    no configuration.
+    """The job of one combination of a sweep; one that is refused has a failure and no
+    configuration.
     """
     values: dict[str, Value] = {}
     for override in overrides:

@@ -89,8 +89,8 @@ def open_runner(
     study: str = "",
     messages: Messages | None = None,
 ) -> Iterator[Runner]:
-    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs
-    under a study, if there is one.
+    """Context with a runner that listens to signals, runs ``stages`` anew under ``options.force``,
+    and logs runs under a study, if there is one.
 
     Parameters
     ----------
@@ -299,9 +299,9 @@ def run_study(
 
 
 def _weights_to_add_to(study: Study, overrides: Sequence[str]) -> PublishedWeights:
-    """The published weights of a study, which each training adds to.
+    """The published weights of a study, to which each training is added.
 
-    Raises `ConfigurationError` where it is not published so.
+    Raises `ConfigurationError` where the study is not published with its overrides.
     """
     changes = content_overrides(overrides)
     if not study.publish or changes:
@@ -369,12 +369,12 @@ def _until(minutes: float | None, begun: float) -> float | None:
 
 
 def _first(jobs: Sequence[Job]) -> Config:
-    """Configuration of the first job that was not refused."""
+    """Configuration of the first job that did not fail."""
     return next(job.config for job in jobs if job.failure is None)
 
 
 def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
-    """Part -> its planned jobs, before anything is trained.
+    """Plan the jobs of all parts, before anything is trained: part -> comparison.
 
     Optional parts whose raw files are missing are left out.
     """
@@ -411,8 +411,8 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
 
 
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
-    """An ingested data set of a study of recordings alone, or an optional one whose raw files are
-    missing.
+    """Ingest a data set of a study of recordings alone; an optional one whose raw files are missing
+    is an `AbsentDataset`.
     """
     dataset = config["dataset"]
     title, licence, citation = (
@@ -441,9 +441,10 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
 def _error_of(
     study: Study, comparisons: Mapping[str, Comparison], runner: Runner
 ) -> JobsFailedError | None:
-    """The error that a study ends with after its report.
+    """The error with which a study ends after its report; None if nothing failed.
 
-    Raised at once where there is nothing to report, or not without what failed.
+    It is raised at once where there is nothing to report, or the report cannot leave out what
+    failed.
     """
     reasons: dict[str, list[str]] = {}
     for name, failure in (
@@ -594,7 +595,7 @@ def evaluate_model(
 
 def _calibration(model: Artefact, evaluation: Evaluation, runner: Runner) -> Artefact | None:
     """The calibration of a model: made on the split that it is evaluated on if it was trained
-    there, else looked for.
+    there, else searched in the output root; None where there is none.
     """
     learnt = learnt_spans(model)
     calibration = None

@@ -28,6 +28,7 @@ from vehest.run.ingest import plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, TableRecord
 from vehest.run.versions import code_of
 
+# matches the version that a script states
 VERSION_LINE = re.compile(r'^VERSION = "(.+?)"', re.MULTILINE)
 
 
@@ -54,9 +55,9 @@ def record_tables(
     without_keys: str = "",
     rows: RowKeys | None = None,
 ) -> None:
-    """Write to provenance.json beside tables how they were made; other tables' records stay.
+    """Record in provenance.json, beside tables, how these were made; records of other tables stay.
 
-    Tables outside results/, of a trial, are not recorded.
+    Tables outside results/, such as those of a trial, are not recorded.
 
     Parameters
     ----------
@@ -121,7 +122,8 @@ def record_tables(
 
 
 def today_of(key: str, folder: Path, overrides: Sequence[str] = ()) -> dict[str, str]:
-    """What a key of a table in ``folder`` is today; without ``data`` where raw files are not here.
+    """Present value of a key of a table in ``folder``; without ``data`` where raw files are not
+    available.
 
     Parameters
     ----------
@@ -170,7 +172,7 @@ def changes_of_tables(
     folder: Path,
     overrides: Sequence[str],
 ) -> tuple[list[tuple[str, str]], str]:
-    """What differs from when tables were made, as pairs with its cause, and a note on what was not
+    """Differences from when tables were made, as pairs with their cause, and a note on what was not
     compared.
 
     Parameters

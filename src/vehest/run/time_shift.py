@@ -13,13 +13,13 @@ from vehest.data.errors import DataError
 
 MAX_RATE = 100.0  # Hz; estimate and reference are correlated at this rate at most
 MIN_OVERLAP_SECONDS = 5.0  # s of samples that both have; a shift with less does not count
-MIN_OVERLAP_SHARE = 0.5  # the same as a share of the shorter one's samples
+MIN_OVERLAP_SHARE = 0.5  # smallest overlap as a share of the shorter one's samples
 MIN_VARIANCE_RATIO = 1.5
-"""By which the second best shift must leave more variance unexplained than the best one, to be
-refused otherwise.
+"""Smallest ratio of the variance unexplained at the second best shift to that at the best one;
+below it the shift is ambiguous and refused.
 """
 
-MIN_UNEXPLAINED = 1e-3  # share of the variance, below which two shifts are equally good
+MIN_UNEXPLAINED = 1e-3  # share of the variance below which two shifts count as equally good
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Series:
         return float((len(self.time) - 1) / (self.time[-1] - self.time[0]))
 
     def sampled(self, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-        """Deviations from the mean on a uniform clock, 0 where there is no sample, and 1 where
-        there is one.
+        """Resample to a uniform rate: deviations from the mean, 0 where there is no sample, and a
+        mask, 1 where there is one.
 
         Parameters
         ----------
@@ -66,10 +66,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Shift:
-    """Seconds to add to the times of an estimate, and its correlation with the reference there."""
+    """Shift between the clocks of an estimate and of the reference."""
 
-    seconds: float
-    correlation: float
+    seconds: float  # seconds to add to the times of the estimate
+    correlation: float  # correlation with the reference after the shift
 
 
 def estimate_shift(estimate: Series, reference: Series) -> Shift:
@@ -126,9 +126,8 @@ def _correlations(
     estimate: tuple[FloatArray, FloatArray],
     rate_hz: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Pearson's correlation of the samples in common at every lag of the estimate in samples.
-
-    -inf where these are too few.
+    """Pearson's correlation of the samples in common at every lag of the estimate in samples, and
+    these lags; -inf where the samples are too few.
     """
     a, has_a = reference
     b, has_b = estimate
@@ -159,7 +158,7 @@ def _correlations(
 
 
 def _second_peak(correlations: FloatArray, best: int) -> int | None:
-    """The highest local maximum outside the lobe of the best one; None without any."""
+    """Index of the highest local maximum outside the lobe of the best one; None without any."""
     low = high = best
     limit = 0.5 * correlations[best]
     while low > 0 and correlations[low] > limit:
@@ -173,8 +172,8 @@ def _second_peak(correlations: FloatArray, best: int) -> int | None:
 
 
 def _vertex(correlations: FloatArray, best: int) -> float:
-    """Place of the vertex of the parabola through the best lag and its neighbours, in samples from
-    it.
+    """Position of the vertex of the parabola through the best lag and its neighbours, in samples
+    from the best lag.
     """
     if not 0 < best < len(correlations) - 1:
         return 0.0

@@ -29,18 +29,19 @@ from vehest.run.evaluate import test_figures
 from vehest.run.train import HISTORY, read_fit_metrics
 from vehest.studies.artefacts import read_frame
 
-STORE = "mlflow.db"
+STORE = "mlflow.db"  # name of MLflow's local store in the output root
 REMOTE_ARTIFACTS = frozenset(
     ["mlflow-artifacts", "http", "https", "s3", "gs", "wasbs", "abfss", "ftp", "sftp", "hdfs"]
 )  # schemes of addresses at which MLflow writes to another machine
 LOCAL_STORES = frozenset(["sqlite", "file", ""])  # schemes of stores that no server answers for
-VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
+VALUES_A_REQUEST = 100  # largest number of parameters that a server takes in one request
 VALUE_LENGTH = 500  # characters of a value in MLflow; longer ones are cut off
-KEY_TAG = "vehest.key"
-STAGE_TAG = "vehest.stage"
-DIGEST_TAG = "vehest.digest"
-OUTPUT_TAG = "vehest.output"
-STUDY_TAG = "vehest.study"
+KEY_TAG = "vehest.key"  # MLflow tag of a run: key of its artefact
+STAGE_TAG = "vehest.stage"  # MLflow tag of a run: stage
+DIGEST_TAG = "vehest.digest"  # MLflow tag of a run: digest of its artefact
+OUTPUT_TAG = "vehest.output"  # MLflow tag of a run: output root
+STUDY_TAG = "vehest.study"  # MLflow tag of a run: study
+# stage -> function that reads the metrics of an artefact's folder
 METRICS: Mapping[str, Callable[[Path], Mapping[str, float]]] = {
     "train": read_fit_metrics,
     "calibrate": calibration_figures,
@@ -151,20 +152,20 @@ class Tracker:
         return get_artifact_repository(address, tracking_uri=self._address)
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
-        """Runs of the experiment with these tags."""
+        """Runs of the experiment that have these tags."""
         condition = " and ".join(
             f"tags.`{name}` = '{value}'" for name, value in tags.items()
         )  # hashes and names of files: without quotes
         return list(self._client.search_runs([self._experiment_id], condition))
 
     def _new_run(self, name: str, tags: Mapping[str, str]) -> Any:
-        """A new run with a name, the command and tags."""
+        """Begin a run with a name, the command and tags."""
         source = " ".join(["vehest", *sys.argv[1:]])[:VALUE_LENGTH]
         about = {"mlflow.runName": name, "mlflow.source.name": source, OUTPUT_TAG: self._root}
         return self._client.create_run(self._experiment_id, tags={**about, **tags})
 
     def _parent(self) -> str:
-        """Run of the study, above those of its artefacts."""
+        """Id of the study's run, above those of its artefacts."""
         tags = {STUDY_TAG: self.study, STAGE_TAG: "study"}
         runs = [run for run in self._runs(tags) if run.data.tags.get(OUTPUT_TAG) == self._root]
         run_id = str((runs[0] if runs else self._new_run(self.study, tags)).info.run_id)
@@ -204,7 +205,9 @@ class Tracker:
 
     @cached_property
     def _experiment_id(self) -> str:
-        """The experiment of the configuration, made where it is missing."""
+        """Id of the experiment that the configuration names, which is created where it is
+        missing.
+        """
         name = str(self.config.get("experiment", "vehest"))
         location = (self.output / "mlartifacts").resolve().as_uri() if self.store else None
         experiment = self._client.get_experiment_by_name(name)
@@ -216,7 +219,7 @@ class Tracker:
 
     @property
     def _root(self) -> str:
-        """The output root as an absolute path, which tells runs of several roots apart."""
+        """The output root as an absolute path, which distinguishes runs of several roots."""
         return str(self.output.resolve())
 
     @property
@@ -226,7 +229,7 @@ class Tracker:
 
 
 def _require_sqlite_path(store: Path) -> None:
-    """Refuse a path that MLflow would read as another one or that it cannot take.
+    """Raise an error for a path that MLflow would read as another one or cannot use.
 
     SQLAlchemy takes what follows ``?`` for options and ``%20`` for a blank. Quoted it reads the
     path, but MLflow creates the folder of the quoted path, too.

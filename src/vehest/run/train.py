@@ -28,35 +28,37 @@ from vehest.estimators.registry import new_estimator
 from vehest.run.versions import code_of
 from vehest.training.context import FitContext
 
-STAGE = "train"
-HISTORY = "history.csv"
-FIT_METRICS = "fit.csv"
+STAGE = "train"  # name of the stage
+HISTORY = "history.csv"  # name of the training history in a model's folder
+FIT_METRICS = "fit.csv"  # name of the figures of a fit in a model's folder
+# note on a training that diverged
 DIVERGED = "diverged and ended with its best weights until then; lower its learning_rate"
-UNKEYED = frozenset({"checkpoint_seconds"})  # options of a training that move no number
+# options of a training that change no result and are not in its key
+UNKEYED = frozenset({"checkpoint_seconds"})
 
 
 @dataclass(frozen=True)
 class TrainJob:
     """One member to train, and the artefact it becomes."""
 
-    plan: StagePlan
-    estimator: Mapping[str, Any]
-    training: Mapping[str, Any]
-    split: Split
-    seed: int
+    plan: StagePlan  # the artefact
+    estimator: Mapping[str, Any]  # ``estimator`` of the configuration
+    training: Mapping[str, Any]  # ``training`` of the configuration
+    split: Split  # ranges of training and validation
+    seed: int  # seed of the training
     data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
 
     @property
     def is_learnt_at_once(self) -> bool:
-        """Whether it has no training to configure: nothing is fitted, or a closed form."""
+        """Whether there is no training to configure: nothing is fitted, or it has a closed form."""
         return bool(self.training["name"] == "none")
 
     @property
     def group(self) -> tuple[Any, ...]:
-        """Jobs of one group may be trained together.
+        """Key of trainings that may be done together: those with equal keys.
 
-        Estimators, training options, seeds unless these are fitted together, ranges and inputs
-        decide.
+        It has estimator, training options, seed (unless seeds are fitted together), ranges and
+        inputs.
         """
         estimator = new_estimator(self.estimator)
         key = (estimator.batch_key, None if estimator.fits_seeds_together else self.seed)
@@ -73,7 +75,7 @@ class TrainJob:
 
 
 def estimator_rate(config: Mapping[str, Any]) -> float:
-    """The rate that the estimator of a configuration works at [Hz].
+    """Sampling rate that the estimator of a configuration works at [Hz].
 
     Raises
     ------
@@ -84,7 +86,7 @@ def estimator_rate(config: Mapping[str, Any]) -> float:
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact.
+    """Plan a training and its artefact.
 
     Parameters
     ----------
@@ -244,7 +246,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
 
 
 def divergence_values(record: FitRecord) -> dict[str, Any]:
-    """What model.yaml says of a training that diverged; empty for one that never did."""
+    """Entries of model.yaml on a training that diverged; empty for one that did not."""
     if "step_size_halvings" not in record.metrics:
         return {}
     halvings = int(record.metrics["step_size_halvings"])
@@ -294,8 +296,8 @@ def trained_rate(model: Artefact) -> float:
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
-    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those
-    of the named roles.
+    """The ranges that a model was trained on (``train``) and validated on for early stopping
+    (``validation``), or those of the named roles.
     """
     with _reading_manifest(model):
         return [
@@ -312,7 +314,7 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
 
 @contextmanager
 def _reading_manifest(model: Artefact) -> Iterator[None]:
-    """Raises `DataError` where a manifest describes no training."""
+    """Context that raises `DataError` where a manifest describes no training."""
     try:
         yield
     except (LookupError, TypeError, ValueError, ConfigurationError) as error:

@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.estimators.registry import new_estimator
 from vehest.run.train import TrainJob
 
-START = "start_from"
+START = "start_from"  # option of the model that a training starts from
 
 Differences = Mapping[str, str]  # option, without its group -> value
 
@@ -50,14 +50,16 @@ def differences_of(trainings: Iterable[TrainJob]) -> dict[str, Differences]:
 
 
 def difference_text(differences: Differences) -> str:
-    """Text behind a title, ``, learning_rate 0.003``; a start has words of its own there."""
+    """Suffix of a title, such as ``, learning_rate 0.003``, without the option ``start_from``,
+    which has a text of its own there.
+    """
     return "".join(
         f", {option} {value}" for option, value in differences.items() if option != START
     )
 
 
 def difference_suffix(differences: Differences) -> str:
-    """Suffix of a variant's name, ``_learning_rate_0.003``."""
+    """Suffix of a variant's name, such as ``_learning_rate_0.003``."""
     return "".join(f"_{option}_{value}" for option, value in differences.items())
 
 

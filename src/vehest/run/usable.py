@@ -29,28 +29,26 @@ from vehest.run.printing import TerminalTable
 from vehest.sources.base import car_of
 
 SUFFICES = "no channel is missing"
-"""Of settings with which no channel is missing."""
+"""Text for settings with which no channel is missing."""
 SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Channels that some recording lacks, those that an estimator reads and those that its fit
-    reads.
-    """
+    """Channels that at least one recording lacks."""
 
-    to_estimate: list[str]
-    to_train: list[str]
+    to_estimate: list[str]  # channels that the estimator reads
+    to_train: list[str]  # channels that its fit reads
     # channel -> transforms that make it of channels that are there; None where none do
     supplies: dict[str, Derivation | None]
 
     @property
     def unsupplied(self) -> list[str]:
-        """Channels that no transform makes."""
+        """Missing channels that no transform derives."""
         return [channel for channel, supply in self.supplies.items() if supply is None]
 
-    def in_words(self) -> list[str]:
-        """Each channel with its supply."""
+    def describe(self) -> list[str]:
+        """Texts of the missing channels, each with its supply."""
         return [
             f"{channel} ({'not in the log' if supply is None else supply.in_words()})"
             for channel, supply in self.supplies.items()
@@ -62,23 +60,25 @@ class Usability:
     """Whether an estimator can be used with recordings."""
 
     estimator: str  # name in conf/estimator
-    rate_hz: float | None  # that it would run at [Hz]; None where its settings are incomplete
-    configured_rate_hz: float | None  # of its configuration [Hz]
+    rate_hz: float | None  # rate at which it would run [Hz]; None where its settings are incomplete
+    configured_rate_hz: float | None  # rate of its configuration [Hz]
     missing: Missing  # channels that the recordings lack
     gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
     settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
-    without: str = ""  # the same in words, with channels that are missing even then
-    # overrides that its fit needs, since it asks for recordings by other names
+    without: str = ""  # text of these settings, with channels that are missing even then
+    # overrides that its fit needs, since its settings ask for other names of recordings
     patterns: tuple[str, ...] = ()
-    to_give: str = ""  # setting that only the user knows, or why it is unusable
-    # keys of the car's parameters, which are those of another car unless given
+    to_give: str = ""  # setting that the user has to give, or why the estimator is unusable
+    # keys of its settings that are parameters of the car, which are those of another car unless
+    # given
     car: tuple[str, ...] = ()
     settings_suffice: bool = False  # whether nothing is missing with ``settings``
-    of_car: str = ""  # overrides with values of the car that the user has to give; empty if none
+    # overrides with values of the car that the user has to give; empty if there are none
+    of_car: str = ""
 
     @property
     def usable(self) -> str:
-        """Whether it can be used.
+        """Whether the estimator can be used with these recordings.
 
         ``yes`` as it is; ``with settings`` if overrides make it usable, those in ``settings`` and
         ``patterns`` or values of the car, as `vehest new` writes them; ``not to train`` if only a
@@ -92,7 +92,7 @@ class Usability:
         return "with settings" if is_missing or self.patterns or self.of_car else "yes"
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """The fields as plain values, for JSON."""
         return {
             "estimator": self.estimator,
             "usable": self.usable,
@@ -115,11 +115,10 @@ class Usability:
 def all_usabilities(
     recordings: Sequence[RecordingSummary], dataset: Mapping[str, Any] | None = None
 ) -> list[Usability]:
-    """A row for each estimator of conf/estimator, then of other packages that have no file there,
-    with the car of a data set, if any.
+    """Usability of each estimator of conf/estimator, then of those of other packages without a file
+    there, with the car of a data set, if there is one.
 
-    There is at least one recording. A file or a package that cannot be used is a row with the
-    reason.
+    A file or a package that cannot be used is a row with the reason.
 
     Parameters
     ----------
@@ -194,7 +193,7 @@ def _usability(
     to_estimate: Sequence[RecordingSummary],
     has_wheelbase: bool,
 ) -> Usability:
-    """As `usability`, where nothing but vehest's errors is expected."""
+    """`usability` without the handling of errors of other packages."""
     summaries = [*recordings, *to_estimate]
     family = str(config["estimator"]["name"])
     try:
@@ -239,8 +238,8 @@ def _usability(
 
 
 def _overrides_of_car(estimator: Estimator, has_wheelbase: bool) -> str:
-    """Overrides with values of the car that a first comparison needs and neither the settings nor
-    the data set have yet, for people.
+    """Text of overrides with values of the car that a first comparison needs and that neither the
+    settings nor the data set have.
     """
     overrides = " ".join(trial.overrides for trial in estimator.trials)
     if "{car}" in overrides:
@@ -253,7 +252,7 @@ def _overrides_of_car(estimator: Estimator, has_wheelbase: bool) -> str:
 
 
 def car_parameters(estimator: str) -> tuple[str, ...]:
-    """Keys of an estimator's settings that are parameters of the car."""
+    """Dotted keys of an estimator's settings that are parameters of the car."""
     car = get_type_hints(estimator_class(estimator).settings_type).get("car")
     return (
         tuple(f"estimator.car.{parameter.name}" for parameter in fields(car))
@@ -262,9 +261,9 @@ def car_parameters(estimator: str) -> tuple[str, ...]:
     )
 
 
-def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
-    """A table of estimators, transforms that make channels that some lack, and estimators that take
-    another car's parameters.
+def usability_lines(rows: Sequence[Usability]) -> list[str | TerminalTable]:
+    """Lines for a terminal: a table of estimators, transforms that derive missing channels, and
+    estimators whose settings are another car's parameters.
     """
     supplies = {
         channel: supply.in_words()
@@ -289,7 +288,7 @@ def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
 
 
 def _cells(row: Usability) -> list[str]:
-    """Cells of the table; the lines below it have the transforms in full."""
+    """Cells of an estimator in the table; the lines below the table have the transforms in full."""
     to_train = ", ".join(
         name for name in row.missing.to_train if name not in row.missing.to_estimate
     )
@@ -326,9 +325,10 @@ def _cells(row: Usability) -> list[str]:
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
-    """Channels that recordings of a split lack and its estimator needs, as one line.
+    """One line on the channels that recordings of a split lack and its estimator needs; empty if
+    none.
 
-    Empty if none; raises `ConfigurationError`.
+    Raises `ConfigurationError`.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
     )
     if incomplete:
         and_more = f" and {len(incomplete) - 1} more lack" if len(incomplete) > 1 else " lacks"
-        reasons = Missing([], [], by_scores.supplies | usable.missing.supplies).in_words()
+        reasons = Missing([], [], by_scores.supplies | usable.missing.supplies).describe()
         without = [usable.without] if usable.settings else []
         return (
             f"recording '{incomplete[0]}'{and_more} channels that estimator '{estimator.name}' "
@@ -383,7 +383,9 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
 
 
 def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
-    """Those of the needed channels that at least one recording lacks."""
+    """Those of the needed channels that at least one recording lacks, with transforms that derive
+    them.
+    """
     missing = [name for summary in recordings for name in channels if name not in summary.channels]
     return _with_supplies(missing, missing, recordings)
 
@@ -405,7 +407,7 @@ def _recordings(
 
 
 def _built(config: Config) -> tuple[Estimator, Any]:
-    """Estimator and settings of its training; raises `ConfigurationError`."""
+    """Estimator, and settings of its training, of a configuration; raises `ConfigurationError`."""
     estimator = new_estimator(config["estimator"])
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 
@@ -416,7 +418,7 @@ def _missing(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> Missing:
-    """Channels that an estimator reads and its fit reads, and recordings lack."""
+    """Channels that an estimator or its fit reads and recordings lack."""
     read = [
         name
         for summary in to_estimate
@@ -432,9 +434,8 @@ def _missing(
 
 
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
-    """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks.
-
-    None where nothing is trained.
+    """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks;
+    empty where nothing is trained.
     """
     required = (
         (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
@@ -445,7 +446,7 @@ def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[s
 def _with_supplies(
     read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> Missing:
-    """Missing channels, each once, with transforms that make them of the channels that all
+    """Missing channels, each once, with transforms that derive them from the channels that all
     recordings have.
     """
     common = common_channels(recordings)
@@ -461,10 +462,10 @@ def _settings_without(
     to_train: Sequence[RecordingSummary],
     to_estimate: Sequence[RecordingSummary],
 ) -> tuple[tuple[str, ...], str]:
-    """Overrides of the estimator by which fewer channels are missing, and the same in words.
+    """Overrides of the estimator by which fewer channels are missing, and a text of them.
 
-    Step by step the one that leaves the fewest is taken, until none leaves fewer. ``missing`` are
-    the channels that no transform makes.
+    In each step the override that leaves the fewest is taken, until none leaves fewer. ``missing``
+    are the channels that no transform derives.
     """
     changes: dict[str, Any] = {}
     while missing:
@@ -502,8 +503,8 @@ def _settings_without(
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, Any]]:
-    """Each other choice of a setting with two or a few, and each list of channels without one of
-    them.
+    """Yield dotted keys with alternative values: each other choice of a setting with a few choices,
+    and each list of channels without one of them.
     """
     settings = new_estimator(config["estimator"]).settings
     for key, hint in get_type_hints(type(settings)).items():

@@ -16,21 +16,23 @@ VERSIONS = {
     "report": "1",
     "sweep": "2",
 }
-"""Stage -> its version, raised when its numbers move."""
-FAULTS = "3"  # of an evaluation's faults, likewise
-TYRE_CHECK = "1"  # of a calibration of estimators whose tyre model bands check, likewise
+"""Stage -> its version, which is raised when its results change."""
+FAULTS = "3"  # version of the evaluation under faults, which is raised when its results change
+# version of the calibration of estimators with a tyre check, which is raised when its results
+# change
+TYRE_CHECK = "1"
 
 
 def _checks_tyres(name: str) -> bool:
-    """Whether an estimator's bands depend on its tyre model, so that a calibration has a further
+    """Whether an estimator's bands have a tyre check, so that a calibration has a further
     version.
     """
     return estimator_class(name).training_friction is not Estimator.training_friction
 
 
 def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
-    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or
-    study by name, and of ``faults``.
+    """Version of a stage with that of its source, estimator or study, and of ``faults``, such as
+    ``train=1 ksnn=1 training=1``.
 
     Parameters
     ----------

@@ -41,9 +41,11 @@ COMPRESSED = "zlib,"
 """Begins the content of a file that is compressed and written in base64; files of weights of
 earlier versions have plain text.
 """
-FILES = (DESCRIPTION, FIT_METRICS, HISTORY)  # of a training, beside its weights
-FORMAT = 4  # in the key of a report that has weights: 3 has compressed files, 4 origins
-MAX_MEGABYTES = 25  # of a study, since every clone of the repository downloads them
+# files of a model that are published beside its weights
+FILES = (DESCRIPTION, FIT_METRICS, HISTORY)
+FORMAT = 4  # version in the key of a report that has weights: 3 has compressed files, 4 origins
+# MB of a study's weights, at most, since every clone of the repository downloads them
+MAX_MEGABYTES = 25
 MAX_FILE_BYTES = 10_000_000  # uncompressed, so that no file of weights can fill the memory
 
 
@@ -53,13 +55,14 @@ class WeightsTooLargeError(VehestError):
 
 @dataclass(frozen=True)
 class PublishedModel:
-    """What a training wrote beside its weights, which are the tensors ``KEY/NAME`` of the file."""
+    """Record of a training beside its weights, which are the tensors ``KEY/NAME`` of the file."""
 
-    label: str
+    label: str  # name of the training
     code: str  # version of the training
-    digest: str  # of the training's artefact
+    digest: str  # digest of the training's artefact
     origin: str = ""  # the training's key with the origins of its recordings; empty: not known
-    files: dict[str, str] = field(default_factory=dict)  # of `FILES` -> content, `compressed`
+    # file of `FILES` -> its content, `compressed`
+    files: dict[str, str] = field(default_factory=dict)
 
 
 class PublishedWeights:
@@ -224,7 +227,9 @@ def compressed(content: bytes) -> str:
 
 
 def uncompressed(text: str) -> bytes:
-    """A file's content; raises `ValueError` where it is damaged or above `MAX_FILE_BYTES`."""
+    """The content of a file from its text in a `PublishedModel`; raises `ValueError` where it is
+    damaged or above `MAX_FILE_BYTES`.
+    """
     if not text.startswith(COMPRESSED):
         return text.encode()
     inflation = zlib.decompressobj()
@@ -242,7 +247,7 @@ def uncompressed(text: str) -> bytes:
 
 
 def _record_of(model: Artefact, origin: str) -> PublishedModel:
-    """What is published of a model beside its weights."""
+    """The published record of a model beside its weights."""
     files = {
         name: compressed((model.folder / name).read_bytes())
         for name in FILES

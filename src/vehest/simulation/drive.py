@@ -37,8 +37,8 @@ from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import described, measure
 
 RATE_HZ = 100.0  # default sampling rate of recordings [Hz]
-AFTER_STAND = 1.0  # recorded after the car has come to its stand [s]
-MAX_STOP_SECONDS = 60.0  # within which a car stands that spun or left the road [s]
+AFTER_STAND = 1.0  # time that is recorded after the car has come to its stand [s]
+MAX_STOP_SECONDS = 60.0  # longest time until a car that spun or left the road has to stand [s]
 # share of the grip with which a driver brakes after a spin or beside the road; assumed
 STOPPING_SHARE = 0.7
 
@@ -47,18 +47,19 @@ STOPPING_SHARE = 0.7
 class Flags:
     """Outcome of a drive."""
 
-    spun: bool  # the car slid beyond the validity of its equations of rolling
-    left_road: bool = False  # it was further beside its line than the manoeuvre's half_width
-    stood: bool = False  # it stands at the end
-    # the manoeuvre came to its own end, and was not cut off because it took too long
+    spun: bool  # whether the car slid beyond the validity of its equations of rolling
+    # whether the car was farther beside its line than the manoeuvre's half_width
+    left_road: bool = False
+    stood: bool = False  # whether the car stands at the end
+    # whether the manoeuvre came to its own end, and was not cut off because it took too long
     completed: bool
-    # when the driver began to stop because of a spin or beside the road [s]; none if never
+    # time at which the driver began to stop because of a spin or beside the road [s]; None: never
     gave_up_at: float | None = None
-    # distance from the line [m]; none where there is no line
+    # largest distance from the line [m]; None where there is no line
     largest_lateral_error: float | None = None
-    largest_sideslip: float  # above 1 m/s, either sign [rad]
-    largest_ay: float  # either sign [m/s²]
-    # of the recorded time in which stability control intervened; none where it is off
+    largest_sideslip: float  # largest magnitude of the sideslip angle above 1 m/s [rad]
+    largest_ay: float  # largest magnitude of the lateral acceleration [m/s²]
+    # share of the recorded time in which stability control intervened; None where it is off
     stability_share: float | None = None
 
 
@@ -66,10 +67,10 @@ class Flags:
 class Trip:
     """True motion and outcome of a drive."""
 
-    motion: Motion  # true motion, first sample after the settling time
-    # the car's place left of its line [m], (T,); NaN where there is no line
+    motion: Motion  # true motion, from the first sample after the settling time on
+    # distance of the car from its line, positive left of it [m], (T,); NaN where there is no line
     lateral_error: FloatArray
-    flags: Flags  # how it went
+    flags: Flags  # outcome
     drawn: dict[str, Any]  # values that the seed drew
 
 
@@ -158,7 +159,7 @@ def simulate_drive(
 
 @contextmanager
 def naming(id: str, seed: int) -> Iterator[None]:
-    """Names drive and seed in the errors of a simulation.
+    """Context in which errors of a simulation name the drive and its seed.
 
     Raises
     ------

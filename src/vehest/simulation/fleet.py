@@ -24,10 +24,12 @@ from vehest.simulation.plant.parameters import (
 from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
 
-# of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+# random stream of the fleet in a drive's seed; 0 to 3 are the driver's, the sensors', the surface's
+# and the manoeuvre's
 _STREAM = 4
 
 
+# lowest and highest scale
 Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
 
 
@@ -35,9 +37,11 @@ Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
 class Variation:
     """Parameters of the plant that are scaled together."""
 
-    parameters: tuple[str, ...]  # the library's names, ``tire.p_dy1`` for one of a group
+    # names of the parameters in the library, ``tire.p_dy1`` for one of a group
+    parameters: tuple[str, ...]
     factor: Scales  # lowest and highest scale, drawn uniformly for every drive
-    # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
+    # whether the scale is drawn uniformly over its logarithm, so that half as much is as likely as
+    # twice as much
     log: bool = False
 
     def __post_init__(self) -> None:
@@ -48,7 +52,7 @@ class Variation:
             )
 
     def drawn(self, generator: np.random.Generator) -> float:
-        """A scale.
+        """Draw a scale for all of the parameters.
 
         Parameters
         ----------
@@ -136,7 +140,7 @@ def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) ->
 
 
 def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]:
-    """Scales of each parameter."""
+    """Scales that the seed draws for each parameter."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     factors_of: dict[str, list[float]] = {}
     for variation in variations:
@@ -154,7 +158,7 @@ class SensorVariation:
 
     # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
     factors: Mapping[str, tuple[float, float]]
-    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the
+    # lowest and highest share of the body's roll that leaks into ay, of either sign; None: as the
     # sensors have it
     roll_share: tuple[float, float] | None = None
 

@@ -18,9 +18,8 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import measure
 
-PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {
-    Freestyle.name: Freestyle
-}  # manoeuvres of the planar plant's cars by name
+# name -> manoeuvre, of cars of the planar plant
+PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
 
 CHANNELS = (
     "vx",
@@ -34,7 +33,7 @@ CHANNELS = (
     "vy_ref",
     "yaw_rate_ref",
 )
-"""Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes
+"""Channels of a small car: it has no sensors at single wheels, and the inertial unit's other axes
 are not kept.
 """
 
@@ -95,8 +94,8 @@ def drive_freely(
     rate_hz: float = RATE_HZ,
     surface: Surface = SURFACES["dry"],
 ) -> Trip:
-    """Drive a car for the time of a recording and keep its true motion; it starts from standstill,
-    SETTLING_TIME before.
+    """Drive a small car for the time of a recording and return its true motion; it starts from
+    standstill, SETTLING_TIME before the first sample.
 
     Parameters
     ----------

@@ -25,15 +25,18 @@ from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9  # bytes to which no archive may unpack, unless a caller allows more
 ALLOWED_BYTES = 64 * 2**20  # bytes to which any archive may unpack
-MOST_EXPANSION = 250  # times its packed size to which a larger one may unpack
+# largest ratio of unpacked to packed size of an archive that unpacks to more than `ALLOWED_BYTES`
+MOST_EXPANSION = 250
 MOST_FILES = 10_000  # entries of an archive; one with more is refused
-# without LZMA, which takes as much memory as an entry asks for, up to 4 GiB
+# methods of compression that are read; without LZMA, which takes as much memory as an entry asks
+# for, up to 4 GiB
 METHODS = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
     zipfile.ZIP_BZIP2,
 )
 
+# exceptions of zipfile and zlib for a damaged archive
 _UNSOUND = (
     zipfile.BadZipFile,
     zlib.error,
@@ -65,7 +68,7 @@ class _Archive(io.FileIO):
 
 
 def unpacked_limit(packed: int, most_bytes: int = MOST_BYTES) -> int:
-    """What ``packed`` bytes may unpack to on disk [bytes].
+    """Largest size to which an archive of ``packed`` bytes may unpack on disk [bytes].
 
     It is `MOST_EXPANSION` times the packed size, at least `ALLOWED_BYTES` and at most
     ``most_bytes``.

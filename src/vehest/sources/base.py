@@ -28,10 +28,10 @@ from vehest.data.text_files import first_line
 from vehest.data.transforms import ReferenceLever, transform_from_config
 from vehest.sources.clocks import require_clock
 
-ENTRY_POINTS = "vehest.sources"
+ENTRY_POINTS = "vehest.sources"  # group of the entry points by which other packages offer sources
+# endings of files that are no tables
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
-SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
-# key of a recording's provenance: transforms of its data set, and where its channels were measured
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")  # endings of files of spreadsheets
 SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
@@ -46,14 +46,13 @@ def kind_of(dataset: Mapping[str, Any]) -> Kind:
 
 @dataclass(frozen=True)
 class Point:
-    """Where something was measured, from the centre of gravity [m]: ``x`` ahead, ``y`` to the
-    left.
-    """
+    """Position where something was measured, from the centre of gravity."""
 
-    x: float = 0.0
-    y: float = 0.0
+    x: float = 0.0  # distance ahead of it [m]
+    y: float = 0.0  # distance to the left of it [m]
 
 
+# a point, or ``unknown``
 Place = Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"]
 
 
@@ -61,28 +60,35 @@ Place = Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or un
 class CommonOptions:
     """Options of every data set; see docs/data.md."""
 
-    source: str
-    name: str = "unnamed"
-    title: str = ""
-    kind: Kind = "real"
+    source: str  # name of the source that reads the data set
+    name: str = "unnamed"  # name of the data set
+    title: str = ""  # title for people
+    kind: Kind = "real"  # whether recordings are real or simulated
+    # name of the vehicle, or its configuration for a simulation
     vehicle: str | dict[str, Any] | None = None
+    # values of the car as it was recorded
     car: Annotated[CarValues, "a mapping of wheelbase, mass and others"] | None = None
-    licence: str = ""
-    citation: str = ""
+    licence: str = ""  # licence of the data
+    citation: str = ""  # work to cite for the data
+    # names of checks whose findings are accepted
     accept: Annotated[tuple[str, ...], "a list of checks"] | None = None
+    # address, files and checksums of a download
     download: (
         Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None
     ) = None
+    # transforms that are applied to each recording, in order
     transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
-    reference_point: Place | None = None
-    imu_point: Place | None = None
+    reference_point: Place | None = None  # position at which the reference was measured
+    imu_point: Place | None = None  # position of the inertial unit
 
 
+# names of the options of every data set
 COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 
 def origin_in_words(recording: Recording) -> list[str]:
-    """Where a recording's channels were measured and which were derived, by its data set.
+    """Lines of text on where a recording's channels were measured and which were derived, by its
+    data set.
 
     Returns
     -------
@@ -109,7 +115,9 @@ def origin_in_words(recording: Recording) -> list[str]:
 
 
 def _point_in_words(point: Any) -> str:
-    """A declared point, ``{x: …, y: …}`` [m] or ``unknown``, as seen from the centre of gravity."""
+    """Text of a declared point, ``{x: …, y: …}`` [m] or ``unknown``, as seen from the centre of
+    gravity.
+    """
     if point == "unknown":
         return "at a point that is not known"
     x = float(point.get("x", 0.0))
@@ -119,7 +127,7 @@ def _point_in_words(point: Any) -> str:
     return f"{' and '.join(parts) or 'at'} the centre of gravity"
 
 
-Options = TypeVar("Options")
+Options = TypeVar("Options")  # dataclass of options
 
 
 def car_of(dataset: Mapping[str, Any]) -> CarValues:
@@ -174,9 +182,8 @@ class Source(ABC):
     options_type: ClassVar[type]
     options: Any
     version: ClassVar[str] = "1"
-    slow: ClassVar[bool] = (
-        False  # whether a recording takes so long that each is kept as soon as it is made
-    )
+    # whether a recording takes so long that each is kept as soon as it is made
+    slow: ClassVar[bool] = False
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
@@ -343,7 +350,7 @@ class Source(ABC):
         return []
 
     def recordings(self) -> Iterator[Recording]:
-        """All recordings, one after another."""
+        """Recordings of the data set, one after another."""
         for recording_id in self.ids():
             yield self.read(recording_id)
 

@@ -12,7 +12,8 @@ from vehest.constants import FloatArray
 
 DAY = 86_400.0  # s
 HOUR = 3600.0  # s
-MAX_STEP = 20.0 * DAY  # s, beyond which day and month were mistaken for one another
+MAX_STEP = 20.0 * DAY  # s, largest step; with a larger one day and month were interchanged
+# matches a time of day, with or without a date
 CLOCK = (
     r"^\s*(?:(?P<date>\d{4}[-/.]?\d{1,2}[-/.]?\d{1,2}|\d{1,2}[-/. ]\w{1,3}[-/. ]\d{2,4})[T _]+"
     r"|(?P<days>\d+) days?,? *|(?:\d{4}[-:/ ])?(?P<day_of_year>\d{3})[-:/T ])?"
@@ -20,13 +21,17 @@ CLOCK = (
     r"|(?P<minutes>\d{1,3}):(?P<seconds>\d{2}[.,]\d+))"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?\s*(?:Z|UTC|[+-]\d{2}:?\d{2})?\s*$"
 )
+# matches a duration
 DURATION = (
     r"(?i)^(?P<date>)(?P<day_of_year>)(?P<half>)(?P<minutes>)(?P<seconds>)\s*"
     r"(?:P(?:(?P<days>\d+)D)?T(?:(?P<hour>\d+)H)?(?:(?P<minute>\d+)M)?)?"
     r"(?:(?P<second>\d+(?:[.,]\d+)?)\s*s(?:ec)?)?\s*$"
 )
-DIGITS = r"^\s*(\d{8})(\d{6})(\d{0,6})\s*$"  # of date and time without a mark, to the microsecond
+# matches date and time in digits alone, to the microsecond
+DIGITS = r"^\s*(\d{8})(\d{6})(\d{0,6})\s*$"
+# matches the three parts of a date
 DATE = r"^(?P<first>\d{4}|\d{1,2})[-/. ]?(?P<second>\d{1,2})[-/. ]?(?P<third>\d+)$"
+# first letters of the months, in order
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 

@@ -18,30 +18,37 @@ from vehest.data.errors import DataError, number_of
 from vehest.data.limits import check_limit
 from vehest.data.recording import HIGHEST_RATE
 
+# treatment of uneven time stamps, see `uniform_clock`
 ClockPolicy = Literal["strict", "interpolate", "uniform"]
 
 LONGEST_STEP = 86_400.0  # s; a recording with a longer typical step is refused
 MOST_STEPS = 1e8  # median steps from the first to the last stamp; a recording with more is refused
 LATEST_TIME = 1e11  # s; a later stamp is refused: two samples at 1e5 Hz would be the same double
 GAP = 1.5  # median steps; a longer step is a gap
-MOST_JITTER = 0.01  # of a step, by which an even interval may differ from the median
-# steps from the line between first and last stamp, within which a clock is even
+MOST_JITTER = 0.01  # largest difference of an even interval from the median, over a step
+# largest distance of an even clock from the line between first and last stamp, in steps
 MOST_CLOCK_DRIFT = 0.5
-# steps over a whole recording by which a plain rate may differ from the measured one
+# largest difference between a plain rate and the measured one over a whole recording, in steps
 MOST_STRETCH = 0.1
-MOST_DRIFT = 0.01  # steps over a whole recording that may come from the resolution of the stamps
-# an interpolated clock may run at any rate: take a plain one this near
+# largest difference over a whole recording that may come from the resolution of the stamps, in
+# steps
+MOST_DRIFT = 0.01
+# largest relative difference at which an interpolated clock, which may run at any rate, takes a
+# plain one
 INTERPOLATED_TOLERANCE = 5e-3
-SLACK = 1e-6  # of a step; times that are nearer are the same
-SORT = "repair, remove or sort the rows"
-BRIDGE = "cut the range out or set dataset.clock=interpolate"
+SLACK = 1e-6  # steps; times that are nearer are the same
+SORT = "repair, remove or sort the rows"  # remedy for stamps in the wrong order, for messages
+BRIDGE = "cut the range out or set dataset.clock=interpolate"  # remedy for gaps, for messages
 
 MIN_SAMPLES_OF_CLOCK = 20  # samples behind which an even clock is looked for
-BLOCK_SECONDS = 1.0  # s; blocks by whose median stamp missing samples and drift are looked for
-# standard deviations, by the median |residual|, beyond which a stamp is no part of the line
+# s, length of the blocks by whose median stamp missing samples and drift are found
+BLOCK_SECONDS = 1.0
+# number of standard deviations, by the median |residual|, beyond which a stamp is left out of the
+# line
 REJECTED = 3.0
-MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
-# relative difference of a measured rate from the stated one, or from a limit, that passes
+# largest deviation of stamps from an even clock, in steps; a lost sample in the middle makes 0.5
+MOST_WANDERING = 0.4
+# largest relative difference between a measured rate and the stated one, or a limit
 RATE_TOLERANCE = 5e-3
 
 
@@ -71,7 +78,7 @@ def require_clock(
 
 
 def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
-    """How time stamps break the rule for every recording, and what to do about it, in words.
+    """Text on how time stamps break the rule for every recording, and on what to do about it.
 
     The rule is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
 
@@ -101,7 +108,7 @@ def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False
 
 
 def span_fault(stamps: FloatArray) -> str:
-    """A stray one among time stamps, in words.
+    """Text on a stray one among time stamps.
 
     Parameters
     ----------
@@ -132,8 +139,8 @@ def typical_step(stamps: FloatArray) -> float:
 
 
 def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
-    """The first stamp that is no time of a drive, goes backwards or repeats, in words; empty if
-    none.
+    """Text on the first stamp that is no time of a drive, goes backwards or repeats; empty if there
+    is none.
     """
     if len(stamps) < 2:
         return f"fewer than two time stamps; {fix}"
@@ -155,7 +162,7 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
 
 
 def unevenness(stamps: FloatArray) -> str:
-    """Gaps, jitter or drift of increasing time stamps, in words.
+    """Text on gaps, jitter or drift of increasing time stamps.
 
     Parameters
     ----------
@@ -275,9 +282,9 @@ def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArra
 class Clock:
     """A uniform clock, and how to bring samples onto it."""
 
-    start_time: float  # s
-    rate_hz: float
-    n_samples: int
+    start_time: float  # time of the first tick [s]
+    rate_hz: float  # rate of the ticks [Hz]
+    n_samples: int  # number of ticks
     stamps: FloatArray | None = (
         None  # the file's own time stamps, where samples must be interpolated [s]
     )

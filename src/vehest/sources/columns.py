@@ -22,23 +22,24 @@ from vehest.data.recording import HIGHEST_RATE
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
 
+# channel -> its declaration in conf/dataset
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
-ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
-# YAML reads 3 as a number
+ChannelNames = Annotated[tuple[str, ...], "a list of channels"]  # names of channels
+# name of a column; YAML reads 3 as a number
 ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
-Positive = Annotated[float, Field(gt=0)]
-Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
-RunNumber = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]  # number above 0
+Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]  # sampling rate [Hz]
+RunNumber = Annotated[int, Field(ge=0)]  # number of a run
 
 
 @dataclass(frozen=True)
 class Column:
     """Declaration of a column that becomes a channel."""
 
-    column: ColumnName  # the column's name in the file
-    unit: str  # the unit its values have there
+    column: ColumnName  # name of the column in the file
+    unit: str  # unit of its values in the file
     sign: Literal[1, -1] = 1  # 1, or -1 where the file counts the other way round than ISO 8855
-    # what the file's values must be multiplied with to be in ``unit``, such as 1 / wheel radius
+    # factor that brings the file's values to ``unit``, such as 1 / wheel radius
     factor: Annotated[float, "a number other than 0"] = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
@@ -67,6 +68,7 @@ class SampledColumn(Column):
     another one holds the sign.
     """
 
+    # numbers, in the file's unit, that mean that nothing was measured
     invalid: Annotated[tuple[float, ...], "a list of numbers, in the file's unit"] = ()
     sign_column: ColumnName | None = None  # 0 where values are positive, 1 where negative
 

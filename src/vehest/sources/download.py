@@ -28,14 +28,15 @@ from vehest.data.text_files import first_line, read_text
 from vehest.sources.base import Source, existing_folder
 from vehest.version import __version__
 
-CHECKSUMS = "checksums.txt"
-UNDER_WAY = ".download"
-CHUNK = 1 << 15  # bytes
-TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
+CHECKSUMS = "checksums.txt"  # name of the record of checksums
+UNDER_WAY = ".download"  # folder of files that are being downloaded
+CHUNK = 1 << 15  # bytes that are received at a time
+TIMEOUTS = (15.0, 60.0)  # s, longest times to connect and between two chunks
+# text on what to do after a failed download
 REMEDY = "correct download.url or put the file into the data set's folder by hand"
-NAME = re.compile(r'[^./\\:*?"<>|\s-][^/\\:*?"<>|\x00-\x1f\x7f]*')
+NAME = re.compile(r'[^./\\:*?"<>|\s-][^/\\:*?"<>|\x00-\x1f\x7f]*')  # matches valid names of files
 
-# file, bytes received, bytes in all where the server states them
+# takes the file, bytes received, and bytes in all where the server states them
 Progress = Callable[[str, int, int | None], None]
 
 
@@ -48,28 +49,29 @@ def _file_name(name: str) -> str:
     return name
 
 
-FileName = Annotated[str, AfterValidator(_file_name)]
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{64}$")]
+FileName = Annotated[str, AfterValidator(_file_name)]  # name of a file without a folder
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{64}$")]  # checksum in hexadecimal digits
 
 
 @dataclass(frozen=True)
 class DownloadOptions:
     """Option ``download`` of a data set; without ``files`` the source names them."""
 
-    url: Annotated[str, Field(pattern=r"^https?://[^\s/\[]\S*$")]
+    url: Annotated[str, Field(pattern=r"^https?://[^\s/\[]\S*$")]  # address of the folder
+    # names of the files; None: those that the source names
     files: tuple[FileName, ...] | None = None
-    sha256: dict[FileName, Sha256] | None = None
+    sha256: dict[FileName, Sha256] | None = None  # name of a file -> its checksum
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result for one file."""
+    """Result of the download or check of one file."""
 
-    name: str
+    name: str  # name of the file
     what: Literal[
         "fetched", "matched", "recorded"
     ]  # matched its known checksum; was there and its checksum is recorded on first sight
-    sha256: str
+    sha256: str  # checksum of the file
     size: int  # bytes
 
 
@@ -82,10 +84,11 @@ class Download:
     else with the recorded one.
     """
 
-    folder: Path
-    url: str
-    files: tuple[str, ...]
-    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums known beforehand, by name
+    folder: Path  # folder of the data set
+    url: str  # address of the folder from which they come
+    files: tuple[str, ...]  # names of the files
+    # name of a file -> checksum that is known beforehand
+    sha256: Mapping[str, str] = field(default_factory=dict)
 
     def address(self, name: str) -> str:
         """Address of a file: its name, percent-encoded, below ``url``."""
@@ -326,7 +329,7 @@ def _record(folder: Path, name: str, sha256: str) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that no other process downloads into it.
+    """Context in which no other process downloads into a folder.
 
     Folders on disks that know no locks are not held.
 

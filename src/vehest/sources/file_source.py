@@ -108,7 +108,7 @@ class FileSource(Source):
         return {None: slice(None)}
 
     def _selected_runs(self, file: Path) -> Runs:
-        """All runs, or the one that the option ``run`` names.
+        """Runs of a file: all, or the one that the option ``run`` names.
 
         A source has them in the cache ``_runs_of``.
 
@@ -157,7 +157,7 @@ class FileSource(Source):
         return self._id_of(file) if run is None else f"{self._id_of(file)}_run_{run}"
 
     def _require_pattern(self) -> None:
-        """See that ``files`` is a pattern inside the folder."""
+        """Raise an error unless ``files`` is a pattern inside the folder."""
         pattern = self.options.files
         unclear = any("**" in part and part != "**" for part in Path(pattern).parts)
         if not Path(pattern).parts or Path(pattern).is_absolute() or unclear or "\0" in pattern:

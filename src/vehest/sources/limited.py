@@ -27,23 +27,25 @@ from vehest.data import errors
 from vehest.data.errors import DataError, MissingError, VehestError, printable
 from vehest.data.limits import Limits, current_limits, use_limits
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[Any]]  # name -> array
 
 SECONDS = 15.0  # s of processor time, to which SECONDS_PER_BYTE of the file are added
 SECONDS_PER_BYTE = 1e-6  # s of processor time more for each byte of the file
-# times the processor time that a reader may take in all: a busy machine, or one without limits of
-# its own
+# longest time a reader may take in all, over the processor time: for a busy machine, or one without
+# limits of its own
 WAITING = 8.0
 MEMORY_PER_BYTE = 10.0  # bytes of memory for each byte of the file, besides the limit `memory`
 NO_MEMORY = 77  # exit status of a reader that ran out of memory
+# command that starts the limited process
 _COMMAND = [sys.executable, "-P", "-m", "vehest.sources.limited"]
+# environment variables by which libraries use one thread
 _SINGLE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
 
 
 class Reading(NamedTuple):
-    """What a reader returned."""
+    """Result of a reader."""
 
     arrays: Arrays  # name -> samples, one-dimensional
     summary: dict[str, Any]  # everything else, as JSON holds it
@@ -121,7 +123,7 @@ def read_limited(reader: str, file: Path, *, packed: Path | None = None, **reque
 
 
 def require_package(module: str, extra: str, purpose: str) -> None:
-    """See that an optional package is installed, without importing it.
+    """Raise an error unless an optional package is installed, without importing it.
 
     Parameters
     ----------
@@ -167,8 +169,8 @@ def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
 
 
 def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
-    """What the reader returns within memory and processor time, without writing a file, or the
-    error that it raises.
+    """Result of the reader within memory and processor time, without writing a file, or the error
+    that it raises.
     """
     module, _, name = order["reader"].partition(":")
     file = Path(order["file"])

@@ -28,13 +28,14 @@ Requests = Mapping[str, tuple[str, int | str | None]]
 class MdfOptions(SignalOptions):
     """Options of the source, by type; None leaves an option open."""
 
-    files: str = "*.mf4"
+    files: str = "*.mf4"  # pattern of the measurements in ``path``
 
 
 @dataclass(frozen=True)
 class MdfChannel(SignalChannel, SampledColumn):
     """A channel's signal, with the number or name of its group where its name occurs in several."""
 
+    # number or name of the signal's group
     group: Annotated[int | str | None, "the number or name of a group"] = None
 
 

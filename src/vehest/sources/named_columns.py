@@ -22,7 +22,7 @@ from vehest.sources.unit_spellings import plain_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-TIME = "time"
+TIME = "time"  # name of the column of times among channels
 
 
 @dataclass(frozen=True)

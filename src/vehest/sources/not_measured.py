@@ -11,15 +11,17 @@ import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 
-# of integers, which a scale of a power of ten brings to 327.67 or 65.535
+# ends of the ranges of integers, which a scale of a power of ten brings to 327.67 or 65.535
 _ENDS_OF_RANGE = frozenset(
     sign * (2**bits - below)
     for bits in (*range(7, 17), 23, 24, 31, 32)
     for sign, below in ((1, 1), (1, 0), (-1, 1), (-1, 0))
 )
+# numbers of which all digits are nine
 _NINES = frozenset(sign * (10**digits - 1) for digits in range(3, 10) for sign in (1, -1))
-DECIMAL_SCALES = (1.0, 10.0, 100.0, 1e3, 1e4)
-BINARY_SCALES = (16.0, 128.0, 256.0, 1024.0, 8192.0)  # of J1939: 65535 / 256 km/h is no speed
+DECIMAL_SCALES = (1.0, 10.0, 100.0, 1e3, 1e4)  # powers of ten by which a code may be divided
+# powers of two by which a code may be divided, of J1939: 65535 / 256 km/h is no speed
+BINARY_SCALES = (16.0, 128.0, 256.0, 1024.0, 8192.0)
 # of SAE J1939-71, signals with an offset: steps per unit, offset, bits, and factor to another unit
 _J1939_SIGNALS = (
     (8192.0, -3.92, 16, math.degrees(1.0)),  # yaw rate [rad/s], SPN 1808
@@ -27,23 +29,30 @@ _J1939_SIGNALS = (
     (2048.0, -15.687, 16, 1.0 / GRAVITY),  # lateral acceleration [m/s²], SPN 1809
     (10.0, -12.5, 8, 1.0 / GRAVITY),  # longitudinal acceleration [m/s²], SPN 1810
 )
+# values that SAE J1939-71 reserves for these signals, in two units each
 _J1939_CODES = tuple(
     factor * (raw / steps + offset)
     for steps, offset, bits, other_unit in _J1939_SIGNALS
     for raw in {(1 << bits) - 1, (0xFF << (bits - 8)) - 1, 0xFE << (bits - 8)}
     for factor in (1.0, other_unit)
 )
-MIN_HUGE = 1e15  # beyond it a number of a log is a code such as 1e20 or 3.4e38
-MIN_CODES = 2  # samples; one alone may be a spike
-MIN_J1939_DISTANCE = 0.2  # of the range of the other samples; accelerations come near their codes
-MAX_J1939_DIFFERENCE = 5e-4  # relative, for a table's digits and another value of g
+MIN_HUGE = 1e15  # smallest magnitude of a number of a log that is a code, such as 1e20 or 3.4e38
+MIN_CODES = 2  # smallest number of samples that hold a code; a single one may be a spike
+# smallest distance of a code of J1939 from the other samples over their range, since accelerations
+# come near their codes
+MIN_J1939_DISTANCE = 0.2
+# largest relative difference from a code, for a table's digits and another value of g
+MAX_J1939_DIFFERENCE = 5e-4
 
-_SYMBOLS = re.compile(r"[-–—*?]+|#[A-Z/0]+[!?]?", re.IGNORECASE)  # dashes; #VALUE!, #N/A
+# matches symbols that mark a missing sample: dashes; #VALUE!, #N/A
+_SYMBOLS = re.compile(r"[-–—*?]+|#[A-Z/0]+[!?]?", re.IGNORECASE)
+# words that do not change the meaning of a mark
 _FILLERS = (
     *("signal", "value", "data", "sensor", "is", "indicator", "code", "state"),
     *("wert", "signalwert", "daten"),
 )
-_NEGATIONS = (["no"], ["kein"], ["keine"])
+_NEGATIONS = (["no"], ["kein"], ["keine"])  # words by which a text negates what follows
+# words that mark a sample as not measured, without blanks
 _WORDED_MARKS = """
     na nv nan sna snv inf ind qnan snan none null void
     missing invalid inv inval invld unknown undefined undef unavailable no
@@ -59,7 +68,7 @@ _WORDED_MARKS = """
     ueberlauf überlauf unterlauf
     initialisierung nichtinitialisiert initwert initialwert initialisierungswert
 """
-_PHRASES = frozenset(_WORDED_MARKS.split())
+_PHRASES = frozenset(_WORDED_MARKS.split())  # words of `_WORDED_MARKS` as a set
 
 
 def marks_not_measured(text: str, signal: str = "") -> bool:

@@ -12,22 +12,22 @@ import scipy
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
-UpAxis = Literal["y", "z"]
+UpAxis = Literal["y", "z"]  # upward axis of poses
+# reference channel that poses give
 PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
 POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)  # channels that poses give
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions:
-    """How reference channels are made of poses."""
+    """Options by which reference channels are made from poses."""
 
-    window: int = 9  # samples of the Savitzky-Golay filter
-    order: int = 2  # of its polynomial
-    lever_x: float = (
-        0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
-    )
-    lever_y: float = 0.0  # to the left [m]
-    channels: tuple[PoseChannel, ...] = POSE_CHANNELS
+    window: int = 9  # length of the Savitzky-Golay filter [samples]
+    order: int = 2  # order of its polynomial
+    # distance from the rigid body's origin forward to the reference point, in the car's axes [m]
+    lever_x: float = 0.0
+    lever_y: float = 0.0  # distance to the left [m]
+    channels: tuple[PoseChannel, ...] = POSE_CHANNELS  # reference channels that are made
 
     def __post_init__(self) -> None:
         if not 1 <= self.order < self.window or self.window % 2 == 0:

@@ -24,15 +24,13 @@ class SampleAndHold:
     changes, or else any of their columns.
     """
 
-    channels: Annotated[tuple[str, ...], "a list of channels"]
+    channels: Annotated[tuple[str, ...], "a list of channels"]  # names of the channels
     updated: str | int | None = (
         None  # column that changes with every new sample, such as a time stamp of the sensors' own
     )
-    delay: float | dict[str, float] = (
-        # how much later than it was taken a sample first stands in a row [s], of all channels or
-        # some
-        0.0
-    )
+    # time by which a sample first stands in a row later than it was taken [s], of all channels, or
+    # by channel
+    delay: float | dict[str, float] = 0.0
 
     @property
     def delays(self) -> dict[str, float]:

@@ -39,9 +39,10 @@ from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import Runs
 from vehest.sources.unit_spellings import require_unit
 
-GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
-MIN_COVERED = 0.5  # share of a file's time that its segments must cover
-FASTER = 1.05  # than the raster: the rest would fold into it
+GAP = 3.0  # longest gap that is interpolated where max_gap is not declared, in median intervals
+MIN_COVERED = 0.5  # smallest share of a file's time that its segments must cover
+# largest ratio of the rate of a signal to that of the raster; above it vibrations would alias
+FASTER = 1.05
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,13 @@ class SignalChannel(Column):
 
 @dataclass(frozen=True)
 class Signal:
-    """One signal."""
+    """Samples of one signal with their times."""
 
-    origin: str  # its channel group or message, for messages: group 3 (Gateway)
+    origin: str  # channel group or message of the signal, for messages: group 3 (Gateway)
     stamps: FloatArray  # times of the samples [s], strictly increasing, shape (T,)
     # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
     values: FloatArray
-    unit: str  # as the file writes it
+    unit: str  # unit as the file writes it
 
     @property
     def rate_hz(self) -> float:
@@ -87,7 +88,7 @@ class Signal:
         return list(zip(times[first].tolist(), times[first + 1].tolist(), strict=True))
 
     def missing(self, begin: float, end: float, max_gap: float) -> list[str]:
-        """Samples that a segment lacks, or that end it, in words.
+        """Lines of text on samples that a segment lacks, or that end it.
 
         Parameters
         ----------
@@ -126,14 +127,16 @@ class Signal:
 class SignalOptions:
     """Options of every source of signals; docs/sources/mdf.md describes them."""
 
-    channels: ChannelMap
-    path: str | None = None
-    files: str = "*"
-    rate_hz: Rate | None = None
-    raster: str | None = None
+    channels: ChannelMap  # channel -> its signal and unit
+    path: str | None = None  # folder of the files
+    files: str = "*"  # pattern of the files
+    rate_hz: Rate | None = None  # rate of the recordings [Hz]
+    raster: str | None = None  # channel whose samples give the clock
+    # upper limit of the longest gap of every channel that is interpolated [s]
     max_gap: Positive | None = None
-    run: RunNumber | None = None
-    gappy: ChannelNames | None = None
+    run: RunNumber | None = None  # number of the one segment that is read
+    gappy: ChannelNames | None = None  # channels that may have gaps
+    # whether the units of the file are compared with the declared ones
     file_units: Literal["check", "ignore"] = "check"
 
 

@@ -22,7 +22,9 @@ from vehest.simulation.plant.planar_car import PLANAR, planar_car_from_configura
 from vehest.simulation.plant.wear import Stint
 from vehest.sources.base import Source
 
+# whole number, zero or positive
 Natural = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
+# a surface's name or parameters
 SurfaceFile = Annotated[
     str | dict[str, Any], "one of dry, wet, patchy, or a mapping such as {friction: 0.6}"
 ]
@@ -30,11 +32,11 @@ SurfaceFile = Annotated[
 
 @dataclass(frozen=True)
 class Payload:
-    """A mass [kg] and its place forward and up of the centre of gravity [m]."""
+    """A payload: a mass and its position from the centre of gravity."""
 
-    mass: float
-    forward: float = 0.0
-    up: float = 0.0
+    mass: float  # mass [kg]
+    forward: float = 0.0  # distance forward of the centre of gravity [m]
+    up: float = 0.0  # distance above the centre of gravity [m]
 
 
 @dataclass(frozen=True)
@@ -44,19 +46,23 @@ class Drive:
     For None the data set's own value holds.
     """
 
-    id: str | int
+    id: str | int  # name of the drive
+    # name of the manoeuvre and its parameters
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
-    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = (
-        None  # called ID_001, ID_002 and so on
-    )
-    seed: Natural | None = None  # None: one that follows from the data set's and the drive's name
+    # number of drives, called ID_001, ID_002 and so on
+    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None
+    # seed of the drive; None: one that follows from the data set's and the drive's name
+    seed: Natural | None = None
+    # name of one of the vehicles
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
-    surface: SurfaceFile | None = None
-    stability_control: bool | None = None
+    surface: SurfaceFile | None = None  # surface of the road
+    stability_control: bool | None = None  # whether stability control acts
+    # preset of the sensors, or what differs from one
     sensors: (
         Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None
     ) = None
-    payload: Payload | None = None
+    payload: Payload | None = None  # payload of the vehicle
+    # loss of grip over the drive
     tyres: Annotated[Stint, "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
 
 
@@ -64,15 +70,17 @@ class Drive:
 class SimulatedOptions:
     """Options of the source; docs/sources/simulated.md describes them."""
 
-    vehicles: dict[str, Any] | None = None
-    drives: tuple[Drive, ...] | None = None
-    seed: Natural = 0
+    vehicles: dict[str, Any] | None = None  # name of a vehicle -> its configuration
+    drives: tuple[Drive, ...] | None = None  # drives of the data set
+    seed: Natural = 0  # seed from which the drives' own follow
+    # rate of the recordings [Hz]
     rate_hz: Annotated[float, Field(ge=1.0, le=1000.0), "a number between 1 and 1000"] = 100.0
-    sensors: str | dict[str, Any] | None = None
-    surface: SurfaceFile | None = None
-    stability_control: bool = False
+    sensors: str | dict[str, Any] | None = None  # preset of the sensors, or what differs from one
+    surface: SurfaceFile | None = None  # surface of drives that name none
+    stability_control: bool = False  # whether stability control acts
+    # parameters of the vehicle that are scaled for every drive, and their ranges
     vary: Annotated[list[dict[str, Any]], "a list of {parameters, factor}"] | None = None
-    vary_sensors: dict[str, Any] | None = None
+    vary_sensors: dict[str, Any] | None = None  # kind of a sensor's error -> range of its scale
 
 
 class SimulatedSource(Source):

@@ -14,7 +14,7 @@ from vehest.sources.clocks import Clock, even_clock
 from vehest.sources.table_rows import TimeColumn
 from vehest.sources.tables import TextLayout, column_parts, is_parquet
 
-LARGE = 1 << 25  # bytes of a table of text from which on it is read in parts
+LARGE = 1 << 25  # smallest size of a table of text that is read in parts [bytes]
 
 
 def is_large(file: Path) -> bool:

@@ -17,23 +17,22 @@ from vehest.sources.clocks import Clock
 from vehest.sources.columns import Column, column_from_config
 from vehest.sources.pose import PoseOptions
 
-UNITS = {"x": "m", "y": "m", "yaw": "rad"}
+UNITS = {"x": "m", "y": "m", "yaw": "rad"}  # coordinate of a pose -> its SI unit
 
 
 @dataclass(frozen=True)
 class TablePose(PoseOptions):
-    """Columns of poses."""
+    """Declaration of columns of poses."""
 
-    x: Column  # column of the position and its unit, z up
-    y: Column  # the same
+    x: Column  # column of the position x and its unit, z up
+    y: Column  # column of the position y and its unit
     yaw: Column  # column of the yaw angle and its unit
-    yaw_offset: float = (
-        0.0  # from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
-    )
+    # angle from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
+    yaw_offset: float = 0.0
 
     @property
     def columns(self) -> dict[str, Column]:
-        """Columns of ``x``, ``y`` and ``yaw``."""
+        """Declarations of the columns ``x``, ``y`` and ``yaw``, by these names."""
         return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
     def channels_of(

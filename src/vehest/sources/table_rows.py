@@ -19,7 +19,7 @@ from vehest.sources.columns import Column, Positive
 
 Runs = Mapping[int | None, slice]
 """Number of each run -> its rows; None where runs are not distinguished."""
-RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
+RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")  # matches the number of a row, or a range of them
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,9 @@ def dropped_rows_from_config(
 
 
 def _rows(row: int | str, location: str) -> slice:
-    """Rows, from 0, of a number or range, from 1; `ConfigurationError` for any other text."""
+    """Rows, from 0, of a number or range, from 1; raises `ConfigurationError` for any other
+    text.
+    """
     match = RANGE.fullmatch(str(row).strip())
     first, last = match.groups(default=match[1]) if match else ("", "")
     if not first or (last and int(last) < int(first)):
@@ -147,7 +149,7 @@ def remaining_files(
 
 
 def remaining_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
-    """Which rows of a table count.
+    """Whether each row of a table counts.
 
     Parameters
     ----------

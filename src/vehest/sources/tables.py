@@ -30,16 +30,20 @@ from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
-BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
-TAIL = 1 << 16  # bytes at the end of the rows, in which the last ones are
-BYTES_PER_CELL = 16  # a double, and as much again while text becomes numbers
-# a row with a cell that is a number, or whose first one is missing
+BLOCK = 1 << 20  # largest length of a line that pyarrow reads [bytes]
+TAIL = 1 << 16  # bytes at the end of the rows that hold the last ones
+# memory of a cell [bytes]: a double, and as much again while text becomes numbers
+BYTES_PER_CELL = 16
+# matches a row with a cell that is a number, or whose first one is missing
 ROW_OF_NUMBERS = r'(^|[,;|\t])\s*"?([-+]?[.,]?\d|(nan|na|n/a|null|none|inf)\b)|^[\s-]*$'
+# matches the start of a row of numbers
 BEGINS_AS_ROW = re.compile(
     r'\s*"?([-+]?[.,]?\d|[,;|\t]|(nan|na|n/a|null|none|inf)\b)', re.IGNORECASE
 )
-COMMENT = re.compile(r"\s*(#|%|//)\s")
-UNFINISHED = re.compile(r"[-+]|[-+]?\.|[-+]?[\d.]+e[-+]?", re.IGNORECASE)  # a number, cut short
+COMMENT = re.compile(r"\s*(#|%|//)\s")  # matches the start of a comment
+# matches a number that is cut short
+UNFINISHED = re.compile(r"[-+]|[-+]?\.|[-+]?[\d.]+e[-+]?", re.IGNORECASE)
+# ending of a packed table -> its compression
 PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 
@@ -47,15 +51,15 @@ PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 class TextLayout:
     """Layout of a table of text."""
 
-    delimiter: str = ","
-    decimal: str = "."
-    encoding: str = "utf8"
-    skip_rows: int = 0  # lines above the names; above the rows where names are given
-    rows_below_names: int = 0  # lines between the names and the rows
-    missing: tuple[str, ...] = ()  # cells without a sample, beside empty ones, NaN, NA and null
-    names: tuple[str, ...] | None = None  # of the columns where the file has no line of them
-    clock: str | None = None  # column of times as a clock shows them, which become seconds
-    n_bytes: int | None = None  # of the file that are read; None for all of them
+    delimiter: str = ","  # character between cells
+    decimal: str = "."  # decimal mark
+    encoding: str = "utf8"  # encoding of the text, by Python's name
+    skip_rows: int = 0  # number of lines above the names; above the rows where names are given
+    rows_below_names: int = 0  # number of lines between the names and the rows
+    missing: tuple[str, ...] = ()  # cells without a sample, besides empty ones, NaN, NA and null
+    names: tuple[str, ...] | None = None  # names of the columns where the file has no line of them
+    clock: str | None = None  # column of times that are written as a clock's, which become seconds
+    n_bytes: int | None = None  # number of bytes of the file that are read; None: all of them
 
 
 def is_parquet(file: Path) -> bool:
@@ -161,7 +165,7 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
 
 
 def require_columns(file: Path, names: Sequence[str], selected: Iterable[str]) -> None:
-    """See that a table has every wanted column once.
+    """Raise an error unless a table has every wanted column once.
 
     Parameters
     ----------
@@ -380,8 +384,8 @@ def _options(
 
 @contextmanager
 def decoding_failures_ignored() -> Iterator[None]:
-    """Within it, a row of damaged bytes is pyarrow's error alone: before that, pyarrow fails to
-    decode the row for the handler, which Python would print with a traceback.
+    """Context in which a row of damaged bytes is pyarrow's error alone: before that, pyarrow fails
+    to decode the row for the handler, which Python would print with a traceback.
     """
     hook = sys.unraisablehook
 
@@ -431,7 +435,7 @@ def table_stream(file: Path, n_bytes: int | None = None) -> pa.NativeFile:
 
 
 def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
-    """End of a table that is none of its rows: bytes before it, and its text.
+    """Number of bytes before the end of a table that is none of its rows, and the text of this end.
 
     Of a logger that was switched off while it wrote, it is zero bytes, a last row without an end
     that has fewer cells than the row above or ends within a number, or both; else a `_footer`.

@@ -55,6 +55,7 @@ from vehest.sources.tables import (
 
 
 def _encoding(name: str) -> str:
+    """An encoding's name; raises `ValueError` for one that Python does not know."""
     try:
         "0,1".encode(name).decode(name)  # which codecs that are none of text refuse
     except (LookupError, ValueError):
@@ -62,37 +63,40 @@ def _encoding(name: str) -> str:
     return name
 
 
-Character = Annotated[str, Field(min_length=1, max_length=1)]
+Character = Annotated[str, Field(min_length=1, max_length=1)]  # a single character
 
 
 @dataclass(frozen=True)
 class TabularOptions:
     """Options of the source; docs/sources/tabular.md describes them."""
 
-    path: str | None = None
-    files: str = "*.csv"
+    path: str | None = None  # folder of the tables
+    files: str = "*.csv"  # pattern of the tables
+    # patterns of the stems of tables that are left out
     exclude: Annotated[tuple[str, ...], "a list of patterns over the files' stems"] | None = None
+    # stem of a table -> rows that are left out
     drop_rows: (
         Annotated[
             dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"
         ]
         | None
     ) = None
-    runs: ColumnName | None = None
-    time_restarts: bool = False
-    max_gap: Positive | None = None
-    run: RunNumber | None = None
-    time: dict[str, Any] | None = None
-    rate_hz: Positive | None = None
-    clock: ClockPolicy = "strict"
-    channels: ChannelMap | None = None
-    gappy: ChannelNames | None = None
-    held: dict[str, Any] | None = None
-    pose: dict[str, Any] | None = None
-    delimiter: Character = ","
-    decimal: Character = "."
+    runs: ColumnName | None = None  # column that counts runs
+    time_restarts: bool = False  # whether a run begins where times go backwards
+    max_gap: Positive | None = None  # longest time without a row, or a sample, within a run [s]
+    run: RunNumber | None = None  # number of the one run that is read
+    time: dict[str, Any] | None = None  # declaration of the column of times
+    rate_hz: Positive | None = None  # rate of the rows where there is no column of times [Hz]
+    clock: ClockPolicy = "strict"  # treatment of uneven time stamps
+    channels: ChannelMap | None = None  # channel -> its column and unit
+    gappy: ChannelNames | None = None  # channels that may have gaps
+    held: dict[str, Any] | None = None  # channels whose samples the table repeats in every row
+    pose: dict[str, Any] | None = None  # columns of poses from which reference channels are made
+    delimiter: Character = ","  # character between cells
+    decimal: Character = "."  # decimal mark
+    # encoding of the text, by Python's name
     encoding: Annotated[str, AfterValidator(_encoding)] = "utf8"
-    skip_rows: Annotated[int, Field(ge=0, le=10_000)] = 0
+    skip_rows: Annotated[int, Field(ge=0, le=10_000)] = 0  # number of lines above the names
 
     def __post_init__(self) -> None:
         if self.time is None and self.rate_hz is None:
@@ -195,6 +199,7 @@ class TabularSource(FileSource):
         return time if is_strict and is_large(file) and not is_stored_recording(file) else None
 
     def _read(self, file: Path, run: int | None) -> Recording:
+        """A table, or one run of it."""
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)

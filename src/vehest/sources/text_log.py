@@ -19,16 +19,18 @@ from vehest.sources.clocks import bridged
 from vehest.sources.tabular import TabularOptions, TabularSource
 
 CLOCK = "clock"  # unit of times that are written as a clock's
-LONGEST_BRIDGE = 10.0  # s
+LONGEST_BRIDGE = 10.0  # s, largest value of ``bridge``
 
 
 @dataclass(frozen=True)
 class TextLogOptions(TabularOptions):
     """Options of the source; docs/sources/text_log.md describes them."""
 
+    # number of lines between the names and the rows
     rows_below_names: Annotated[int, Field(ge=0, le=100)] = 0
+    # longest gap that is filled by a straight line [s]
     bridge: Annotated[float, Field(gt=0, le=LONGEST_BRIDGE)] | None = None
-    missing: tuple[str, ...] | None = None
+    missing: tuple[str, ...] | None = None  # cells that mark a missing sample
 
 
 class TextLogSource(TabularSource):

@@ -59,21 +59,24 @@ _SPELLINGS_OF = {
     "m": "m meter metre",
     "another unit": "mm cm km mv ma hpa mbar hz kg ms s",
 }
+# spelling -> unit
 _SPELLINGS = {
     spelling: unit for unit, spellings in _SPELLINGS_OF.items() for spelling in spellings.split()
 }
-# where upper and lower case differ in meaning
+# spelling of which upper and lower case matter -> unit
 _CASES = {
     "kN": "kN",
     "kn": "knots",
     "Mpa": "MPa",
     "mPa": "another unit",
 }
+# matches a unit with the step of a raw count before it
 _STEPPED = re.compile(
     r"(?:((?=.*?[1-9])\d*[.,]?\d+(?:e[-+]?\d)?)(?=[\s·*×\[a-z°]))?(.*)", re.IGNORECASE | re.DOTALL
 )
-_FRACTION = re.compile(r"^1/(10{1,4})[\s·*×]*(?=[^\W\d]|[°º])")  # of a unit, as in 1/1000 g
-_SECOND = re.compile(r"sec(on(d[saeoi]?)?)?|sek(unden?)?|秒")
+# matches a fraction before a unit, as in 1/1000 g
+_FRACTION = re.compile(r"^1/(10{1,4})[\s·*×]*(?=[^\W\d]|[°º])")
+_SECOND = re.compile(r"sec(on(d[saeoi]?)?)?|sek(unden?)?|秒")  # matches spellings of a second
 
 
 def plain_unit(text: str) -> str | None:

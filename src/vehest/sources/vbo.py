@@ -39,32 +39,36 @@ from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
-LONGEST_HEAD = 1 << 20  # bytes before the rows
-# units of columns that state none
+LONGEST_HEAD = 1 << 20  # largest number of bytes before the rows
+# column -> unit, where the file states none
 UNITS = {
     "velocity": "km/h",
     "vert-vel": "km/h",
     "Longacc": "g",
     "Latacc": "g",
 }
-# lines of [header] that state the unit of the logger's own speeds
+# matches lines of [header] that state the unit of the logger's own speeds
 SPEED_IN_HEADER = re.compile(r"(?mi)^(vertical )?velocity[ \t(\[]+([^\s()\[\]]+)[ \t)\]]*$")
-MAX_SATS = 255.0  # sats has eight bits; larger values are clipped to this
-SATELLITES = 63  # bits of sats that count them; others mark a trigger and a differential fix
-# measured by them; 0 where there is none
+MAX_SATS = 255.0  # largest value of sats, which has eight bits; larger ones are clipped to this
+SATELLITES = 63  # bits of sats that count satellites; others mark a trigger and a differential fix
+# matches columns that are measured by satellites; they are 0 where there are none
 OF_SATELLITES = re.compile(
     r"lat|long|velocity|heading|height|vert-vel|Longacc|Latacc|True_Head|Slip_\w+|L(at|ng)\._Vel\."
 )
-JUMP = 1.5  # intervals; a last row that comes later is left out
+JUMP = 1.5  # longest step to a last row, in intervals; a row that comes later is left out
 # slower or straighter samples do not show whether the logger's slip offsets changed places
-MIN_TURNING_SPEED = 5.0  # m/s
-MIN_TURNING_YAW_RATE = 0.05  # rad/s
-MIN_TURNING_SAMPLES = 100  # samples in such turns; with fewer the slip angles are not checked
-# of the slip angles' difference that the yaw rate makes between the axles
+# m/s, lowest speed of samples that show whether the logger's slip offsets changed places
+MIN_TURNING_SPEED = 5.0
+MIN_TURNING_YAW_RATE = 0.05  # rad/s, smallest yaw rate of these samples
+# smallest number of these samples; with fewer the slip angles are not checked
+MIN_TURNING_SAMPLES = 100
+# smallest difference of the slip angles over that which the yaw rate makes between the axles
 MIN_DIFFERENCE_SHARE = 0.25
-SLIP_CHECK = "slip_offsets"
-# Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
+SLIP_CHECK = "slip_offsets"  # name of this check, by which a data set accepts its finding
+# matches columns of slip at entered points; Slip_Angle, Lat._Vel. and Lng._Vel. are those at the
+# antenna
 SLIP_AT_A_POINT = re.compile(r"Slip_(COG|[FR][LR])")
+# matches a line of offsets: point, lateral and longitudinal distance
 OFFSETS = re.compile(
     r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}"
 )
@@ -74,25 +78,24 @@ OFFSETS = re.compile(
 class VboOptions:
     """Options of the source; docs/sources/vbo.md describes them."""
 
-    channels: ChannelMap
-    path: str | None = None
-    files: str = "*.[vV][bB][oO]"
-    max_gap: Positive | None = None
-    run: Annotated[int, Field(ge=0)] | None = None
-    clock: ClockPolicy = "strict"
-    gappy: ChannelNames | None = None
+    channels: ChannelMap  # channel -> its column and unit
+    path: str | None = None  # folder of the logs
+    files: str = "*.[vV][bB][oO]"  # pattern of the logs
+    max_gap: Positive | None = None  # longest pause within a recording [s]
+    run: Annotated[int, Field(ge=0)] | None = None  # number of the one part that is read
+    clock: ClockPolicy = "strict"  # treatment of uneven time stamps
+    gappy: ChannelNames | None = None  # channels that may have gaps
 
 
 @dataclass(frozen=True)
 class Log:
-    """Rows and sections of a file."""
+    """Columns and settings of a log."""
 
     columns: Mapping[str, FloatArray]  # name -> values in the file's unit, (T,)
     units: Mapping[str, str]  # name -> unit as the file writes it; only of columns that have one
     seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
-    modules: Mapping[
-        str, str
-    ]  # name -> module of the logger that it comes from; only of columns that have one
+    # column -> module of the logger that it comes from; only of columns that have one
+    modules: Mapping[str, str]
     offsets: Mapping[
         str, tuple[float, float]
     ]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
@@ -244,8 +247,8 @@ def read_log(file: Path) -> Log:
 
 
 def _without_lost_fixes(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """With NaN for the zeros that the logger writes where it has no satellites; unchanged where it
-    never has any.
+    """The columns with NaN for the zeros that the logger writes where it has no satellites;
+    unchanged where it never has any.
     """
     sats = np.nan_to_num(np.clip(columns.get("sats", np.empty(0)), 0.0, MAX_SATS))
     has_fix = sats.astype(int) & SATELLITES > 0
@@ -260,7 +263,7 @@ def _without_lost_fixes(columns: dict[str, FloatArray]) -> dict[str, FloatArray]
 
 
 def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
-    """The lines of a section, each of one of the last columns, by its name.
+    """Name of a column -> its line of a section that has a line for each of the last columns.
 
     An empty line for none.
     """
@@ -275,7 +278,8 @@ def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
 
 
 def require_slip_offsets(log: Log, location: str) -> None:
-    """See that slip at two wheels of one side differs by what the yaw rate makes between the axles.
+    """Raise an error unless slip at two wheels of one side differs by what the yaw rate makes
+    between the axles.
 
     The logger computes slip at points whose offsets from the antenna were entered as {lateral,
     longitudinal}. Where the two change places, front and rear wheel of a side have the same

@@ -25,7 +25,7 @@ from vehest.evaluation.metrics import Protocol, Scored, score_all
 def read_frame(
     path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()
 ) -> pd.DataFrame:
-    """A table that vehest wrote as CSV, its numbers bit for bit.
+    """Read a table that vehest wrote as CSV; its numbers are bitwise those that were written.
 
     Parameters
     ----------
@@ -74,10 +74,11 @@ def write_frame(table: pd.DataFrame, path: Path) -> None:
 
 
 def nominal_rows(metrics: pd.DataFrame) -> pd.DataFrame:
-    """Rows of a long table with METRIC_COLUMNS over all samples without a fault."""
+    """Rows of a table with METRIC_COLUMNS that are over all samples, without a fault."""
     return metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
 
 
+# columns that identify a run and what a metric is over
 HEAD = (
     "estimator",
     "variant",
@@ -91,6 +92,8 @@ HEAD = (
     "mode",
     "seed",
 )
+# columns of a long table of metrics, a row for each value; low and high are the ends of its
+# interval
 METRIC_COLUMNS = ("study", *HEAD, "metric", "value", "unit", "low", "high")
 
 
@@ -99,15 +102,16 @@ class EvaluatedModel:
     """One fitted and evaluated estimator."""
 
     estimator: str  # name in conf/estimator
-    variant: str  # what the paper calls it
-    title: str  # for people, for example ``KS-NN linear + bias, P = 2``
-    seed: int  # its seed
-    model_folder: Path  # what the train stage wrote (``history.csv`` in it, where there is one)
-    # what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or
-    # the n-th sequence
+    variant: str  # identifier of its configuration, as the paper names it
+    title: str  # name in tables and figures, for example ``KS-NN linear + bias, P = 2``
+    seed: int  # seed of its training
+    # folder that the train stage wrote, with ``history.csv`` where the method has one
+    model_folder: Path
+    # folder that the evaluate stage wrote, with ``<test set>/<n>.parquet`` for the n-th range of a
+    # test set, or the n-th sequence
     evaluation_folder: Path
-    training: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, as configured
-    calibration_folder: Path | None = None  # where trust.yaml lies, if it was calibrated
+    training: Mapping[str, Any] = field(default_factory=dict)  # settings of its training
+    calibration_folder: Path | None = None  # folder of trust.yaml; None: not calibrated
 
     @property
     def name(self) -> tuple[str, str]:
@@ -120,9 +124,8 @@ class EvaluatedModel:
         return read_frame(path) if path.is_file() else None
 
     def fit_metrics(self) -> dict[str, float]:
-        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``, no times.
-
-        None where nothing was written.
+        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``, without times:
+        name -> value; empty where nothing was written.
         """
         path = self.model_folder / "fit.csv"
         rows = read_rows(path, ("metric", "value")) if path.is_file() else []
@@ -176,13 +179,13 @@ class PartArtefacts:
     """One comparison: estimators that were trained on one split and were scored on it."""
 
     study: str  # name of the study
-    title: str  # its title
+    title: str  # title of the comparison
     about: str  # a paragraph on what is compared, from the pipeline file
     command: str  # the command that makes this report
     split: Split  # training, validation and test ranges
-    protocol: Protocol  # how estimates are scored
+    protocol: Protocol  # protocol by which estimates are scored
     kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
-    data_titles: Mapping[str, str]  # data set -> title, for people
+    data_titles: Mapping[str, str]  # data set -> title in the report
     # long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are
     # not among them, since what a study draws
     # is published, and a time is never the same twice.
@@ -192,7 +195,7 @@ class PartArtefacts:
     # ranges of the split
     references: Mapping[tuple[str, str], Path]
     facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
-    # name of what is left out, since it failed or is not there -> why
+    # name of a model or data set that is left out -> why: it failed or is not available
     failed: Mapping[str, str] = field(default_factory=dict)
 
     def reference(self, span: Span, channels: Iterable[str] | None = None) -> Recording:
@@ -250,7 +253,8 @@ class PartArtefacts:
 
 
 def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Tables of all parts as one; ``trained_on`` is followed by the part, where it has a name.
+    """Concatenate the tables of all parts; the part's name, where it has one, is appended to
+    ``trained_on``.
 
     Parameters
     ----------
@@ -268,13 +272,13 @@ def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 class StoredDataset:
     """A data set in the store."""
 
-    name: str  # in conf/dataset
-    title: str  # for people
+    name: str  # name in conf/dataset
+    title: str  # title in reports
     kind: str  # ``real`` or ``simulated``
-    config: Mapping[str, Any]  # of its ingest, prose aside
+    config: Mapping[str, Any]  # configuration of the data set, without texts
     files: Mapping[str, Path]  # recording -> Parquet file at the native rate
-    licence: str = ""  # whose recordings they are
-    citation: str = ""  # what to cite
+    licence: str = ""  # licence of the recordings
+    citation: str = ""  # work to cite
 
     def recordings(self) -> Iterator[Recording]:
         """All recordings, one at a time.
@@ -289,12 +293,12 @@ class StoredDataset:
 
 @dataclass(frozen=True)
 class AbsentDataset:
-    """A data set that a study would show and whose raw files are not here."""
+    """A data set of a study whose raw files are not available."""
 
-    name: str  # in conf/dataset
-    title: str  # for people
-    licence: str  # whose recordings they are
-    citation: str  # what to cite
+    name: str  # name in conf/dataset
+    title: str  # title in reports
+    licence: str  # licence of the recordings
+    citation: str  # work to cite
 
 
 @dataclass(frozen=True)
@@ -303,42 +307,43 @@ class Trial:
     that of others.
     """
 
-    search: str  # part of the pipeline file that names the candidates
-    name: str  # part that trained this one
+    search: str  # part of the pipeline file that lists the candidates
+    name: str  # part of the pipeline file that trained this one
     options: str  # overrides that were tried, for example ``training.learning_rate=0.001``
     estimator: str  # name in conf/estimator
-    variant: str  # what the paper calls it
-    title: str  # for people
-    seed: int  # its seed
-    training: Mapping[str, Any]  # how it was trained, as configured
-    metric: str  # that chooses
+    variant: str  # identifier of its configuration, as the paper names it
+    title: str  # name in tables
+    seed: int  # seed of its training
+    training: Mapping[str, Any]  # settings of its training
+    metric: str  # metric by which the candidate is chosen
     validation: float  # value of the metric on the validation range, to six significant digits
-    origin: str  # of its training: `vehest.run.weights`
+    origin: str  # key of its training in `vehest.run.weights`
     evaluation: str  # version and options of its evaluation
-    chosen: bool = False  # whether it has the lowest value of its search
+    chosen: bool = False  # whether the trial has the lowest value of its search
 
 
 @dataclass(frozen=True)
 class StudyArtefacts:
-    """Everything that a study module may look at: parts that compare estimators, or data sets."""
+    """Input of a study module: parts that compare estimators, or data sets."""
 
     study: str  # name of the study
-    title: str  # its title
+    title: str  # title of the study
     about: str  # a paragraph on what is compared or shown, from the pipeline file
     command: str  # the command that makes this report
-    # part -> title, of all there are in the pipeline file
+    # part -> title, for all parts of the pipeline file
     titles: Mapping[str, str] = field(default_factory=dict)
-    # part -> what was compared in it; a study that is not in parts has one without a name
+    # name of a part -> artefacts that were compared in it; a study that is not in parts has one
+    # without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
-    absent: Sequence[str] = ()  # parts whose raw files were not here
-    # part -> names of trainings that are planned and not done; also of parts that are not here
+    absent: Sequence[str] = ()  # parts whose raw files are not available
+    # part -> names of trainings that are planned and not done, absent parts included
     not_trained: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    trials: Sequence[Trial] = ()  # of searches, which are in no part
-    search_remarks: Sequence[str] = ()  # on parts that do not use what a search chose
-    # of a study of recordings alone, in the order of the pipeline file
+    trials: Sequence[Trial] = ()  # candidates of searches, which are in no part
+    search_remarks: Sequence[str] = ()  # sentences on parts that do not use what a search chose
+    # data sets of a study of recordings alone, in the order of the pipeline file
     datasets: Sequence[StoredDataset] = ()
-    absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
-    report_command: str = ""  # that draws this report again, with all of its overrides
+    absent_datasets: Sequence[AbsentDataset] = ()  # data sets whose raw files are not available
+    report_command: str = ""  # command that draws this report again, with all of its overrides
     # overrides, as text for a shell, that say where raw files come from and results go; in no
     # published file
     location: str = ""

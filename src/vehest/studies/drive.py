@@ -59,16 +59,16 @@ from vehest.studies.kit.standing import (
     BEST,
     NOT_SIGNIFICANT,
     basis_sentence,
-    interval_in_words,
+    describe_interval,
     ranking_of,
     standing_columns,
 )
 from vehest.studies.kit.warnings import sizes_of_sideslip, warnings_of
 
-TAKES = "split"
-MAX_DRAWN = 8  # estimators that figures show at most, the best by validation
-
-VERSION = "5"
+TAKES = "split"  # data that pipelines of this study name (`vehest.studies.registry`)
+MAX_DRAWN = 8  # largest number of estimators in figures, the best by validation
+VERSION = "5"  # raised where tables or figures change
+# metrics of the leaderboard that are errors
 _ACCURACY = (
     "rmse_sideslip",
     "rmse_vy",
@@ -77,9 +77,10 @@ _ACCURACY = (
     "max_error_sideslip",
     "share_below_min_speed",
 )
-_OF_MODEL = ("n_parameters", "epochs")
-BELOW_MIN_SPEED = "share_below_min_speed"
-_BOUND = "floor_cramer_rao"
+_OF_MODEL = ("n_parameters", "epochs")  # metrics of the leaderboard that are of the model itself
+BELOW_MIN_SPEED = "share_below_min_speed"  # metric: share of samples without scored sideslip
+_BOUND = "floor_cramer_rao"  # metric: bound of the error of sideslip
+# columns of the leaderboard for the spread over seeds
 _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rmse_sideslip_std")
 
 
@@ -101,7 +102,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 @dataclass(frozen=True)
 class Additions:
-    """What a study adds to the report of a comparison.
+    """Contents that a study adds to the report of a comparison (`comparison`).
 
     Parameters
     ----------
@@ -197,7 +198,7 @@ def comparison(artefacts: PartArtefacts, additions: Additions | None = None) -> 
 
 
 def _additions(artefacts: PartArtefacts) -> Additions:
-    """Verdict and recommended estimator of each test set, where the study adds nothing itself."""
+    """Default additions to a report: verdict and recommended estimator of each test set."""
     recommendations = {name: recommendation_of(artefacts, name) for name in artefacts.split.tests}
     sentences = {name: outcome.describe() for name, outcome in recommendations.items()}
     models = {
@@ -209,7 +210,7 @@ def _additions(artefacts: PartArtefacts) -> Additions:
 
 
 def _verdict_block(artefacts: PartArtefacts, verdicts: Mapping[str, Sequence[str]]) -> str:
-    """The section that the report opens with: the verdicts, and whether data are real."""
+    """First section of the report, in Markdown: the verdicts, and whether data are real."""
     paragraphs = []
     for test_set, sentences in verdicts.items():
         named = f"Test set {as_code(test_set)}: " if len(verdicts) > 1 else ""
@@ -219,7 +220,9 @@ def _verdict_block(artefacts: PartArtefacts, verdicts: Mapping[str, Sequence[str
 
 
 def _basis_block(artefacts: PartArtefacts, remark: str) -> str:
-    """What was compared, how, and warnings."""
+    """Section in Markdown on what was compared and how, with warnings; ``remark`` is a sentence
+    that is appended.
+    """
     paragraphs = [artefacts.about.strip()] if artefacts.about.strip() else []
     paragraphs.append(f"{budget_sentence(artefacts)}{remark}")
     for test_set in artefacts.split.tests:
@@ -313,8 +316,8 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
 
 
 def _spread_of(values: FloatArray) -> dict[str, float]:
-    """Median, lowest, highest and sample standard deviation of the finite values; NaN where there
-    are none.
+    """Median, lowest, highest and sample standard deviation of the finite values, by the names in
+    `_SPREAD`; NaN where there are none.
     """
     finite = values[np.isfinite(values)]
     if not len(finite):
@@ -338,7 +341,7 @@ def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
     """
     spans = artefacts.split.tests[test_set]
     ranges = "; ".join(
-        f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}"
+        f"recording {as_text(span.recording)}, {_describe_range(artefacts, span)}"
         for span in spans[:3]
     )
     if len(spans) > 3:
@@ -350,7 +353,7 @@ def _describe_test_set(artefacts: PartArtefacts, test_set: str) -> str:
 
 
 def data_sentence(artefacts: PartArtefacts) -> str:
-    """Which data sets the numbers come from, and which of them are real."""
+    """A sentence on which data sets the numbers come from, and which of them are real."""
     kinds = {dataset: artefacts.kinds[dataset] for dataset in artefacts.split.datasets}
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
@@ -364,7 +367,7 @@ def data_sentence(artefacts: PartArtefacts) -> str:
 
 
 def budget_sentence(artefacts: PartArtefacts) -> str:
-    """Numbers of estimators, seeds and epochs.
+    """A sentence on the numbers of estimators, seeds and epochs.
 
     Epochs are those of trainings that have any: methods that are solved in closed form do not
     count.
@@ -395,12 +398,12 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
 
 
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
-    """How one of several parts was made; its tables are called after it.
+    """Appendix on how one of several parts was made; its tables are named after the part.
 
     Parameters
     ----------
     name : str
-        Of the part; the table of ranges is ``ranges_NAME``.
+        Name of the part; the table of ranges is ``ranges_NAME``.
     part : PartArtefacts
         What was compared.
     """
@@ -437,6 +440,7 @@ def _text_rows(lines_by_part: Mapping[str, Sequence[str]], column: str) -> pd.Da
     return pd.DataFrame(rows, columns=["part", column])
 
 
+# sentences of the appendix on how seeds are chosen
 CHOICE = (
     "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. "
     "Test data choose nothing."
@@ -516,7 +520,7 @@ def ranges_of(artefacts: PartArtefacts) -> pd.DataFrame:
             "dataset": artefacts.data_titles.get(span.dataset, span.dataset),
             "kind": artefacts.kinds[span.dataset],
             "recording": printable(span.recording),
-            "range": _range_in_words(artefacts, span),
+            "range": _describe_range(artefacts, span),
             "seconds": span.stop - span.start
             if math.isfinite(span.stop - span.start)
             else math.nan,
@@ -544,7 +548,7 @@ def _describe_excluded(artefacts: PartArtefacts) -> str:
     return f" Excluded, since the car is slower: {listed(named)}." if named else ""
 
 
-def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
+def _describe_range(artefacts: PartArtefacts, span: Span) -> str:
     """A range as text; in a recording with unix time it counts from the start of the recording."""
     file = artefacts.references.get((span.dataset, span.recording))
     begin = 0.0
@@ -567,7 +571,7 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
 
 
 def file_of(test_set: str) -> str:
-    """A test set as the end of the names of its tables and figures.
+    """Suffix that a test set gives the names of its tables and figures.
 
     Characters other than lower-case letters, digits, ``_``, ``.`` and ``-`` become ``_``.
     """
@@ -576,13 +580,13 @@ def file_of(test_set: str) -> str:
 
 @dataclass(frozen=True)
 class DrawnTest:
-    """Figures of a test set, by where the report shows them."""
+    """Figures of a test set, by their place in the report."""
 
-    forest: Sequence[Block]
-    opening: Sequence[Block]  # after the forest plot
-    traces: Sequence[Block]  # of the whole test set
-    remark: str  # a sentence, after a space, where not all estimators are in them
-    estimators: Mapping[Name, tuple[str, int]]  # in them -> title and seed
+    forest: Sequence[Block]  # forest plot of RMSE(β) with intervals
+    opening: Sequence[Block]  # figures after the forest plot
+    traces: Sequence[Block]  # traces of the whole test set
+    remark: str  # a sentence, after a space, where not all estimators are in the figures
+    estimators: Mapping[Name, tuple[str, int]]  # estimators in the figures -> title and seed
 
 
 def _figures_of(
@@ -627,7 +631,7 @@ def _sections_of_test(
     lines: Mapping[Name, Line],
     drawn: DrawnTest,
 ) -> list[Block]:
-    """Tables of a test set, its bands, and traces of all of it, a section each."""
+    """Sections of the appendix on a test set: its tables, its bands, and traces of all of it."""
     file = file_of(test_set)
     of_test = f" on test set `{test_set}`" if len(artefacts.split.tests) > 1 else ""
     blocks: list[Block] = [
@@ -699,6 +703,7 @@ def _minutes_blocks(artefacts: PartArtefacts) -> list[Block]:
     return ["## Minutes of reference", Table("minutes", caption, frame, columns)]
 
 
+# column of the leaderboard that draws the interval as a bar
 _INTERVAL = Column(
     "95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")
 )
@@ -738,7 +743,7 @@ def _leaderboard_table(
     decimals = decimals_for(frame["rmse_sideslip"].tolist())
     has_bound = frame[_BOUND].notna().any()
     bound = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
-    frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
+    frame["interval"] = [describe_interval(row, decimals) for row in frame.to_dict("records")]
     folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
     chosen = [
         folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")

@@ -21,14 +21,13 @@ from vehest.report.style import decimals_for, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import budget_sentence, data_sentence, how_it_was_made
 from vehest.studies.kit.runs import by_name
-from vehest.studies.kit.standing import interval_in_words, standing_columns, verdict_sentences
+from vehest.studies.kit.standing import describe_interval, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
-TAKES = "folds"
+TAKES = "folds"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
-TEST = "test"
-
-VERSION = "3"
+TEST = "test"  # name of the test set of each fold
+VERSION = "3"  # raised where tables or figures change
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -99,8 +98,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
-    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors
-    in every fold.
+    """Errors by segment of the candidates with finite errors in every fold, for each seed and fold.
 
     Parameters
     ----------
@@ -190,8 +188,8 @@ def overview(
 def _left_out(
     parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]
 ) -> list[str]:
-    """Sentences on what is missing: models that failed in a fold, and candidates that are not in
-    every fold with finite errors.
+    """Sentences on what the table lacks: models that failed in a fold, and candidates without
+    finite errors in every fold.
     """
     lines = [
         f"{as_text(part.title)}: {line}"
@@ -232,6 +230,6 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "static map: paired, corrected by Holm."
     )
     frame = board.drop(columns=["estimator", "variant"]).assign(
-        interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
+        interval=[describe_interval(row, decimals) for row in board.to_dict("records")]
     )
     return Table("overview", caption, frame, columns)

@@ -27,12 +27,12 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest.studies.kit.recommendation import Recommendation, plain_text, recommendation_of
 from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
-TAKES = "parts"
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
 PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
-VERSION = "9"
+VERSION = "9"  # raised where tables or figures change
 leaderboard = drive.leaderboard
 Verdict = tuple[
     list[str], EvaluatedModel | None
@@ -40,9 +40,9 @@ Verdict = tuple[
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Verdict, figures and next commands.
+    """The report: verdict, figures and next commands, then the appendices: what was not compared
+    and the whole comparison.
 
-    Then the appendices: what was not compared and the whole comparison.
 
     Parameters
     ----------
@@ -94,8 +94,8 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
-    """Which estimator is recommended after a test set (`recommendation_of`), with the error to be
-    expected, and what it beats.
+    """The verdict of a test set: which estimator is recommended (`recommendation_of`), with the
+    error to be expected, and what it beats.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
         on how much hard driving was recorded.
     """
     recommendation = recommendation_of(part, test_set)
-    sentences = recommendation.describe(_reach(part, test_set))
+    sentences = recommendation.describe(_describe_driving(part, test_set))
     if not recommendation.ranking.order:
         return sentences, None
     if not recommendation.obstacles:
@@ -116,8 +116,8 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
 
 
 def _comparison_with_plain(recommendation: Recommendation) -> str:
-    """How the recommended estimator compares with the plain ones other than the baselines, which it
-    beats.
+    """A sentence on how the recommended estimator compares with `PLAIN_ESTIMATORS` other than the
+    baselines, which it beats.
     """
     ranking = recommendation.ranking
     name = recommendation.model.name if recommendation.model is not None else ranking.order[0]
@@ -144,7 +144,9 @@ def _comparison_with_plain(recommendation: Recommendation) -> str:
 
 
 def _counted(part: PartArtefacts, test_set: str) -> str:
-    """Share of a test that is scored, and the sideslip in the start of each range, which is not."""
+    """Sentences on the share of a test that is scored, and on the sideslip at the start of each
+    range, which is not.
+    """
     protocol = part.protocol
     scored = list[FloatArray]()
     hidden = list[FloatArray]()
@@ -192,7 +194,7 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
 
 
 def _commands(artefacts: StudyArtefacts, verdicts: Mapping[str, Verdict]) -> list[str]:
-    """What to run next, with the model of the first test set that has a verdict."""
+    """Command lines to run next, with the model of the first test set that recommends one."""
     part = artefacts.first
     location = f" {artefacts.location}" if artefacts.location else ""
     models = [
@@ -212,8 +214,8 @@ def _commands(artefacts: StudyArtefacts, verdicts: Mapping[str, Verdict]) -> lis
     ]
 
 
-def _reach(part: PartArtefacts, test_set: str) -> str:
-    """How hard the test was driven: 99 % of its lateral accelerations, else of its speeds."""
+def _describe_driving(part: PartArtefacts, test_set: str) -> str:
+    """Clause on how hard a test was driven, by the 99 % quantile of |ay|, else of the speed."""
     ay = _samples(part, part.split.tests[test_set], "ay")
     if len(ay):
         return (
@@ -228,8 +230,8 @@ def _reach(part: PartArtefacts, test_set: str) -> str:
 
 
 def _hard_driving(part: PartArtefacts) -> str:
-    """Minutes of hard driving, and how many more would halve the interval, whose width goes as one
-    over the root of the time.
+    """Sentences on the minutes of hard driving in the recordings, and on how many more would halve
+    the interval, whose width is inversely proportional to the root of the time.
     """
     split = part.split
     spans = (*split.train, *split.validation, *split.test_spans)
@@ -252,9 +254,8 @@ def _hard_driving(part: PartArtefacts) -> str:
 
 
 def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatArray:
-    """Samples of a channel over ranges, at the evaluation rate, end to end.
-
-    None where a recording lacks it.
+    """Finite samples of a channel over ranges, at the evaluation rate, end to end, (N,); empty
+    where a recording lacks the channel.
     """
     samples = []
     for recording in part.reference_ranges(spans):
@@ -265,9 +266,9 @@ def _samples(part: PartArtefacts, spans: Sequence[Span], channel: str) -> FloatA
 
 
 def not_compared(part: PartArtefacts) -> list[str]:
-    """Families that were not compared, each with the channels that its plainest form lacks.
+    """Families of estimators that were not compared, each with the reason, such as the channels
+    that its plainest form lacks; those that failed or had no time come first.
 
-    Those that failed or had no time come first.
 
     Parameters
     ----------

@@ -38,11 +38,11 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest.studies.drive import data_of_parts
 from vehest.studies.kit.standing import NOT_SIGNIFICANT
 
-TAKES = "parts"
-VERSION = "2"
-TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")
-METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
-SCRATCH = "from scratch"
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
+VERSION = "2"  # raised where tables or figures change
+TEMPLATE = Path(__file__).with_name("reference_minutes.md.j2")  # file of the report's template
+METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")  # those of metrics.csv
+SCRATCH = "from scratch"  # start of a training that starts from no model
 COLUMNS = {
     "title": Column("estimator"),
     "start": Column("training"),
@@ -52,29 +52,31 @@ COLUMNS = {
     "n_trainings": Column("trainings", decimals=0),
     "against_scratch": Column("compared with scratch"),
 }
-"""Of a table of `rows_of_curve`."""
+"""Key of `rows_of_curve` -> column of the table in the report."""
 COMMON_MINUTES = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Amounts of reference that get a column in the overview where they occur [min].
 
 The error with the most minutes, and their number, follow.
 """
+# caption of a figure, with places
 FIGURE_CAPTION = "{title}, test set `{test_set}`: RMSE(β) over the minutes of reference."
 FIGURE_NOTE = (
     "Minutes are those of recording with a reference for training and validation; bars are 95 % "
     "intervals over blocks of the test and trainings. Dashed: zero-sideslip baseline."
 )
-"""What holds for every figure of a curve."""
+"""Note below every figure of a curve."""
+# caption of the overview
 OVERVIEW_CAPTION = (
     "RMSE(β) [deg] by minutes of reference for training and validation together, over all "
     "trainings with as many minutes."
 )
-MAX_MINUTES_DEVIATION = (
-    0.15  # of the minutes asked for, by which ends of a few seconds may shorten them
-)
+# largest deviation of the recorded minutes from those asked for, over the latter, by which ends of
+# a few seconds may shorten them
+MAX_MINUTES_DEVIATION = 0.15
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: errors with each amount of reference as one table, and a figure a curve.
+    """The report: errors with each amount of reference as one table, and a figure for each curve.
 
     Parameters
     ----------
@@ -122,7 +124,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def overview_table(points: pd.DataFrame) -> Table:
-    """A row an estimator and start on a test set, RMSE(β) by minutes of reference in columns.
+    """Table of RMSE(β) by minutes of reference (columns), for each estimator, start and test set
+    (rows).
 
     Parameters
     ----------
@@ -157,10 +160,11 @@ def overview_table(points: pd.DataFrame) -> Table:
 
 
 def summary_of_curve(points: pd.DataFrame) -> dict[str, object]:
-    """Estimators with the lowest error at the fewest and the most minutes [deg], and the minutes at
-    which starting from another model makes a significant difference.
+    """Values for the template of the report: estimators with the lowest error at the fewest and the
+    most minutes [deg], and the minutes at which starting from another model makes a significant
+    difference.
 
-    ``points``: `rows_of_curve`, with a column ``curve``.
+    ``points`` are rows of `rows_of_curve`, with a column ``curve``.
 
     Returns
     -------
@@ -194,18 +198,18 @@ def summary_of_curve(points: pd.DataFrame) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Point:
-    """An estimator after so much reference."""
+    """A point of a learning curve: an estimator trained with an amount of reference."""
 
-    estimator: str  # its name
-    variant: str  # its variant
-    title: str  # for people
-    start: str  # what its training starts from; `SCRATCH` for nothing
-    minutes: float  # with reference for training and validation, as configured
-    n_trainings: int  # segments of the drive times seeds
+    estimator: str  # name in the registry
+    variant: str  # identifier of its configuration
+    title: str  # name in tables and figures
+    start: str  # start of its training; `SCRATCH` for nothing
+    minutes: float  # recording time with reference for training and validation [min]
+    n_trainings: int  # number of trainings: segments of the drive times seeds
 
     @property
     def name(self) -> Name:
-        """Under which it is ranked."""
+        """Name under which the point is ranked, with start and minutes in place of the variant."""
         return (
             self.estimator,
             ""
@@ -218,10 +222,10 @@ class Point:
 class Curve:
     """Learning curves on one test set."""
 
-    title: str  # of the first of its parts
-    test_set: str  # that was tested on
-    points: Sequence[Point]  # by estimator, start and minutes
-    # of all of them, whose intervals are missing where the test is too short for them
+    title: str  # title of the first of its parts
+    test_set: str  # name of the test set
+    points: Sequence[Point]  # sorted by estimator, start and minutes
+    # ranking of all points, without intervals where the test is too short for them
     ranking: Ranking
 
 
@@ -280,7 +284,7 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
         Point(
             estimator,
             variant,
-            as_text(trained[0].title.removesuffix(start_in_words(trained[0].training))),
+            as_text(trained[0].title.removesuffix(describe_start(trained[0].training))),
             start,
             minutes,
             len(trained),
@@ -325,13 +329,13 @@ def _differ_in_start(plain: Point, tuned: Point) -> bool:
 
 
 def start_of(training: Mapping[str, object]) -> str:
-    """What a training started from, for people."""
+    """Text of what a training started from: `SCRATCH` or ``from MODEL``."""
     start = training.get("start_from")
     return SCRATCH if start is None else f"from {Path(str(start)).name}"
 
 
-def start_in_words(training: Mapping[str, object]) -> str:
-    """Behind a title: ``, starting from MODEL``; empty where a training starts from nothing."""
+def describe_start(training: Mapping[str, object]) -> str:
+    """Suffix of a title: ``, starting from MODEL``; empty where a training starts from scratch."""
     return "" if training.get("start_from") is None else f", starting {start_of(training)}"
 
 
@@ -358,7 +362,7 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
     """
     caption = FIGURE_CAPTION.format(title=curve.title, test_set=curve.test_set)
     return [
-        _in_words(curve),
+        _describe_curve(curve),
         Figure(f"reference_minutes_{name}", f"{caption} {FIGURE_NOTE}", _figure(curve)),
         Table(
             f"reference_minutes_{name}",
@@ -372,8 +376,8 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
 
 
 def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
-    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and
-    how it stands to one from scratch.
+    """Rows of the table of a curve, one for each point: title, start, minutes, RMSE(β) [deg], its
+    interval as text, number of trainings, and the comparison with training from scratch.
 
     Returns
     -------
@@ -399,8 +403,8 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
 
 
 def _against_scratch(curve: Curve, point: Point) -> str:
-    """The verdict against the same estimator trained from scratch on as many minutes; empty where
-    it was not compared.
+    """Verdict of a point against the same estimator trained from scratch with as many minutes;
+    empty where these were not compared.
     """
     plain = next(
         (candidate for candidate in curve.points if _differ_in_start(candidate, point)), None
@@ -412,17 +416,16 @@ def _against_scratch(curve: Curve, point: Point) -> str:
 
 
 def _lines(curve: Curve) -> list[list[Point]]:
-    """Points by estimator and start, each with more minutes than the one before.
-
-    None of the zero-sideslip baseline.
+    """Points of each line of the figure, one for each estimator and start, by rising minutes,
+    without the zero-sideslip baseline.
     """
     groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
     return [list(points) for key, points in groups if key[0] != BASELINES[0]]
 
 
-def _in_words(curve: Curve) -> str:
-    """Errors with the fewest and the most minutes of reference, and significant effects of starting
-    from another model.
+def _describe_curve(curve: Curve) -> str:
+    """Sentences on the errors with the fewest and the most minutes of reference, and on significant
+    effects of starting from another model.
     """
     sentences = []
     for first, *_, last in (points for points in _lines(curve) if len(points) > 1):
@@ -453,8 +456,8 @@ def _in_words(curve: Curve) -> str:
 
 
 def _figure(curve: Curve) -> MatplotlibFigure:
-    """RMSE(β) over the minutes, both logarithmic, a line an estimator and start; lines are shifted
-    by 3 % of a value each, so that their intervals do not cover one another.
+    """Draw RMSE(β) over the minutes, both logarithmic, with a line for each estimator and start;
+    lines are shifted by 3 % of a value each, so that their intervals do not cover one another.
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 

@@ -27,7 +27,8 @@ from types import ModuleType
 from vehest.data.errors import ConfigurationError, printable
 from vehest.data.text_files import first_line
 
-ENTRY_POINTS = "vehest.studies"
+ENTRY_POINTS = "vehest.studies"  # group of entry points of other packages' studies
+# names of the studies that are modules of this package
 BUILT_IN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer")
 
 

@@ -32,19 +32,18 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
 
 CONFIDENCE = 0.95  # level of the interval of a mean over seeds
-METRIC = "rmse_sideslip"
-DONE = "done"
-FAILED = "failed"
+METRIC = "rmse_sideslip"  # metric by which the combination is chosen
+DONE = "done"  # status of a job
+FAILED = "failed"  # status of a job
 MIN_RATIO_FOR_LOG = 20.0  # highest over lowest value, above which colours are logarithmic
 MAX_COLUMNS_SIDE_BY_SIDE = 6  # columns of a heat map; those with more are drawn below one another
-CELL_HEIGHT = 0.42  # in
-NO_VALUE_COLOUR = "#ececec"
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
-
-Value = bool | int | float | str
+CELL_HEIGHT = 0.42  # height of a cell of a heat map, in
+NO_VALUE_COLOUR = "#ececec"  # colour of a cell without a value
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in the relative luminance
+Value = bool | int | float | str  # value of a setting
 Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
-"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and
-column of those with a frame.
+"""Panel of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row
+and column of the cells with a frame.
 """
 
 
@@ -53,7 +52,7 @@ class SweepArtefacts:
     """Everything that tables and figures of a sweep are made from."""
 
     part: PartArtefacts  # the comparison of all combinations
-    # those that take several values, the seed aside, in the order of the command
+    # settings that take several values, without the seed, in the order of the command
     keys: Sequence[str]
     # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status``
     # (``done`` or ``failed``), ``error``,
@@ -64,7 +63,7 @@ class SweepArtefacts:
 
     @property
     def sets(self) -> list[str]:
-        """What is scored: the validation range, where there is one, and each test set."""
+        """Names of what is scored: the validation range, where there is one, and each test set."""
         return [*([VALIDATION] if self.part.split.validation else []), *self.part.split.tests]
 
     @cached_property
@@ -223,7 +222,7 @@ def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
                 for switch, value in zip(switches, key, strict=True)
             )
             panels.append(_panel(rows, title, name, numeric, cells))
-        set_text = _set_in_words(name)
+        set_text = _describe_set(name)
         caption = (
             f"RMSE(β) on {set_text} over {across} and {up} ({_kinds(artefacts, name)}). In each "
             "cell the mean over seeds and, "
@@ -250,6 +249,7 @@ def override_text(value: object) -> str:
 
 
 def _is_number(value: object) -> bool:
+    """Whether a value is a number, and no truth value."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(
         value, bool | np.bool_
     )
@@ -258,7 +258,9 @@ def _is_number(value: object) -> bool:
 def _panel(
     table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: list[list[float]]
 ) -> Panel:
-    """Combinations with two numeric keys of these values, across and up."""
+    """Panel of a heat map from the combinations in a table: the values of the first numeric key
+    across, those of the second up.
+    """
     across, up = numeric
     mean, half, chosen = (
         table.pivot(index=up, columns=across, values=column)
@@ -277,7 +279,7 @@ def heat_map(
     row_label: str,
     quantity: str,
 ) -> MatplotlibFigure:
-    """Panels, (R, C) each, on one scale of colours, the darker the larger.
+    """Draw panels, (R, C) each, on one scale of colours, the darker the larger.
 
     Logarithmic where the largest value is 20 times the smallest.
 
@@ -334,8 +336,8 @@ def heat_map(
 
 
 def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
-    """One panel: coloured cells with mean and half interval as text, white on dark colours, and
-    frames.
+    """Draw one panel: coloured cells with mean and half interval as text, white on dark colours,
+    and frames.
     """
     from matplotlib.patches import Rectangle
 
@@ -379,13 +381,14 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
 
 
 def _kinds(artefacts: SweepArtefacts, name: str) -> str:
+    """Text on the kinds of the recordings of a test set, or of the validation range."""
     part = artefacts.part
     return part.kinds_of(part.split.validation if name == VALIDATION else part.split.tests[name])
 
 
 def _chosen_sentence(artefacts: SweepArtefacts) -> str:
-    """Which combination was chosen on validation, with its errors and how many others lie within
-    its interval; or why none was chosen.
+    """Sentences on which combination was chosen on validation, with its errors and the number of
+    others within its interval; or on why none was chosen.
     """
     if any(key.split(".")[0] == "fault" for key in artefacts.keys):
         return (
@@ -405,7 +408,7 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
         f" ({settings})" if settings else ""
     )
     figures = [
-        f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})"
+        f"{_with_interval(row, name)} on {_describe_set(name)} ({_kinds(artefacts, name)})"
         for name in artefacts.sets
     ]
     seeds = int(row["n_seeds"])
@@ -421,12 +424,13 @@ def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     return words
 
 
-def _set_in_words(name: str) -> str:
+def _describe_set(name: str) -> str:
+    """Text that names a test set."""
     return "the validation range" if name == VALIDATION else f"test set `{name}`"
 
 
 def _with_interval(row: pd.Series, name: str) -> str:
-    """Mean and half interval of RMSE(β) of a combination on a set, with the degree sign."""
+    """Text of mean and half interval of a combination's RMSE(β) on a set, with the degree sign."""
     mean = float(row[f"{METRIC}.{name}"])
     half = float(row[f"{METRIC}_half.{name}"])
     return mean_and_half(mean, half, decimals_for([mean])) + "°"
@@ -459,6 +463,7 @@ def _budget(jobs: pd.DataFrame) -> str:
     return f"Budget: {counts}{took}"
 
 
+# statements of the report on intervals and on the choice
 INTERVAL_AND_CHOICE = (
     "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ "
     "s/√n, from Student's t distribution "

@@ -42,24 +42,27 @@ from vehest.studies.drive import data_of_parts
 from vehest.studies.kit.runs import titles_of
 from vehest.studies.kit.standing import figure_of, ranking_of, standing_columns
 
-VERSION = "4"
-TEMPLATE = Path(__file__).with_name("transfer.md.j2")
-TAKES = "parts"
+VERSION = "4"  # raised where tables or figures change
+TEMPLATE = Path(__file__).with_name("transfer.md.j2")  # file of the report's template
+TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
 SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
 MAX_PANEL_COLUMNS = 4  # panels side by side at most; further ones begin a row
 TITLE_WIDTH = 24  # characters of a line of a panel's title
-ROW_HEIGHT = 0.16  # in, height of an estimator
+ROW_HEIGHT = 0.16  # height of an estimator's row, in
 REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
 """Baselines, in the order in which tables list them first."""
+# caption of a figure, with places
 FIGURE_CAPTION = (
     "RMSE(β) over that of the zero-sideslip baseline (zero), with 95 % intervals: left of 1, an "
     "estimator is better than it. The vertical line in each row is the static map, whose two "
     "numbers are fitted on the same ranges."
 )
+# caption of the overview
 OVERVIEW_CAPTION = (
     "Number of tests on which an estimator is significantly better than each baseline, and its "
     "RMSE(β) over that of zero: median and highest over tests."
 )
+# caption of the table of errors
 ERRORS_CAPTION = (
     "RMSE(β) [deg] over all seeds. * significantly better than zero and the static map, corrected "
     "by Holm within the test. – lacks a channel, failed or has no finite error."
@@ -67,7 +70,7 @@ ERRORS_CAPTION = (
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: answer, errors as a figure, a summary by estimator and the errors of every test.
+    """The report: answer, errors as a figure, a summary by estimator and the errors of every test.
 
     Parameters
     ----------
@@ -112,7 +115,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def _values(
     artefacts: StudyArtefacts, board: pd.DataFrame, summary: pd.DataFrame
 ) -> dict[str, object]:
-    """Numbers and names that the template has places for."""
+    """Values that the template of the report is filled with, by name."""
     parts = artefacts.parts
     places = board[["part", "test_set"]].drop_duplicates()
     kinds = [
@@ -147,10 +150,11 @@ def _values(
 
 
 def _beats_both(board: pd.DataFrame) -> pd.Series:
-    """Whether a row is significantly better than zero and the static map."""
+    """Mask of the rows of a board that are significantly better than zero and the static map."""
     return (board["beats_zero"] == "yes") & (board["beats_static_map"] == "yes")
 
 
+# column of `_summary` -> column of the table in the report
 SUMMARY_COLUMNS = {
     "estimator": Column("estimator"),
     "tests": Column("tests", decimals=0),
@@ -163,8 +167,8 @@ SUMMARY_COLUMNS = {
 
 
 def _summary(board: pd.DataFrame) -> pd.DataFrame:
-    """A row an estimator: tests with a finite error, on how many it is significantly better than
-    the baselines, and its RMSE(β) over that of zero.
+    """Summary with a row for each estimator: number of tests with a finite error, on how many of
+    them it is significantly better than the baselines, and its RMSE(β) over that of zero.
     """
     zero = board[board["estimator"] == "zero"].set_index(["part", "test_set"])["rmse_sideslip"]
     places = pd.MultiIndex.from_frame(board[["part", "test_set"]])
@@ -191,7 +195,7 @@ def _summary(board: pd.DataFrame) -> pd.DataFrame:
 
 
 def _errors(board: pd.DataFrame) -> Table:
-    """A row a test, a column an estimator."""
+    """Table of RMSE(β) [deg], with a row for each test and a column for each estimator."""
     titles = list(dict.fromkeys(board["estimator_title"]))
     columns = {"test": Column("test")}
     columns |= {f"estimator_{position}": Column(title) for position, title in enumerate(titles)}
@@ -211,8 +215,8 @@ def _errors(board: pd.DataFrame) -> Table:
 def _tests(
     parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]
 ) -> pd.DataFrame:
-    """A row a test: its data, the estimator with the lowest error, those that are not
-    significantly worse, and the blocks of the comparison.
+    """Table with a row for each test: its data, the estimator with the lowest error, those that are
+    not significantly worse, and the blocks of the comparison.
     """
     rows = []
     for (name, test_set), ranking in rankings.items():
@@ -307,7 +311,7 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
 
 
 def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
-    """A test as a row's name: title of the part, and the test set where it has several."""
+    """Name of a test in tables: title of the part, and the test set where the part has several."""
     several = board[board["part"] == row["part"]]["test_set"].nunique() > 1
     return f"{row['title']}, {row['test_set']}" if several else str(row["title"])
 
@@ -324,8 +328,8 @@ def _cell(row: Mapping[Any, Any]) -> str:
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
-    """A panel a test, a row an estimator: RMSE(β) over that of zero with its interval, and the
-    static map as a vertical line.
+    """Draw a panel for each test with a row for each estimator: RMSE(β) over that of zero with its
+    interval, and the static map as a vertical line.
     """
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     names = list(

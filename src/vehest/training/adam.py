@@ -20,16 +20,16 @@ class Adam:
     Parameters
     ----------
     parameters : Iterable[Tensor]
-        Leaves that learn.
+        Leaf tensors that are trained, in place.
     learning_rate : float
         Step size; may be changed between steps.
     weight_decay : float, default 0.0
-        Decoupled, times the step size.
+        Decoupled weight decay λ.
 
     Attributes
     ----------
     state
-        Of each parameter that was stepped: ``step`` (), and the moments ``exp_avg`` and
+        Values of each parameter that was stepped: ``step`` (), and the moments ``exp_avg`` and
         ``exp_avg_sq`` in its shape.
 
     Source: Kingma & Ba, Adam, 2015; Loshchilov & Hutter, Decoupled weight decay regularization,

@@ -2,7 +2,7 @@
 
 A checkpoint is one safetensors file in a folder of the member: tensors, and in its metadata the
 plain values as JSON with a SHA-256 of both. `save_checkpoint` replaces it by one rename;
-`load_checkpoint` takes a damaged file or one of another layout for none, and training starts anew.
+`load_checkpoint` ignores a damaged file and one of another layout, and training starts anew.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from vehest.data.errors import VehestError
 from vehest.data.files import as_os_error, regular_file, remove, written_aside
 from vehest.data.text_files import parse_json
 
-_FILE = "checkpoint.safetensors"
-_LAYOUT = b"2"  # of what trainings keep; a checkpoint of another one is none
+_FILE = "checkpoint.safetensors"  # name of the file in a member's folder
+_LAYOUT = b"2"  # version of what trainings store; a checkpoint of another one is ignored
 
 
 class Checkpoint(NamedTuple):
-    """Tensors and plain values of a training's state."""
+    """State of a training after an epoch."""
 
-    tensors: Mapping[str, Tensor]
-    values: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]  # name -> weights, moments, states of generators
+    values: Mapping[str, Any]  # name -> plain value, as JSON stores it; ``epoch`` is among them
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -38,7 +38,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     Parameters
     ----------
     folder : Path
-        Of one member.
+        Folder of one member.
     checkpoint : Checkpoint
         Its values must be JSON; a valid checkpoint has an integer ``epoch`` and perhaps
         ``finished``.
@@ -62,8 +62,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint in ``folder``; none if there is none or it cannot be read, in which case
-    training starts anew.
+    """Read the checkpoint in ``folder``; None where there is none or it cannot be read, in which
+    case training starts anew.
     """
     path = folder / _FILE
     try:
@@ -83,7 +83,9 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def _digest(values: str, tensors: Mapping[str, Tensor]) -> str:
-    """Hash of all that a checkpoint holds: one that has been damaged anywhere is none."""
+    """SHA-256 of the layout, the values and the tensors of a checkpoint, by which damage is
+    found.
+    """
     digest = hashlib.sha256(_LAYOUT + values.encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
@@ -92,10 +94,10 @@ def _digest(values: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def resume_epoch(folder: Path) -> int:
-    """Epochs that the checkpoint in ``folder`` saves, 0 if there is none, -1 if training was over
-    and only the model is missing.
+    """Number of epochs after which the checkpoint in ``folder`` was stored; 0 without a checkpoint,
+    -1 if training was over and only the model is missing.
 
-    Members can go on together if they agree in this.
+    Members can continue together if these numbers are equal.
     """
     checkpoint = load_checkpoint(folder)
     if checkpoint is None:
@@ -104,5 +106,5 @@ def resume_epoch(folder: Path) -> int:
 
 
 def drop_checkpoint(folder: Path) -> None:
-    """Forget the checkpoint in ``folder``, and the folder with it."""
+    """Delete ``folder`` with the checkpoint in it."""
     remove(folder)

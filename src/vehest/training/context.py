@@ -10,12 +10,14 @@ from pathlib import Path
 
 from vehest.data.errors import DataError
 
-MAX_HALVINGS = 3  # of the step size, each after a divergence; then the training ends with its best
+# largest number of halvings of the step size, each after a divergence; then the training ends with
+# its best
+MAX_HALVINGS = 3
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fit stands after an epoch."""
+    """Progress of a fit after an epoch, for `FitContext.on_progress`."""
 
     epoch: int  # epochs finished
     max_epochs: int  # epochs allowed
@@ -26,9 +28,9 @@ class Progress:
 
 @dataclass(frozen=True)
 class FitContext:
-    """What a caller gives a fit besides data and settings: checkpoints, stop request, progress."""
+    """Arguments of a fit besides data and settings: checkpoints, stop request, progress."""
 
-    # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
+    # folder in which each member stores its checkpoints; empty: none are stored
     checkpoint_folders: Sequence[Path] = ()
     # asked after every batch; True ends the fit cleanly with the best so far
     should_stop: Callable[[], bool] = lambda: False
@@ -37,9 +39,9 @@ class FitContext:
 
 @dataclass(frozen=True)
 class FitRecord:
-    """How a fit went."""
+    """Result of a fit besides the weights: its history and figures."""
 
-    # column -> values, one row an epoch or a search; empty where there is nothing to show
+    # column -> values, a row for each epoch or search; empty where a fit has no steps
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
     # figures such as ``epochs`` and ``train_seconds``
     metrics: Mapping[str, float] = field(default_factory=dict)
@@ -53,7 +55,7 @@ def record_of_epochs(
     interrupted: bool,
     **columns: Sequence[float],
 ) -> FitRecord:
-    """The record of a fit with one row an epoch: ``columns``, then epoch and losses.
+    """Make the record of a fit with a row for each epoch: ``columns``, then epoch and losses.
 
     Parameters
     ----------
@@ -81,13 +83,13 @@ def record_of_epochs(
 
 
 class DivergenceError(DataError):
-    """A loss finds that its training has diverged, so that the trainer returns to the best
-    parameters so far.
+    """Raised by a loss that finds that its training has diverged, so that the trainer returns to
+    the best parameters so far.
     """
 
 
 def divergence_metrics(halvings: int, has_diverged: bool) -> dict[str, float]:
-    """Figures of a fit that diverged; empty for one that never did.
+    """Metrics of a fit that diverged, name -> value; empty for one that never did.
 
     ``step_size_halvings``: how often its step size was halved; ``ended_by_divergence``: 1 if it
     diverged again at the end.
@@ -99,4 +101,6 @@ def divergence_metrics(halvings: int, has_diverged: bool) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class NoTraining:
-    """Nothing to set: what the estimator needs is given, or read off the data as it is."""
+    """Settings of a fit without any: the estimator's values are given, or follow from the data in
+    closed form.
+    """

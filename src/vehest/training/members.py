@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 
-# evaluated at once where no gradient is wanted: each is laid out by itself in memory
+# windows of a member that are evaluated at once without gradients, since each is copied in memory
 MAX_WINDOWS_TOGETHER = 1024
 
 
@@ -59,12 +59,12 @@ def is_plain(network: nn.Module) -> bool:
 
 @contextmanager
 def random_numbers(seed: int) -> Iterator[None]:
-    """Let torch draw from this seed on the CPU; restores its random state afterwards.
+    """Context in which torch draws from a seed on the CPU; its random state is restored afterwards.
 
     Parameters
     ----------
     seed : int
-        Of torch's default generator on the CPU, within the context.
+        Seed of torch's default generator on the CPU.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
@@ -72,7 +72,7 @@ def random_numbers(seed: int) -> Iterator[None]:
 
 
 def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
-    """Buffers and parameters that are not trained, by name, (M, ...).
+    """Stack the buffers and the parameters that are not trained, by name, (M, ...).
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class FlatParameters:
         self.size = sum(shape.numel() for shape in self.shapes.values())
 
     def pack(self, modules: Sequence[nn.Module]) -> Tensor:
-        """Rows of parameters, shape (M, K)."""
+        """The trained parameters of M modules as rows, (M, K)."""
         return torch.stack(
             [torch.cat([p.detach().reshape(-1) for _, p in _trained(module)]) for module in modules]
         )
@@ -125,7 +125,7 @@ class FlatParameters:
         }
 
     def unpack(self, row: Tensor, module: nn.Module) -> None:
-        """Copy one row, shape (K,), into a module."""
+        """Copy one row, (K,), into the parameters of a module."""
         with torch.no_grad():
             for (_, parameter), values in zip(
                 _trained(module), self.views(row.unsqueeze(0)).values(), strict=True
@@ -173,13 +173,13 @@ def predict_members(
     compiled : bool
         Use the compiled recursion where the network has one; PyTorch otherwise.
     seeds : Sequence[int], default ()
-        What layers that draw random numbers draw from, one a member; none: from torch's global
-        state.
+        Seed of each member for layers that draw random numbers; empty: these draw from torch's
+        global state.
 
     Returns
     -------
     Tensor
-        (M, B) [m/s].
+        Lateral velocity one step after each window, (M, B) [m/s].
 
     Raises
     ------
@@ -202,7 +202,7 @@ def predict_members(
 
 
 _UNBATCHABLE: WeakSet[nn.Module] = WeakSet()
-"""Networks with a layer that torch cannot batch."""
+"""Networks that have been found to have a layer that torch cannot batch over members."""
 
 
 def _plain(

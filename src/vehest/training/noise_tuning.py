@@ -20,12 +20,12 @@ from vehest.training.search import (
     optuna_search,
 )
 
-MIN_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
+MIN_PROCESS_YAW_RATE = 1e-5  # rad/s, lower limit of the search for the yaw rate's process noise
 
 
 @dataclass(frozen=True)
 class NoiseTuningSettings(Group):
-    """How a filter comes by its noise levels."""
+    """Settings of the search for a filter's noise levels."""
 
     group = "training"
     version: ClassVar[str] = "1"
@@ -57,19 +57,19 @@ class NoiseTuningSettings(Group):
         context: FitContext,
         trials: int | None = None,
     ) -> SearchRecord:
-        """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see
-        `vehest.training.search`.
+        """Search the smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts,
+        see `vehest.training.search`.
 
         Parameters
         ----------
         cost : Cost
-            Of parameters (K,).
+            Function of the parameters, (K,).
         boxes : Box
             Admissible range of each parameter.
         starts : Box
             Range over which the starts of Nelder-Mead are spread; Optuna does not use it.
         seed : int
-            Of Optuna's sampler.
+            Seed of Optuna's sampler.
         context : FitContext
             Progress and the wish to stop.
         trials : int | None, default None
@@ -86,8 +86,8 @@ class NoiseTuningSettings(Group):
 
 @dataclass(frozen=True)
 class IdentificationSettings(NoiseTuningSettings):
-    """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section
-    III-B).
+    """Settings of the identification of a filter's tyres and noise levels (Bertipaglia et al. 2024,
+    Section III-B).
     """
 
     group = "identification"
@@ -98,7 +98,7 @@ class IdentificationSettings(NoiseTuningSettings):
     )
     trials: int = setting(60, "evaluations of Optuna in all stages together", least=1)
     stages: int = setting(
-        2, "of Optuna; after the first, the box shrinks around the best so far", least=1
+        2, "stages of Optuna; after the first, the box shrinks around the best so far", least=1
     )
     shrink: float = setting(
         0.3,
@@ -111,7 +111,7 @@ class IdentificationSettings(NoiseTuningSettings):
         "pattern of the names of those training recordings that tyres are identified on",
     )
     restarts: int = setting(5, "genetic searches for the tyres, of which the best counts", least=1)
-    generations: int = setting(200, "of each, at most", least=1)
+    generations: int = setting(200, "generations of each genetic search, at most", least=1)
     most_process_yaw_rate: float = setting(
         10.0,
         "upper limit of the search for the yaw rate's process noise, of one sample's step; with a "

@@ -40,7 +40,7 @@ def robust_squares(errors: Tensor, limit: float) -> Tensor:
 
 
 def robust_squares_of_array(errors: FloatArray, limit: float) -> FloatArray:
-    """`robust_squares` of an array, without gradients."""
+    """`robust_squares` for a NumPy array, without gradients."""
     if not limit:
         return np.square(errors)
     size = np.abs(errors)

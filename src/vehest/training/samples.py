@@ -16,17 +16,17 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):
-    """Training data, as a network receives it."""
+    """Samples of a training, scaled as the network takes them."""
 
-    inputs: Tensor  # (N, C)
-    targets: Tensor  # (N,)
+    inputs: Tensor  # scaled inputs, (N, C)
+    targets: Tensor  # scaled targets, (N,)
 
 
 class Draw(NamedTuple):
-    """A batch."""
+    """Random choice of a batch for each of M members."""
 
-    rows: Tensor  # which samples each member sees, int64 (M, B)
-    seeds: Tensor  # of each member's dropout, int64 (M,)
+    rows: Tensor  # indices of the samples that each member is trained on, int64 (M, B)
+    seeds: Tensor  # seed of each member's dropout, int64 (M,)
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ def sample_phase(
     losses: Callable[[Draw], Tensor],
     judge: Callable[[], Tensor],
 ) -> Phase:
-    """Members learn from all samples, each in an order of its own; what is judged is their mean.
+    """The phase in which members are trained on all samples, each in its own random order; its
+    validation loss is their mean.
 
     An epoch draws one permutation of the samples for each member; the last batch may be smaller.
     The losses of members are added, so that each member's gradient is that of its own loss.
@@ -69,21 +70,21 @@ def sample_phase(
     Parameters
     ----------
     name : str
-        Of the phase.
+        Name of the phase.
     module : nn.Module
-        Of all members; what happens in one member's parameters must not touch another's.
+        Module of all members; what happens in one member's parameters must not touch another's.
     settings : PhaseSettings
         Step size, epochs, patience.
     batch_size : int
         Samples of a member's batch.
     n_samples : int
-        How many there are.
+        Number of training samples.
     members : int
-        M.
+        Number M of members.
     losses : Callable[[Draw], Tensor]
-        Of a batch, one a member, (M,).
+        Returns the loss of each member on a batch, (M,).
     judge : Callable[[], Tensor]
-        On validation samples, (M,).
+        Returns the loss of each member on the validation samples, (M,).
 
     Returns
     -------

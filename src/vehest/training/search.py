@@ -21,11 +21,11 @@ from vehest.data.errors import DataError, MissingError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
-INITIAL_STEP_SHARE = 0.05  # of a parameter's range: edges of the first simplex
-UNUSABLE_COST = 1e6  # instead of a cost that is not finite: a search goes on elsewhere
+INITIAL_STEP_SHARE = 0.05  # edge of the first simplex along a parameter, over its range
+UNUSABLE_COST = 1e6  # cost in place of one that is not finite, so that a search goes on elsewhere
 MAX_GRID = 1000  # starts along a parameter
-Cost = Callable[[FloatArray], float]
-Box = Sequence[tuple[float, float]]
+Cost = Callable[[FloatArray], float]  # function of parameters (K,) that is minimised
+Box = Sequence[tuple[float, float]]  # smallest and largest value of each of K parameters
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,15 @@ class SearchRecord(NamedTuple):
     """Outcome of a direct search."""
 
     best: FloatArray  # parameters with the smallest cost, shape (K,)
-    cost: float  # that cost
+    cost: float  # cost at these values
     starts: FloatArray  # each start with the parameters and the cost it led to, shape (S, 2K + 1)
-    evaluations: int  # of the cost, in all
+    evaluations: int  # number of evaluations of the cost in all
     interrupted: bool  # before the last start
 
     def history(self, names: Sequence[str]) -> dict[str, list[float]]:
-        """Starts, what each led to and its cost, as a fit's history has them."""
+        """The history of a fit, column -> values: start and result of each parameter, and the cost
+        as ``train_loss``, with a row for each start.
+        """
         columns = (*(f"start_{name}" for name in names), *names, "train_loss")
         return dict(zip(columns, self.starts.T.tolist(), strict=True))
 
@@ -126,8 +128,8 @@ def finite_cost(cost: float) -> float:
 
 
 def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> SearchRecord:
-    """Record of a search from rows of start, result (K each) and cost; raises `DataError` where no
-    cost is usable.
+    """Make the record of a search from rows of start (K), result (K) and cost; raises `DataError`
+    where no cost is usable.
     """
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
@@ -141,8 +143,8 @@ def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> 
 
 
 def _simplex(start: FloatArray, box: Box) -> FloatArray:
-    """A start and a step of 5 % of the box along each parameter, inwards where it would leave the
-    box.
+    """First simplex of Nelder-Mead, (K + 1, K): the start, and a step of `INITIAL_STEP_SHARE` of
+    the box along each parameter, inwards where it would leave the box.
     """
     vertices = np.tile(start, (len(start) + 1, 1))
     for k, (low, high) in enumerate(box):

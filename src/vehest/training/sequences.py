@@ -66,22 +66,22 @@ class PhaseSettings(Group):
 
 @dataclass(frozen=True)
 class Phase:
-    """What learns, from what, and what is to become small.
+    """A phase of a training: the module that is trained, its batches, its loss and its validation.
 
     Phases may be of one module or of several that share parameters; what an earlier phase learnt is
     where a later one starts. The module is never asked for random numbers: what is random about an
     epoch (order, offsets, masks of dropout) is drawn by ``batches``.
     """
 
-    name: str  # for people and for the checkpoint; unique among the phases of a training
+    name: str  # name in messages and in the checkpoint; unique among the phases of a training
     settings: PhaseSettings  # step size, epochs, patience, clipping
-    module: nn.Module  # its parameters are changed in place
-    # of one epoch; random numbers are drawn from the generator and from no other
+    module: nn.Module  # module whose parameters are changed in place
+    # returns the batches of one epoch; draws random numbers from the generator and from no other
     batches: Callable[[torch.Generator], Iterable[Any]]
-    loss: Callable[[Any], Tensor]  # scalar to minimise, of one batch; ``backward`` is called on it
-    # loss on the validation data with the parameters as they stand; called without gradients
+    loss: Callable[[Any], Tensor]  # returns the loss of a batch, a scalar with a gradient
+    # returns the loss on the validation data with the present parameters, without gradients
     validation: Callable[[], float]
-    # which parameters learn, by name, while the others are frozen; all if None
+    # whether a parameter of this name learns, while the others are frozen; None: all learn
     trainable: Callable[[str], bool] | None = None
     # called once before the first validation; may set parameters that this phase starts from
     prepare: Callable[[], None] | None = None
@@ -89,31 +89,33 @@ class Phase:
 
 @dataclass
 class PhaseRecord:
-    """How a phase goes; plain values, which a checkpoint keeps as they are."""
+    """Progress and losses of a phase, as plain values, which a checkpoint stores."""
 
-    name: str  # of the phase
+    name: str  # name of the phase
     # epoch (from 1) whose parameters were kept; 0 if none was better than the start
     best_epoch: int = 0
     best_loss: float = math.inf  # validation loss of the parameters that were kept
     # validation loss before the first epoch; NaN if it was stopped before
     start_loss: float = math.nan
-    # mean over the batches of each epoch, skipped ones left out
+    # training loss of each epoch: mean over its batches, skipped ones left out
     train_loss: list[float] = field(default_factory=list)
-    # after each epoch; NaN where not validated
+    # validation loss after each epoch; NaN where not validated
     validation_loss: list[float] = field(default_factory=list)
     seconds: float = 0.0  # wall time, earlier runs that a checkpoint continues included [s]
     skipped_steps: int = 0  # batches whose loss or gradient was not finite
-    skipped_in_a_row: int = 0  # the last of them
-    validated: bool = False  # whether it was, before the first epoch
-    interrupted: bool = False  # whether it was stopped before it was over
-    halvings: int = 0  # how often it diverged and went on from its best with half the step size
-    returned_at: int = 0  # epochs finished when it last did, from which its patience counts
-    has_diverged: bool = False  # whether it ended because the smallest step size diverged too
+    skipped_in_a_row: int = 0  # consecutive batches that were skipped, up to the last one
+    validated: bool = False  # whether the validation before the first epoch is done
+    interrupted: bool = False  # whether the phase was stopped before it was over
+    # number of divergences after which it continued from its best with half the step size
+    halvings: int = 0
+    returned_at: int = 0  # epochs finished at the last of these, from which its patience counts
+    # whether the phase ended because the smallest step size diverged too
+    has_diverged: bool = False
     problem: str = ""  # error message of the last divergence; empty: it never diverged
 
     @property
     def epochs(self) -> int:
-        """Epochs finished."""
+        """Number of finished epochs."""
         return len(self.train_loss)
 
     def is_over(self, settings: PhaseSettings) -> bool:
@@ -126,8 +128,8 @@ class PhaseRecord:
 
 
 def record_of_phases(phases: Sequence[PhaseRecord]) -> FitRecord:
-    """History over the epochs of all phases, and the last phase's figures; epochs, skipped steps
-    and seconds are those of all.
+    """The record of a fit in phases: history over the epochs of all phases, and metrics of the last
+    phase; epochs, skipped steps and seconds are those of all phases.
     """
     last = phases[-1]
     metrics = {
@@ -146,7 +148,7 @@ def record_of_phases(phases: Sequence[PhaseRecord]) -> FitRecord:
 
 
 def divergence_of_phases(phases: Sequence[PhaseRecord]) -> dict[str, float]:
-    """Figures of a training that diverged; empty for one that never did."""
+    """`divergence_metrics` of a training in phases, over all of them."""
     return divergence_metrics(
         sum(phase.halvings for phase in phases), any(phase.has_diverged for phase in phases)
     )
@@ -165,7 +167,7 @@ def train_phases(
 
     The start of a phase counts as a candidate. A step whose loss or gradient is not finite is
     skipped and counted. Gradients are clipped element by element. Each phase draws from a stream of
-    its own of ``seed``, so that its batches do not hang on how long the phases before it took.
+    its own of ``seed``, so that its batches do not depend on the length of the phases before it.
 
     Where `SKIPS_ALLOWED` steps in a row are not finite, or a loss raises `DivergenceError`, the
     phase returns to its best parameters and goes on with half the step size and new moments, at
@@ -180,10 +182,9 @@ def train_phases(
     phases : Sequence[Phase]
         In their order; names differ.
     seed : int
-        Of the batches.
+        Seed of the batches.
     context : FitContext
-        Where the checkpoint is kept, if anywhere, whether to stop (asked before every batch), whom
-        to tell after every epoch.
+        Folders of checkpoints, stop request (polled before every batch), and progress callback.
     folder_index : int, default 0
         Which of ``context.checkpoint_folders`` is this member's, where several train one after the
         other.
@@ -232,11 +233,12 @@ class PhaseTraining:
     (``state``), the best of them, Adam's moments and the random generator.
     """
 
-    phases: Sequence[Phase]
-    seed: int
-    context: FitContext
-    folder_index: int
-    checkpoint_seconds: float
+    phases: Sequence[Phase]  # phases of the training, in order
+    seed: int  # seed of its random numbers
+    context: FitContext  # checkpoints, stop request and progress
+    folder_index: int  # index of its folder of checkpoints in the context
+    checkpoint_seconds: float  # shortest time between two checkpoints [s]
+    # folders in which the checkpoint is kept: the member's own and those of its twins
     folders: Sequence[Path]
 
     def __post_init__(self) -> None:
@@ -251,7 +253,7 @@ class PhaseTraining:
         return self.records[-1]
 
     def _begin(self, position: int) -> None:
-        """Set the state to the start of a phase, or to the end of all phases."""
+        """Set the state to the start of the phase with this index, or to the end of all phases."""
         self.position = position
         self.best = _copies(self.state)
         if position == len(self.phases):
@@ -271,6 +273,7 @@ class PhaseTraining:
         self.adam = self._new_adam()
 
     def _new_adam(self) -> Adam:
+        """Adam for the parameters that the current phase learns, without moments yet."""
         return Adam(self.learning.values(), self._step_size(), self.phase.settings.weight_decay)
 
     def _step_size(self) -> float:
@@ -314,8 +317,8 @@ class PhaseTraining:
             self._save_now_and_then(self.position == len(self.phases))
 
     def _train_epoch(self, started: float) -> None:
-        """One pass over the batches, then the validation; an epoch that is stopped leaves no trace
-        but the checkpoint before it.
+        """Train on all batches of an epoch, then validate; an epoch that is stopped is undone, so
+        that the checkpoint before it stays.
         """
         phase = self.phase
         settings = self.phase.settings
@@ -366,8 +369,8 @@ class PhaseTraining:
         self.current.interrupted = True
 
     def _step(self, batch: Any, place: str) -> float | None:
-        """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in
-        which case nothing is changed.
+        """Take one step of AdamW on a batch; returns the loss, or None if it or its gradient is not
+        finite, in which case nothing is changed.
         """
         self.adam.zero_grad()
         now = self.current
@@ -416,7 +419,7 @@ class PhaseTraining:
         self.adam = self._new_adam()
 
     def _validate(self) -> float:
-        """The validation loss; the parameters are kept if it is the lowest so far."""
+        """Compute the validation loss, and store the parameters if it is the lowest so far."""
         with torch.no_grad():
             loss = float(self.phase.validation())
         if loss < self.current.best_loss:
@@ -426,7 +429,7 @@ class PhaseTraining:
         return loss
 
     def _checkpoint(self) -> Checkpoint:
-        """The state as it stands, copied."""
+        """A checkpoint with copies of the present state."""
         finished = self.position == len(self.phases)
         epoch = sum(record.epochs for record in self.records)
         values = {
@@ -478,7 +481,7 @@ class PhaseTraining:
 
 
 def _is_of(checkpoint: Checkpoint, phases: Sequence[Phase], state: Mapping[str, Tensor]) -> bool:
-    """Whether a checkpoint has the names of these phases and the shapes of this state."""
+    """Whether a checkpoint is of these phases and of tensors with the shapes of ``state``."""
     names = [record["name"] for record in checkpoint.values.get("phases", ())]
     phase_names = [phase.name for phase in phases]
     shapes = {name: value.shape for name, value in _tensors_below(checkpoint, "best.").items()}
@@ -523,7 +526,9 @@ def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator)
 
 
 def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:
-    """Parameters and buffers of all phases, each once, under the first phase that has it."""
+    """Parameters and buffers of all phases by name, each once, under the first phase that has
+    it.
+    """
     state: dict[str, Tensor] = {}
     collected_ids: set[int] = set()
     for position, phase in enumerate(phases):

@@ -42,7 +42,7 @@ from vehest.training.members import (
 )
 from vehest.training.supervised_settings import SupervisedSettings
 
-BATCHES = 64  # that compiled networks take before a training looks whether it should stop
+BATCHES = 64  # batches of compiled networks between two checks whether a training should stop
 
 
 def train_members(
@@ -108,17 +108,17 @@ def train_members(
 
 @dataclass(eq=False)
 class _Member:
-    """Best weights, losses and random numbers of one member."""
+    """Best weights, losses and random numbers of one member, over all batches of a training."""
 
     best: Tensor  # weights with the lowest validation loss so far, (K,)
-    generator: torch.Generator  # of the order of windows, and of seeds of dropout
+    generator: torch.Generator  # random generator of the order of windows, and of seeds of dropout
     best_loss: float = math.inf  # validation loss of the best weights
-    best_epoch: int = 0  # from 1; 0: no epoch was better than the start
-    halvings: int = 0  # of the step size, one at each divergence
+    best_epoch: int = 0  # number of the best epoch, from 1; 0: no epoch was better than the start
+    halvings: int = 0  # number of halvings of the step size, one at each divergence
     returned_at: int = 0  # epoch of the last divergence
     has_diverged: bool = False  # whether the smallest step size diverged too
-    train_loss: list[float] = field(default_factory=list)
-    validation_loss: list[float] = field(default_factory=list)
+    train_loss: list[float] = field(default_factory=list)  # training loss of each epoch [m²/s²]
+    validation_loss: list[float] = field(default_factory=list)  # after each epoch [m²/s²]
 
     def patience_start(self) -> int:
         """Epoch from which the patience counts."""
@@ -159,7 +159,7 @@ class _Member:
         return state
 
     def record(self, seconds: float, is_interrupted: bool) -> FitRecord:
-        """The record of the fit, which took ``seconds`` of wall time."""
+        """The record of the member's fit, which took ``seconds`` of wall time."""
         metrics = {
             "best_epoch": self.best_epoch,
             "best_validation_loss": min(
@@ -184,9 +184,9 @@ class MemberBatch:
     fixed : Mapping[str, Tensor]
         Buffers, and parameters that are not trained, (M, ...).
     generators : Sequence[torch.Generator]
-        Random numbers of each member.
+        Random generator of each member.
     step_size : float
-        Of Adam.
+        Step size of Adam.
     """
 
     def __init__(
@@ -210,7 +210,9 @@ class MemberBatch:
             self.adam.state[self.weights] = state
 
     def rows(self, rows: Tensor | int) -> dict[str, Tensor]:
-        """Copies of weights, average and moments of some members; Adam's step is that of all."""
+        """Copies of weights, average and moments of the members with these indices, by name as in
+        ``state``; Adam's step is that of all.
+        """
         state = {"parameters": self.weights.detach(), **self.adam.state.get(self.weights, {})}
         if self.average is not None:
             state["average"] = self.average
@@ -237,7 +239,7 @@ class MemberBatch:
         starts : Tensor
             First rows of windows, (M, B).
         seeds : Sequence[int], default ()
-            Of random layers, one a member.
+            Seed of each member for layers that draw random numbers.
 
         Returns
         -------
@@ -255,7 +257,7 @@ class MemberBatch:
         )
 
     def step(self, data: _Prepared, windows: Tensor) -> Tensor:
-        """One step of Adam on one batch.
+        """Take one step of Adam on one batch.
 
         The loss of a member is its mean squared error; losses are added over members, so that each
         row of the gradient is that of one member. Parameters are constrained afterwards, then
@@ -285,7 +287,7 @@ class MemberBatch:
         return losses.detach().double() * windows.shape[1]
 
     def descend(self, data: _Prepared, windows: Tensor) -> Tensor:
-        """Steps on several batches by compiled code; arguments and result are those of `step`.
+        """Take steps on several batches by compiled code; arguments and result are those of `step`.
 
         Bounds of parameters are found by constraining rows of -∞ and ∞ once. Adam's moments and the
         average are changed in place.
@@ -352,12 +354,12 @@ class MemberTraining:
         Finished epochs of the active members.
     """
 
-    networks: Sequence[nn.Module]
-    seeds: Sequence[int]
-    train_windows: WindowSet
-    validation_windows: WindowSet
-    settings: SupervisedSettings
-    context: FitContext
+    networks: Sequence[nn.Module]  # networks of the members
+    seeds: Sequence[int]  # seed of each member
+    train_windows: WindowSet  # windows to learn from
+    validation_windows: WindowSet  # windows for early stopping
+    settings: SupervisedSettings  # settings of the training
+    context: FitContext  # checkpoints, stop request and progress
 
     def __post_init__(self) -> None:
         """Prepare both window sets, and activate all members with the networks' present weights."""
@@ -380,7 +382,7 @@ class MemberTraining:
         self._activate(list(range(len(self.members))), {"parameters": weights})
 
     def _activate(self, members: list[int], state: dict[str, Tensor]) -> None:
-        """Train these members from now on, from a state as `MemberBatch` receives it."""
+        """Make these members the active batch, from a ``state`` as of `MemberBatch`."""
         self.active = members
         # active members never diverged, or there is a single one
         halvings = self.members[members[0]].halvings if members else 0
@@ -407,7 +409,7 @@ class MemberTraining:
         self._activate([member], state or {"parameters": self.members[member].best.unsqueeze(0)})
 
     def train_epoch(self) -> None:
-        """One epoch of training windows, then the validation."""
+        """Train the active members for one epoch, then validate them."""
         before = self._checkpoints()
         n_windows = self._epoch_windows()
         order = torch.stack(
@@ -430,7 +432,7 @@ class MemberTraining:
         self._judge(total / n_windows)
 
     def _epoch_windows(self) -> int:
-        """Training windows of an epoch."""
+        """Number of training windows in an epoch."""
         n_windows = self.settings.epoch_steps * self.settings.batch_size
         return min(n_windows or len(self.train), len(self.train))
 
@@ -498,8 +500,8 @@ class MemberTraining:
         return False
 
     def _checkpoints(self) -> list[Checkpoint]:
-        """The state of every member, each by itself, so that any of them can go on without the
-        others.
+        """A checkpoint of each member by itself, finished ones included, so that any of them can
+        continue without the others.
         """
         row_of = {index: row for row, index in enumerate(self.active)}
         checkpoints = []
@@ -577,7 +579,7 @@ class MemberTraining:
 
 
 def _stacked(states: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Rows of members that go on together; Adam's step is that of all."""
+    """Stack the states of members that continue together, by name; Adam's step is that of all."""
     rows = {name: torch.stack([state[name] for state in states]) for name in states[0]}
     return rows | ({"step": states[0]["step"]} if "step" in rows else {})
 

@@ -31,15 +31,15 @@ from vehest.training.sequences import Phase, PhaseSettings
 class Drive(NamedTuple):
     """An uninterrupted drive, sampled, or several of one length."""
 
-    states: Tensor  # true ones, (..., T, n)
-    inputs: Tensor  # (..., T, p)
-    measurements: Tensor  # (..., T, m); NaN where nothing was measured
+    states: Tensor  # true states, (..., T, n)
+    inputs: Tensor  # inputs of the model, (..., T, p)
+    measurements: Tensor  # measurements of the filter, (..., T, m); NaN: not measured
 
 
 @dataclass(frozen=True)
 class ThroughFilterSettings(Group):
-    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors'
-    code).
+    """Settings of the training of a filter's model (Węgrzynowski et al. 2024, Section IV-A, and its
+    authors' code).
     """
 
     group = "training"
@@ -71,12 +71,14 @@ class ThroughFilterSettings(Group):
         "lengths of shorter sequences to begin with, such as [100, 250], each for "
         "curriculum_epochs",
     )
-    curriculum_epochs: int = setting(100, "see curriculum", least=1)
+    curriculum_epochs: int = setting(100, "epochs with each length of curriculum", least=1)
     truncate_steps: int = setting(
         0, "samples that gradients reach back; 0: to the start of the sequence", least=0
     )
     validation_steps: int = setting(1000, "samples of a validation sequence", least=1)
-    validation_drop_steps: int = setting(200, "first samples of it that do not count", least=0)
+    validation_drop_steps: int = setting(
+        200, "first samples of a validation sequence that do not count", least=0
+    )
     start_spread: float = setting(
         0.2,
         "by how much the last state (friction) is off at the start of a training sequence, at "
@@ -124,9 +126,9 @@ class Weights(NamedTuple):
     and when judging epochs.
     """
 
-    one_step: Tensor
-    training: Tensor
-    validation: Tensor
+    one_step: Tensor  # weights of the one-step prediction, (n,)
+    training: Tensor  # weights of the estimate through the filter, (n,)
+    validation: Tensor  # weights of the estimate when epochs are judged, (n,)
 
 
 def one_step_phase(
@@ -210,15 +212,16 @@ def filter_phases(
     train, validation : Sequence[Drive]
         Drives of any length.
     weights : Weights
-        Of the squared errors of states.
+        Weights of the squared errors of states.
     settings : ThroughFilterSettings
         Sequences, curriculum, mirroring, likelihood.
     phase_settings : PhaseSettings
-        Of each phase; epochs of the curriculum's phases are ``settings.curriculum_epochs``.
+        Settings of each phase; epochs of the curriculum's phases are
+        ``settings.curriculum_epochs``.
     trainable : Callable[[str], bool]
         Which parameters learn, by name.
     name : str
-        Of the last phase; those of the curriculum append their length.
+        Name of the last phase; to those of the curriculum their length is appended.
 
     Returns
     -------
@@ -327,7 +330,9 @@ def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
 
 
 def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> Drive:
-    """As many sequences of each drive as fit into it, each at a random place.
+    """Cut as many sequences of ``steps`` samples from each drive as fit into it, each at a random
+    place.
+
 
     They may overlap. Raises `DataError` where no drive is long enough.
     """
@@ -355,12 +360,16 @@ def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
 
 
 def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
-    """Which of so many are mirrored, (count, 1)."""
+    """Random mask (count, 1) of the sequences or pairs that are mirrored, with the probability
+    ``share`` each.
+    """
     return torch.rand(count, 1, generator=generator) < share
 
 
 def _pairs(drives: Sequence[Drive]) -> list[Tensor]:
-    """States, inputs, and states one sample later."""
+    """All pairs of consecutive samples of drives: states (N, n), inputs (N, p), and states one
+    sample later (N, n).
+    """
     pairs = [(drive.states[:-1], drive.inputs[:-1], drive.states[1:]) for drive in drives]
     return [torch.cat(parts) for parts in zip(*pairs, strict=True)]
 

@@ -20,9 +20,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
-OUTLIER = 8.0  # robust standard deviations
-# of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no
-# noise
+OUTLIER = 8.0  # robust standard deviations of a residual beyond which its row is left out
+# smallest standard deviation of a channel's innovation, over that of the channel; it keeps S
+# regular where a simulation has no noise
 MIN_DEVIATION = 1e-7
 # smallest and largest noise at a speed over that of all speeds
 NOISE_FACTORS = (0.2, 5.0)
@@ -31,7 +31,7 @@ ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
 
 @dataclass(frozen=True, eq=False)
 class Autoregression:
-    """A fitted vector autoregression."""
+    """A fitted vector autoregression of C channels; predicts a sample from the p before it."""
 
     constant: FloatArray  # c, (C,)
     coefficients: FloatArray  # A₁ to A_p, (p, C, C)
@@ -39,7 +39,7 @@ class Autoregression:
 
     @property
     def order(self) -> int:
-        """p."""
+        """p, the number of former samples that a prediction uses."""
         return len(self.coefficients)
 
     def innovations(self, samples: FloatArray) -> FloatArray:
@@ -58,9 +58,8 @@ class Autoregression:
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows of unbroken segments, (T, C) each.
-
-    Keep that of least BIC; raises `DataError`.
+    """Fit orders 1 to ``max_order`` to the same rows of unbroken segments, and return the model of
+    the order with the least BIC.
 
     Two passes find outliers: rows whose residual exceeds `OUTLIER` robust standard deviations in
     any channel are left out, unless they are 2 % or more. Channels are standardised first.
@@ -161,18 +160,19 @@ def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) ->
 def learn_noise_levels(
     innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
+    """Root mean square of innovations as a function of speed, relative to their standard deviation
+    over all speeds.
 
     Parameters
     ----------
     innovations : array
         (T, C); rows that are not finite are left out.
     covariance : array
-        Of all innovations, (C, C), of which the diagonal counts.
+        Covariance of all innovations, (C, C); only its diagonal is used.
     speed : array
-        (T,), of which the size counts.
+        Speed of the car, (T,), in the unit of its channel; only its absolute value is used.
     n_levels : int
-        L.
+        Number L of speeds.
 
     Returns
     -------

@@ -47,41 +47,41 @@ from vehest.trust.tyre_check import TyreCheck
 LEVELS = (0.5, 0.68, 0.9, 0.95)  # coverages, for each of which a band has a factor
 CHANNEL_LEVEL = 0.9  # coverage of the channels band_vy and band_sideslip
 
-MIN_RANGES = 10  # ranges, from which on each is a block
-TURN_YAW_RATE = 0.05  # rad/s, above which a car turns
+MIN_RANGES = 10  # validation ranges, from which on each is a block; with fewer, each turn is one
+TURN_YAW_RATE = 0.05  # rad/s, at which a turn, and with it a new block, begins
 MIN_BLOCK_SECONDS = 2.0  # s; a turn that starts sooner after the last one belongs to the same block
 
 DOMAIN_QUANTILE = 0.999  # quantile of a term's size in training, beyond which bands widen
 OTHER_VEHICLE = 2.0  # factor by which a band is wider on another car or tyre
 LOWEST_SPEED = 1.0  # m/s, below which β is not resolved
-MIN_RELATIVE_SCALE = 0.1  # of the root mean square error in training: the scale's floor
-N_FITS = 20  # of the scale, each with the weights that the last one gives
+MIN_RELATIVE_SCALE = 0.1  # smallest scale over the root mean square error in training
+N_FITS = 20  # iterations of the scale's reweighted least squares, at most
 
-COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")
+COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")  # input channels of which terms are formed
 TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
 """Terms of s²: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over
 vx². ``variance`` is P.
 """
 
-MAX_FACTOR = 1e6  # of factors and floors: beyond it a band says nothing
+MAX_FACTOR = 1e6  # largest factor and floor; beyond it a band says nothing
 MIN_TERM = 1e-30  # smallest size of a term in training that is not 0, in a file
 MAX_TERM = 1e12  # largest size or weight of a term, in a file
-FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
+FIRST_FEATURE = TERMS.index("vx")  # index of the first term that has a domain
 HEAD_LENGTH = 7  # numbers before the weights in a `PackedBands`
 
+# kind of blocks of dependent scores: ranges, or segments from turn to turn
 Blocks = Literal["range", "turn"]
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """The band of one quantity."""
+    """Calibration of the band of one quantity, v or β: scale s and factors q."""
 
     # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
     weights: dict[str, float]
-    floor: float  # s is never below [m/s, or rad]
-    factors: tuple[float, ...]  # q of each level
-    # of each level, whether there are too few blocks for it (`pooled_quantile`)
-    beyond: tuple[bool, ...]
+    floor: float  # smallest s [m/s, or rad]
+    factors: tuple[float, ...]  # q of each level, in the order of `LEVELS`
+    beyond: tuple[bool, ...]  # whether there are too few blocks for each level (`pooled_quantile`)
     effective_blocks: float  # Kish's effective number of blocks, by the squared scores
 
     def __post_init__(self) -> None:
@@ -96,8 +96,9 @@ class Quantity:
         check_number("floor", self.floor, math.ulp(0.0), MAX_FACTOR)
         check_number("effective_blocks", self.effective_blocks, 0.0)
 
-    def beside(self, level: float) -> FloatArray:
-        """Half widths of all `LEVELS` over that of one, (L,).
+    def ratios_to(self, level: float) -> FloatArray:
+        """Half widths of all `LEVELS` divided by that of one level, (L,), which turns a band of
+        that level into bands of the others.
 
         They are ones where the factor of that level is 0. Raises `ValueError`: the level is none of
         `LEVELS`.
@@ -109,24 +110,26 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Bands:
-    """Half widths of v and β of one model."""
+    """Calibrated bands of v and β of one model, and the data that they were calibrated on."""
 
-    # that were driven where it was calibrated; none: a new car for each drive, as any car is to the
-    # model
+    # names of the vehicles that were driven where it was calibrated; none: a new car for each
+    # drive, as any car is to the model
     vehicles: tuple[str, ...]
-    datasets: tuple[str, ...]  # whose recordings these are
-    scaled_on: tuple[str, ...]  # ranges that gave scale and domain
-    calibrated_on: tuple[str, ...]  # ranges that gave the factors
-    blocks: Blocks  # what a block is: a ``range``, or a stretch from ``turn`` to turn
-    n_blocks: int  # how many there are
-    seconds: float  # that were calibrated on [s]
-    channels: tuple[str, ...]  # that the model reads, the columns of its rows
+    datasets: tuple[str, ...]  # data sets of the recordings that gave the factors
+    scaled_on: tuple[str, ...]  # names of the ranges that gave scale and domain
+    calibrated_on: tuple[str, ...]  # names of the ranges that gave the factors
+    blocks: Blocks  # kind of the blocks: a ``range``, or a segment from ``turn`` to turn
+    n_blocks: int  # number of blocks of the validation
+    seconds: float  # duration of the samples that gave the factors [s]
+    channels: tuple[str, ...]  # channels that the model reads, in the order of its rows' columns
     horizon_steps: int  # sampling intervals that its estimate lies ahead of the sample
-    largest: dict[str, float]  # term -> the 99.9th percentile of its size in training
-    vy: Quantity  # the band of v
-    sideslip: Quantity  # the band of β
+    # term -> the 99.9th percentile of its size in training, in the term's unit, not squared
+    largest: dict[str, float]
+    vy: Quantity  # band of v
+    sideslip: Quantity  # band of β
     cars: tuple[CarValues, ...] = ()  # values of the vehicles, as far as their data sets have any
-    tyre_check: TyreCheck | None = None  # of the estimator's tyre model; None: it has none
+    # tyre check of the estimator's tyre model; None: it has none
+    tyre_check: TyreCheck | None = None
 
     def __post_init__(self) -> None:
         """Raise `DataError` for unknown channels or numbers out of range."""
@@ -137,11 +140,12 @@ class Bands:
         check_number("bands.horizon_steps", self.horizon_steps, 0)
 
     def are_of(self, vehicle: str, car: CarValues = UNKNOWN_CAR) -> bool:
-        """Whether they apply to a vehicle, by its name and values, as they are.
+        """Whether the bands apply to a vehicle without the factor `OTHER_VEHICLE`, by its name and
+        values.
 
-        They do if they are for any car. They do not where `difference_to` finds one. Otherwise
-        names decide. Where a side has no name, they apply to the one car that they were calibrated
-        on, and not to one beside several.
+        They do if they are for any car. They do not where `difference_to` finds a difference.
+        Otherwise names decide. Where a side has no name, they apply if they were calibrated on one
+        car, and not if on several.
         """
         if not self.vehicles:
             return True
@@ -152,17 +156,17 @@ class Bands:
         return len(self.vehicles) == 1 and UNNAMED_VEHICLE in (vehicle, *self.vehicles)
 
     def difference_to(self, car: CarValues) -> str:
-        """Why a car is none of those that they were calibrated on, by its values; else empty."""
+        """Text of the first value in which a car differs where it differs from every car that the
+        bands were calibrated on; empty if it agrees with one, or none has values.
+        """
         differences = [car.difference_to(calibrated_car) for calibrated_car in self.cars]
         return differences[0] if differences and all(differences) else ""
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
-        """Arguments of `band_rows` for `CHANNEL_LEVEL`.
+        """The last two inputs of `band_rows`, for `CHANNEL_LEVEL`.
 
-        ``elsewhere``: the car or its tyres are others than those calibrated on.
-
-        The factor 2 of another vehicle multiplies both factors of the level; floors and weights
-        stay.
+        With ``elsewhere``, the car or its tyres are others than those calibrated on, and
+        `OTHER_VEHICLE` multiplies both factors of the level; floors and weights stay.
         """
         level_place = LEVELS.index(CHANNEL_LEVEL)
         wider = OTHER_VEHICLE if elsewhere else 1.0
@@ -224,9 +228,9 @@ def _check_terms(name_of_terms: str, numbers: Mapping[str, float], smallest: flo
 
 
 class PackedBands(NamedTuple):
-    """A level's band as `band_rows` takes it."""
+    """The bands of v and β at one level, as arrays for `band_rows`."""
 
-    # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
+    # index of each of `COLUMNS` among the model's channels, -1 where it does not read it, (5,)
     columns: NDArray[np.int64]
     # factors, squared floors of v and β, lowest speed, weights of the tyre check for v and β,
     # weights of `TERMS` for v and β, their largest sizes, (31,)
@@ -331,11 +335,11 @@ def with_bands(
 def band_inputs(
     estimate: Estimate, measured: Recording, channels: Sequence[str], horizon_steps: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (T, C), estimates (T,) and their variances (T,) for bands; raises `DataError`.
+    """Inputs of `band_rows` for each estimate: rows (T, C), v (T,) [m/s] and its variance (T,)
+    [m²/s²], NaN where the method has none.
 
-    Variances are NaN where the method has none.
-
-    A row is the last sample that the estimate was made of, so that online they are the same.
+    A row is the last sample that the estimate uses, ``horizon_steps`` before it, so that bands are
+    the same online. Raises `DataError` where the recording lacks a channel.
     """
     if len(estimate) != len(measured):
         raise DataError(
@@ -359,7 +363,7 @@ def tyre_error_of(check: TyreCheck | None, estimate: Estimate) -> FloatArray:
 
 
 def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
-    """Column of each of `COLUMNS` among channels, -1 where it is not there, (5,)."""
+    """Index of each of `COLUMNS` among the channels, -1 where it is not there, (5,)."""
     return np.array(
         [channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64
     )
@@ -374,13 +378,14 @@ class Piece:
 
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]
-    variance: FloatArray  # of its error, (T,) [m²/s²], NaN where there is none
-    # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, or nothing is to be
-    # learnt from
+    variance: FloatArray  # variance of the estimate's error, (T,) [m²/s²], NaN where there is none
+    # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, which leaves the sample
+    # out of the calibration
     errors: FloatArray
     yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
-    rate_hz: float  # of the samples [Hz]
-    tyre_error: FloatArray | None = None  # of the tyre check, (T,) [m²/s²]; None without one
+    rate_hz: float  # sampling rate [Hz]
+    # squared error by the tyre check, (T,) [m²/s²]; None without one
+    tyre_error: FloatArray | None = None
 
     @property
     def has_error(self) -> NDArray[np.bool_]:
@@ -391,13 +396,10 @@ class Piece:
 def calibrated(
     training: Sequence[Piece], validation: Sequence[Piece], channels: tuple[str, ...], **origin: Any
 ) -> Bands:
-    """Bands of a model.
+    """Calibrate the bands of a model.
 
-    Scale and domain from training ranges, factors from validation ranges that it has not learnt
-    from.
-
-    ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model
-    and its recordings. Raises `DataError` where one of the two has no sample whose error is known.
+    Training ranges give scale and domain; validation ranges, which the model was not trained on,
+    give the factors. Raises `DataError` where one of the two has no sample whose error is known.
 
     Steps: terms of all training samples; their 99.9th percentiles (domain); scales by
     `fitted_scale`; blocks of the validation; factors by `pooled_quantile` of |error|/(s w). With a
@@ -409,7 +411,7 @@ def calibrated(
     training, validation : sequence of Piece
         Ranges with estimates; samples without an error are left out.
     channels : tuple of str
-        Columns of the rows.
+        Channels of the rows, in the order of their columns.
     **origin : any
         Fields of `Bands` that describe model and recordings.
     """
@@ -525,9 +527,9 @@ def _with_factors(scale: Quantity, scores: FloatArray, blocks: NDArray[np.int64]
 
 
 def effective_blocks(sums: FloatArray) -> float:
-    """How many blocks of equal loss would be spread out like these, (B,).
+    """Kish's effective number of blocks, (Σ s)²/Σ s², of the sums s of squared scores of B blocks.
 
-    (Σ s)² / Σ s², 1 where a single block holds all of it.
+    It is B where all sums are equal, and 1 where a single block has all of the loss.
 
     Source: Kish, Survey Sampling, 1965, Section 11.7, for weights.
     """
@@ -536,18 +538,23 @@ def effective_blocks(sums: FloatArray) -> float:
 
 
 def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, float]:
-    """Weights, none negative, and floor of a scale.
-
-    s² = Σ c_j f_j², as squared errors are spread.
+    """Fit the scale s² = Σ c_j f_j², with c_j ≥ 0, to squared errors.
 
     Iterated least squares, each sample weighted by 1/s⁴ of the last fit: the quasi-likelihood of
     squares whose standard deviation is proportional to their mean, as that of Gaussian errors is
     (McCullagh & Nelder 1989, Section 9.2).
 
+    Parameters
+    ----------
+    terms : array
+        f, (N, J), not squared.
+    errors : array
+        Errors of v [m/s] or β [rad], (N,).
+
     Returns
     -------
     tuple
-        c, (J,), of terms f, (N, J), and errors (N,); and the floor of s.
+        Weights c, (J,), and the smallest value of s, in the unit of the errors.
     """
     squares = np.square(terms)
     targets = np.square(errors)
@@ -576,7 +583,8 @@ def pooled_quantile(
 ) -> tuple[float, bool]:
     """The level's quantile of scores pooled over K blocks of equal weight.
 
-    1/(n + 1) of the weight is at infinity.
+    It turns scores |error|/(s w) of the validation into the factor q of a level. 1/(n + 1) of the
+    weight is at infinity.
 
     n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in
     blocks of m on average, ρ the intraclass correlation of "below the quantile". If scores of a
@@ -588,8 +596,8 @@ def pooled_quantile(
     Returns
     -------
     tuple
-        The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small
-        for the level, where by rule it is the largest score times 1 + 1/n.
+        The quantile of scores (N,), none negative, in blocks whose labels are (N,); and whether n
+        is too small for the level, in which case the first is the largest score times 1 + 1/n.
 
     Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4
     (design effect).
@@ -611,7 +619,8 @@ def pooled_quantile(
 
 
 def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> float:
-    """Intraclass correlation of values (N,) in groups (N,), by one-way analysis of variance.
+    """Intraclass correlation of values (N,) with group labels (N,), by one-way analysis of
+    variance.
 
     1 where a group's values are equal.
 
@@ -637,11 +646,24 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
 def block_labels(
     yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float
 ) -> tuple[list[NDArray[np.int64]], Blocks]:
-    """Block that each sample of some ranges belongs to, counted through.
+    """Label the samples of ranges with the block that they belong to.
 
-    A range each if there are 10, else from turn to turn.
+    From `MIN_RANGES` ranges on each range is a block, else each segment from turn to turn; then a
+    range without yaw rate is one block.
 
-    A range without yaw rate [rad/s] is one block.
+    Parameters
+    ----------
+    yaw_rates : sequence of array or None
+        Yaw rate of each range, (T,) [rad/s].
+    lengths : sequence of int
+        Number of samples of each range.
+    rate_hz : float
+        Sampling rate [Hz].
+
+    Returns
+    -------
+    tuple
+        Labels of each range's samples, (T,), counted on from range to range; and what a block is.
     """
     labels = []
     count = 0

@@ -22,18 +22,19 @@ from vehest.trust.health import learn_health
 from vehest.trust.record import About, Trust
 from vehest.trust.tyre_check import tyre_check_of
 
-SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
+SKIP_SECONDS = 1.5  # s at the start of each range that are not scored, as in evaluations
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """A range to learn from, with the part of its recording before it."""
+class CalibrationRange:
+    """A range of a recording that calibrates a model, with the part of the recording before it."""
 
-    # at the model's rate, with references, and with a warm-up before the range where it has one
+    # recording at the model's rate, with references, and with a warm-up before the range where it
+    # has one
     recording: Recording
-    start: float  # of the range [s]
-    dataset: str  # of the recording; may be empty
-    name: str  # for people
+    start: float  # time at which the range starts [s]
+    dataset: str  # data set of the recording; may be empty
+    name: str  # name of the range in trust.yaml and in messages
 
     @property
     def range(self) -> Recording:
@@ -42,9 +43,12 @@ class Stretch:
 
 
 def learn_trust(
-    estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = ""
+    estimator: Estimator,
+    train: Sequence[CalibrationRange],
+    validation: Sequence[CalibrationRange],
+    variant: str = "",
 ) -> Trust:
-    """Bands, limits of samples and health of a fitted estimator.
+    """Calibrate bands, limits of plausible samples and health of a fitted estimator.
 
     Training ranges give scales, limits and relations between channels; validation ranges give
     factors of bands and, together with the others, thresholds of health.
@@ -56,7 +60,7 @@ def learn_trust(
     ----------
     estimator : Estimator
         Fitted.
-    train, validation : sequence of Stretch
+    train, validation : sequence of CalibrationRange
         Ranges at the estimator's rate.
     variant : str
         The paper's name of the configuration, for people.
@@ -103,8 +107,8 @@ def learn_trust(
     return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
 
 
-def pieces_of(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
-    """Ranges after their starts with the model's estimates on them.
+def pieces_of(estimator: Estimator, stretches: Sequence[CalibrationRange]) -> list[Piece]:
+    """Estimate ranges with a model, and return inputs, estimates and errors for `calibrated`.
 
     Raises `DataError` where a recording lacks a channel.
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from vehest.trust.guard import BRIDGED_SECONDS
 
-# of stamps that do not advance or are uneven, after which the clock is not trusted
+# s of stamps that do not advance or are uneven, after which the clock is not trusted
 FAULT_SECONDS = 0.2
-RECOVERY_SECONDS = 1.0  # of even stamps, after which it is trusted again
-RESET_SECONDS = 1.0  # by which a stamp lies before the last one where the clock has been set back
+RECOVERY_SECONDS = 1.0  # s of even stamps after which the clock is trusted again
+RESET_SECONDS = 1.0  # s by which a stamp lies before the last one where the clock was set back
 MIN_ADVANCE = 0.5  # sampling intervals; a stamp that is ahead by less repeats the last sample
 EVEN_INTERVALS = (0.6, 1.6)  # sampling intervals from one stamp to the next that jitter explains
 RATE_INTERVALS = 20  # first intervals, whose median is compared with the expected interval
@@ -30,16 +30,13 @@ CLOCK_JUMPED = 34  # time stamps jump
 CLOCK_UNEVEN = 35  # time stamps are unevenly spaced
 """Kinds of reasons that follow from time stamps (`vehest.trust.health.REASONS`)."""
 
-REPEATED = -1
-STOPPED = -2
-"""Verdicts on a sample that is not new.
-
-Pass it over; count it as missing, since the clock has stopped.
-"""
+REPEATED = -1  # the sample repeats the last one and is skipped
+STOPPED = -2  # the clock has stopped, and the sample counts as missing
+"""Results of `SampleClock.missing_before` for a sample that is not new."""
 
 
 class SampleClock:
-    """Time stamps of the samples of one drive, in the order of the calls.
+    """Judges the time stamps of the samples of one drive, in the order of the calls.
 
     Parameters
     ----------
@@ -140,14 +137,16 @@ class SampleClock:
         self._recovering = self.recovery_calls
 
     def _recover(self) -> None:
-        """Count an even sample."""
+        """Count an even interval; after ``recovery_calls`` of them the clock is trusted again."""
         self._uneven = max(self._uneven - 1, 0)
         self._recovering = max(self._recovering - 1, 0)
         if self._recovering == 0:
             self.fault = 0
 
     def _warn_of_rate(self, gap: float) -> None:
-        """Warn once where the median of the first intervals is that of another rate."""
+        """Warn once where the median of the first `RATE_INTERVALS` intervals, ``gap`` [s] being the
+        latest, is that of another rate.
+        """
         if len(self._intervals) == RATE_INTERVALS:
             return
         self._intervals.append(gap)

@@ -56,14 +56,15 @@ from vehest.trust.record import Trust
 from vehest.trust.verdict import Monitor, starts_anew
 from vehest.trust.watch import Watch, Watched
 
-NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
-MOTION = ("vx", "yaw_rate", "ay")
+# exceptions of float() for a channel that is missing from a sample or is no number
+NUMBER_ERRORS = (KeyError, TypeError, ValueError, OverflowError)
+MOTION_CHANNELS = ("vx", "yaw_rate", "ay")  # columns of the motion that `Watch` receives
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits calibrated with an estimator, or those of any car.
+    """The guard's limits that were calibrated with an estimator, or else those of any car.
 
-    `DataError` where ``trust`` was calibrated with another one.
+    Raises `DataError` where ``trust`` was calibrated with another estimator.
     """
     if trust is not None:
         trust.check_fit(estimator)
@@ -72,11 +73,13 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
 
 
 class GuardedRun:
-    """An estimator under the contract on a recording, or on its parts to the same bits.
+    """An estimator under the contract on a recording, or on its parts one after another with
+    bitwise the same result.
 
-    Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is
-    neither band nor health of channels. The state of a protocol, ``initial_state``, is that at the
-    first sample; ``elsewhere``: the car or its tyres are others than those that were calibrated on.
+    ``trust`` is the calibration of the fitted estimator; without it, limits are those of any car,
+    and there is neither band nor health of channels. ``initial_state`` is the state at the first
+    sample that a protocol prescribes, quantity -> value [SI]. ``elsewhere``: the car or its tyres
+    are others than those calibrated on.
 
     Attributes
     ----------
@@ -162,9 +165,8 @@ class GuardedRun:
         return self._estimate(verdict)
 
     def _piece(self, start: int) -> int:
-        """Go on from a row up to the next wait or restart, or until the estimator is lost.
-
-        Returns the row to go on with.
+        """Estimate the rows from ``start`` up to the next wait or restart, or until the estimator
+        is lost (`Watch`); returns the row to continue with.
 
         After a loss the next attempt is short at first, so that an estimator that is lost again and
         again takes no quadratic time.
@@ -190,6 +192,10 @@ class GuardedRun:
             reach = min(start + 2 * (reach - start), end)
 
     def _watched(self, start: int, end: int, raw: FloatArray) -> tuple[int, bool]:
+        """Judge raw estimates of the rows ``start`` to ``end`` by the watch and keep what it
+        leaves; returns the end of the rows that were judged, and whether the estimator was lost
+        there.
+        """
         motion = self.motion[start:end]
         motion = np.where(
             np.isnan(motion),
@@ -203,9 +209,10 @@ class GuardedRun:
         return done, watched.lost
 
     def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
-        """The estimator's v after each row of a piece, (T,).
+        """The estimator's v after each of the rows ``start`` to ``end``, before the watch, (T,)
+        [m/s].
 
-        It continues from a state or from the rows before the piece, or begins anew.
+        It continues from ``state`` or from the rows before the piece, ``window``, or begins anew.
         """
         # rows after the last, whose values no estimate at their time depends on
         extra = self.estimator.horizon_steps
@@ -253,9 +260,9 @@ class GuardedRun:
     def _estimated(
         self, piece: Recording, state: Any, initial_state: Mapping[str, float] | None
     ) -> Estimate:
-        """The estimate of a piece from a state, which is updated.
+        """The estimator's result on a piece; an estimator that can continue keeps its last state.
 
-        Where the state is None, it starts from the initial state of a protocol.
+        Where ``state`` is None, it starts from the initial state of a protocol, if there is one.
         """
         estimator = self.estimator
         if not estimator.continues:
@@ -268,9 +275,9 @@ class GuardedRun:
         return estimate
 
     def _estimate(self, verdict: Health) -> Estimate:
-        """The estimate on the recording's clock.
+        """The outputs of all rows as an estimate with the recording's times.
 
-        That after row k holds ``horizon_steps`` samples later, its health at once.
+        The estimate after row k is for ``horizon_steps`` samples later, its health for row k.
         """
         r = self.recording
         horizon = self.estimator.horizon_steps
@@ -332,8 +339,8 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
         (T, 3) [m/s, rad/s, m/s²], bridged values included; NaN where a channel is not read, or was
         not measured while the estimator waits.
     """
-    motion = np.full((len(cleaned.rows), len(MOTION)), np.nan)
-    for column, name in enumerate(MOTION):
+    motion = np.full((len(cleaned.rows), len(MOTION_CHANNELS)), np.nan)
+    for column, name in enumerate(MOTION_CHANNELS):
         if name in channels:
             at = channels.index(name)
             motion[:, column] = np.where(
@@ -348,8 +355,8 @@ class GuardedStepper(Stepper):
     ``trust`` and ``elsewhere`` are as of `GuardedRun`.
 
     Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal
-    anti-aliasing filter first. ``clock`` judges other stamps than those of `step`, such as the
-    frames' that samples are formed from, and whoever passes it takes them.
+    anti-aliasing filter first. A ``clock`` that is passed judges other time stamps than those of
+    `step`, such as those of bus frames, and the caller passes these to it.
 
     Attributes
     ----------
@@ -399,7 +406,8 @@ class GuardedStepper(Stepper):
         self._variance = np.full(1, np.nan)
         self._tyre_error = np.zeros(1)
         self._places = [
-            estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION
+            estimator.channels.index(name) if name in estimator.channels else -1
+            for name in MOTION_CHANNELS
         ]
         self.clock = SampleClock(self.input_rate_hz) if clock is None else clock
         self._judges_samples = clock is None
@@ -453,8 +461,8 @@ class GuardedStepper(Stepper):
         return self.last
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
-        """Take a sample or None as one row at the bus's rate, and step where the front end makes a
-        row of it.
+        """Pass a sample (None: nothing measured) on as one row at the bus's rate, and step if the
+        front end returns a row for the estimator; returns the quantities of the last step.
 
         Channels without a number become NaN one by one, so that one of them does not cost the
         others.
@@ -464,9 +472,9 @@ class GuardedStepper(Stepper):
         if sample is not None:
             try:
                 self._row[0] = [sample[name] for name in self.channels]
-            except NO_NUMBER:
+            except NUMBER_ERRORS:
                 for column, name in enumerate(self.channels):
-                    with suppress(*NO_NUMBER):
+                    with suppress(*NUMBER_ERRORS):
                         self._row[0, column] = sample[name]
         if self.front_end is not None:
             row = self.front_end(self._row)
@@ -475,8 +483,8 @@ class GuardedStepper(Stepper):
         return self.last
 
     def _stepped(self, row: FloatArray) -> dict[str, float]:
-        """Guard, health, estimator, watch, verdict and bands of one row (1, C); returns the
-        quantities.
+        """Process one row (1, C) at the estimator's rate by guard, health, estimator, watch,
+        verdict and bands; returns the quantities as `step` does.
 
         While the clock is not trusted, the row is invalid by the clock's reason from the start.
         """
@@ -518,9 +526,10 @@ class GuardedStepper(Stepper):
         return quantities
 
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float]:
-        """The estimator on a row: v, its own vx and the variance of v's error.
+        """Results of the estimator for a row: v [m/s], its estimate of vx [m/s] and the variance of
+        v's error [m²/s²], NaN where it has none.
 
-        NaN while the guard waits; the estimator starts anew where the guard says so.
+        All are NaN while the guard waits; the estimator starts anew where the guard says so.
         """
         flow = cleaned.flow[0]
         self._extra_quantities = {}

@@ -25,16 +25,16 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import CHANNELS, Channel
 from vehest.data.errors import ConfigurationError
 
-Severity = Literal["mild", "medium", "severe"]
-SEVERITIES: tuple[Severity, ...] = get_args(Severity)
+Severity = Literal["mild", "medium", "severe"]  # severity of a fault, by which its size is chosen
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # severities in ascending order
 
-Sizes = tuple[float, float, float]
+Sizes = tuple[float, float, float]  # sizes of a mild, a medium and a severe fault
 
-DEGREE = math.pi / 180.0
+DEGREE = math.pi / 180.0  # rad
 PIECE_SECONDS = 0.2  # s, length of the pieces in which samples are lost
 LOSS_SECONDS = 0.2  # s until a wheel is locked or spins
-SPIKE_SHARE = 0.02  # of the samples, which are spikes
-HUGE_SHARE = 0.05  # of the samples, which are huge
+SPIKE_SHARE = 0.02  # share of the samples that are spikes
+HUGE_SHARE = 0.05  # share of the samples that are huge
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {
@@ -73,14 +73,15 @@ UNIT_FACTORS: dict[str, Sizes] = {
     "rad/s": (1.0 / math.tau, DEGREE, 1.0 / DEGREE),
     "Pa": (1e-3, 1e-5, 1e5),
 }
-"""Unit -> factors of a wrong one.
+"""Unit of a channel -> factors by which its values are wrong in another unit.
 
-Miles an hour, km/h converted once too often, km/h; ft/s², g for m/s² and the inverse; turns,
-degrees converted once too often, degrees; kPa, bar, and bar converted once too often.
+In the order of the table: miles an hour, km/h converted once too often, km/h; ft/s², g for m/s² and
+the inverse; turns, degrees converted once too often, degrees; kPa, bar, and bar converted once too
+often.
 """
 
 WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
-"""The same of wheels and motor.
+"""Factors of a wrong unit of the angular speeds of wheels and motor.
 
 Turns a second, turns a minute converted once too often, turns a minute.
 """
@@ -90,16 +91,17 @@ Turns a second, turns a minute converted once too often, turns a minute.
 class Fault:
     """A fault of one channel: kind, size and time.
 
-    `ConfigurationError` for one that makes no sense.
+    Raises `ConfigurationError` for a combination that makes no sense.
     """
 
     kind: str  # one of `KINDS`
     channel: str  # never a reference
-    severity: Severity = "medium"  # which of the sizes in this module
-    onset: float = 0.0  # time of its start after the first sample [s]
+    severity: Severity = "medium"  # severity, by which one of the sizes in this module is chosen
+    onset: float = 0.0  # time from the first sample to its start [s]
     duration: float = math.inf  # [s]; ``inf``: to the end
-    seed: int = 0  # of everything that is drawn
-    # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
+    seed: int = 0  # seed of all random draws of the fault
+    # size that replaces the severity's, in the same unit; its sign is kept, that of a severity's
+    # bias, drift or scale is drawn
     size: float | None = None
 
     def __post_init__(self) -> None:
@@ -142,9 +144,9 @@ class Fault:
 
     @property
     def condition(self) -> str:
-        """``bias:ay:mild``.
+        """Name of the fault as a condition of an evaluation, such as ``bias:ay:mild``.
 
-        A given size replaces the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``.
+        A size replaces the severity, and a seed other than 0 is appended: ``bias:ay:0.5:3``.
         """
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
@@ -158,10 +160,9 @@ def is_fault(condition: str) -> bool:
 def applies(kind: str, channel: str) -> bool:
     """Whether a kind of fault makes sense for a channel.
 
-    None for a reference, a wrong sign for channels that have one by convention.
-
-    A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward
-    velocity, which one wheel may measure.
+    A reference has no fault. A wrong sign is for channels whose sign is a convention, a wrong unit
+    for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward velocity, which one
+    wheel may measure.
     """
     channel_range = CHANNELS[channel]
     special = {
@@ -188,13 +189,17 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
     at = SEVERITIES.index(severity)
     sizes = KINDS[kind].sizes
     if sizes is None:
-        return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[channel_range.unit])[at]
+        return (WHEEL_FACTORS if _is_angular_speed(channel) else UNIT_FACTORS[channel_range.unit])[
+            at
+        ]
     if isinstance(sizes, tuple):
         return sizes[at]
     if channel in OFFSETS:
         return sizes * OFFSETS[channel][at]
     return sizes * (
-        OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(channel_range)
+        OFFSETS_OF_SPEED[at]
+        if _is_angular_speed(channel)
+        else OFFSETS_OF_RANGE[at] * _range(channel_range)
     )
 
 
@@ -262,7 +267,8 @@ class FaultedChannel:
     seconds : array
         Times since its onset, (end - first,) [s].
     size : float
-        With a drawn sign for bias, drift and scale, and in rad/s for offsets of wheels and motor.
+        Size of the fault: with a drawn sign for bias, drift and scale unless the fault has a size
+        of its own, and in rad/s for offsets of wheels and motor.
     """
 
     def __init__(
@@ -283,19 +289,21 @@ class FaultedChannel:
         )
         if fault.size is None and fault.kind in ("bias", "drift", "scale"):
             self.size *= float(self.random.choice([-1.0, 1.0]))
-        if isinstance(KINDS[fault.kind].sizes, float) and _turns(fault.channel):
-            self.size *= _reach(values)
+        if isinstance(KINDS[fault.kind].sizes, float) and _is_angular_speed(fault.channel):
+            self.size *= _largest_size(values)
 
     def signs(self) -> FloatArray:
-        """-1 or 1 for each sample."""
+        """Random signs, -1 or 1, one for each sample inside, (end - first,)."""
         return self.random.choice([-1.0, 1.0], len(self.inside))
 
     def share(self) -> NDArray[np.bool_]:
-        """The first samples, a share of the size."""
+        """Mask of the first samples inside, as many as the share ``size``, one at least."""
         return np.arange(len(self.inside)) < max(round(self.size * len(self.inside)), 1)
 
     def drawn(self, share: float, number: int | None = None) -> NDArray[np.bool_]:
-        """A share of single samples, or of a ``number`` of pieces, at least one."""
+        """Random mask that is true for a share of the samples inside, or of ``number`` pieces, one
+        at least.
+        """
         is_chosen = np.zeros(len(self.inside) if number is None else number, np.bool_)
         is_chosen[
             self.random.permutation(len(is_chosen))[: max(round(share * len(is_chosen)), 1)]
@@ -303,14 +311,18 @@ class FaultedChannel:
         return is_chosen
 
     def pieces(self) -> NDArray[np.bool_]:
-        """Samples in pieces of `PIECE_SECONDS`."""
+        """Mask of the samples inside that lie in randomly chosen pieces of `PIECE_SECONDS`; the
+        chosen share of the pieces is ``size``.
+        """
         length = max(round(PIECE_SECONDS * self.rate_hz), 1)
         return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[
             : len(self.inside)
         ]
 
     def earlier(self, samples: int) -> FloatArray:
-        """The channel so many samples before; its first value before that."""
+        """Values that the channel had ``samples`` samples earlier, (end - first,); its first value
+        where the recording begins later.
+        """
         return self.values[np.maximum(np.arange(self.first, self.end) - samples, 0)]
 
 
@@ -322,7 +334,7 @@ def _sample_and_hold(at: FaultedChannel) -> FloatArray:
 
 def _saturation(at: FaultedChannel) -> FloatArray:
     """Clip to a share of the largest size that the channel has while the fault lasts."""
-    limit = at.size * _reach(at.inside)
+    limit = at.size * _largest_size(at.inside)
     return np.clip(at.inside, -limit, limit)
 
 
@@ -334,25 +346,27 @@ def _lost_wheel(at: FaultedChannel) -> FloatArray:
 
 
 class Kind(NamedTuple):
-    """A kind of fault."""
+    """A kind of fault: its sizes and its effect."""
 
-    # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong
-    # unit
+    # mild, medium and severe size; or the factor that multiplies the channel's offsets; None: the
+    # factors of a wrong unit
     sizes: Sizes | float | None
-    size_rule: str  # what a size of one's own must be, a key of `SIZE_RULES`
-    effect: Callable[[FaultedChannel], FloatArray]
+    size_rule: str  # requirement of a size of one's own, a key of `SIZE_RULES`
+    effect: Callable[[FaultedChannel], FloatArray]  # returns the values that replace ``inside``
 
 
+# requirements of a size of one's own, as messages state them
 ANY = "a number other than 0"
-SHARE = "a share above 0, up to 1"
-POSITIVE = "a positive number"
-FACTOR = "a factor from 0 on"
+SHARE = "a share above 0, up to 1"  # requirement of a size that is a share
+POSITIVE = "a positive number"  # requirement of a size that is positive
+FACTOR = "a factor from 0 on"  # requirement of a size that is a factor
 SIZE_RULES: dict[str, Callable[[float], bool]] = {
     ANY: lambda size: math.isfinite(size) and size != 0,
     SHARE: lambda size: 0 < size <= 1,
     POSITIVE: lambda size: 0 < size < math.inf,
     FACTOR: lambda size: 0 <= size < math.inf,
 }
+"""Requirement of a size -> test of it."""
 
 KINDS: dict[str, Kind] = {
     "bias": Kind(1.0, ANY, lambda at: at.inside + at.size),
@@ -398,19 +412,19 @@ KINDS: dict[str, Kind] = {
         (math.nan, 1.5, 0.0), FACTOR, _lost_wheel
     ),  # factor of the speed; NaN: drops out
 }
-"""Kind -> sizes, limits of a size of one's own, effect on the channel while the fault lasts."""
+"""Name of a kind -> its sizes, its rule for a size of one's own, its effect on the channel."""
 
 
-def _turns(channel: str) -> bool:
+def _is_angular_speed(channel: str) -> bool:
     """Whether a channel is the angular speed of a wheel or of the motor."""
     return channel.startswith("wheel_speed") or channel == "motor_speed"
 
 
-def _reach(values: FloatArray) -> float:
-    """Largest finite size of values; 0 where there is none."""
+def _largest_size(values: FloatArray) -> float:
+    """Largest absolute value among finite values; 0 where there is none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def _range(channel: Channel) -> float:
-    """Largest size that a channel may have, in its unit."""
+    """Largest absolute value in the physical range of a channel, in its unit."""
     return max(abs(channel.low), abs(channel.high))

@@ -21,17 +21,17 @@ from vehest.data.recording import HIGHEST_RATE
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
-FILTER_ORDER = 4  # of the Butterworth low-pass
+FILTER_ORDER = 4  # order of the Butterworth low-pass
 CUTOFF = 0.4  # cut-off as a share of the estimator's rate, below its Nyquist frequency
-NOISE_BAND = (0.3, 0.4)  # of the model's rate, where the density of a channel's noise is taken
-TYPICAL_RATE_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
+# band in which the density of a channel's noise is taken, over the model's rate
+NOISE_BAND = (0.3, 0.4)
+TYPICAL_RATE_RATIO = 5  # rate of a bus over that of a model, as 100 to 20 Hz
 SLACK = 1e-9  # relative; within it rates are equal, and a sample is due
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
-    """Channels (T, C) at the model's rate as the filter passes them from a faster bus.
-
-    The bus is `TYPICAL_RATE_RATIO` times as fast; NaN is bridged.
+    """Simulate how channels at the model's rate would arrive through `FrontEnd` from a bus that is
+    `TYPICAL_RATE_RATIO` times as fast, so that limits of health can be learnt for that case.
 
     They are brought to that rate without phase, then filtered causally and thinned out again; the
     filter starts as in a steady signal. What lay above the model's Nyquist frequency is gone in
@@ -142,9 +142,10 @@ class FrontEnd:
         )
 
     def __call__(self, row: FloatArray) -> FloatArray | None:
-        """Take one row, (1, C).
+        """Take one row at the bus's rate, (1, C).
 
-        Returns a row for the estimator where one is due, NaN what was not measured.
+        Returns a row (1, C) for the estimator, with NaN for what was not measured, or None where
+        none is due.
 
         The first row is always due. While the guard waits, the filter forgets its state.
         """

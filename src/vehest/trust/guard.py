@@ -3,7 +3,8 @@
     rows -> Guard -> rows, measured, flow (use, wait, restart)
 
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has
-stood still for longer than it ever did in the estimator's training counts as not measured. Channels
+stood still for twice as long as it ever did in the estimator's training counts as not measured.
+Channels
 that a method can do without become NaN then; the others hold the last value that was accepted, for
 half a second at most. After longer gaps the estimator starts anew when the channels
 are back.
@@ -28,45 +29,48 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number
 
 BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
-PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is accepted
+PERSISTS_SECONDS = 0.1  # a jump is accepted once its new level has lasted this long
 MAX_OVER_TRAINING = 3.0  # times the largest value in training that counts as plausible
-MAX_RUN_SECONDS = 5.0  # s; a channel that stands still for longer in training may do so
-MIN_RUN_SECONDS = 0.3  # s
-STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
-NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
+MAX_RUN_SECONDS = 5.0  # s; a channel that stood still for longer in training has no limit
+MIN_RUN_SECONDS = 0.3  # s, smallest limit of the time for which a channel may stand still
+# largest change of a steering angle that stays where it is, over the largest angle
+STOP_TOLERANCE = 2e-3
+NEAR_STOP = 0.9  # smallest angle at which the steering may be at its stop, over the largest angle
 
-REACHED = {
+CAR_LIMITS = {
     "m/s²": (25.0, 200.0, 6.0),
     "rad/s": (4.0, 15.0, 0.5),
     "rad": (1.0, 15.0, 0.1),
     "m/s": (100.0, 25.0, 2.0),
 }
-"""Unit -> size and change a second that some road car reaches, and change by sensor noise.
+"""Unit -> largest absolute value and largest change a second that some road car reaches, and
+largest change by sensor noise from one sample to the next.
 
-They apply where none was calibrated.
+They apply where no limits were calibrated.
 """
 
-FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
-"""Starts of names whose ranges and changes differ too much between cars.
+CAR_DEPENDENT_PREFIXES = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
+"""Prefixes of channels whose ranges and changes differ too much between cars for `CAR_LIMITS`.
 
-Their limits have to be calibrated.
+Without calibration their limits are those of the channel's table.
 """
 
 STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steering may stand still
 
-ENDLESS = 1e300  # stops of channels that have none
+ENDLESS = 1e300  # absolute value of the stops of channels that have none
 
 MAX_TOP_SPEED = MAX_OVER_TRAINING * CHANNELS["vx"].high  # [m/s] that calibration allows
-TAN_MARGIN = 1.2  # of |v|/max(u, 1 m/s), beyond training
-MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high  # that calibration allows
+TAN_MARGIN = 1.2  # largest |v|/max(u, 1 m/s) over that in training
+# largest limit of |v|/max(u, 1 m/s) that a calibration may have
+MAX_TAN_SIDESLIP = TAN_MARGIN * CHANNELS["vy_ref"].high
 
 STANDSTILL_SPEED = 0.5  # m/s
 STANDSTILL_YAW_RATE = 0.05  # rad/s; below both, nothing is expected to move
 
-# What an estimator does with a row.
-USE = 0
-WAIT = 1  # too much is missing
-RESTART = 2  # it starts anew with the row
+# What an estimator does with a row (`Cleaned.flow`).
+USE = 0  # flow of a row with which the estimator continues
+WAIT = 1  # flow of a row that the estimator skips, since too much is missing
+RESTART = 2  # flow of a row with which the estimator starts anew
 
 
 @dataclass(frozen=True)
@@ -95,10 +99,10 @@ class ChannelLimits:
 
 @dataclass(frozen=True)
 class GuardLimits:
-    """Limits of plausible values of each channel, and of the estimate."""
+    """Limits of plausible values of each channel, for `Guard`, and of the estimate, for `Watch`."""
 
     channels: Mapping[str, ChannelLimits] = field(default_factory=dict)  # name -> limits
-    top_speed: float = 140.0  # that the car reaches [m/s]
+    top_speed: float = 140.0  # largest speed that the car reaches [m/s]
     # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
     largest_tan_sideslip: float = 1.0
 
@@ -119,17 +123,21 @@ class GuardLimits:
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
-    """Limits that hold for any car."""
+    """Limits of channels that hold for any car, at a sampling rate [Hz]; for `Guard` where none
+    were calibrated.
+    """
     return GuardLimits({name: _usual(name, rate_hz) for name in channels})
 
 
 def learn_limits(
     recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float
 ) -> GuardLimits:
-    """Limits from drives at the estimator's rate, with references where they have them.
+    """Learn the limits of channels and of the estimate from training drives.
 
-    A range is that of any car or, if more, `MAX_OVER_TRAINING` times the largest value; a jump
-    likewise; a channel may stand still for twice its longest run while the car moved.
+    A range is that of any car or, if larger, `MAX_OVER_TRAINING` times the largest value; a jump
+    likewise. A channel may stand still for twice its longest run while the car moved
+    (`_run_limit`). The largest tan β of the estimate is `TAN_MARGIN` times that of the references,
+    and at least 1.
 
     Parameters
     ----------
@@ -173,18 +181,18 @@ def learn_limits(
 
 
 def _largest(parts: Sequence[FloatArray]) -> float:
-    """Largest size in all parts; 0 where there is none."""
+    """Largest absolute value in all parts; 0 where there is none."""
     return max((float(np.nanmax(np.abs(part), initial=0.0)) for part in parts), default=0.0)
 
 
 def _usual(name: str, rate_hz: float) -> ChannelLimits:
     """Limits of a channel that hold for any car, at a rate [Hz].
 
-    Channels in `FREE` have the range and the span of their table.
+    Channels in `CAR_DEPENDENT_PREFIXES` have the range and the span of their table.
     """
     table = CHANNELS[name]
-    size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
-    if name.startswith(FREE):
+    size, _, noise = CAR_LIMITS.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
+    if name.startswith(CAR_DEPENDENT_PREFIXES):
         size = math.inf
         noise = 0.0
     return ChannelLimits(
@@ -193,10 +201,14 @@ def _usual(name: str, rate_hz: float) -> ChannelLimits:
 
 
 def _fastest(name: str, rate_hz: float) -> float:
-    """Change from one sample to the next that a car reaches."""
+    """Largest change of a channel from one sample to the next that a car reaches, in its unit."""
     table = CHANNELS[name]
     span = table.high - table.low
-    return span if name.startswith(FREE) else REACHED.get(table.unit, (0.0, span, 0.0))[1] / rate_hz
+    return (
+        span
+        if name.startswith(CAR_DEPENDENT_PREFIXES)
+        else CAR_LIMITS.get(table.unit, (0.0, span, 0.0))[1] / rate_hz
+    )
 
 
 def _tan_sideslip(recording: Recording) -> FloatArray:
@@ -208,9 +220,11 @@ def _tan_sideslip(recording: Recording) -> FloatArray:
 
 
 def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
-    """Twice the longest time that a channel stood still while the car moved [s]; 0: no limit.
+    """Limit of the time for which a channel may stand still while the car moves [s]; 0: no limit.
 
-    Only time between its stops counts.
+    It is twice the longest such time in the recordings, `MIN_RUN_SECONDS` at least. There is none
+    for a channel that may rest, or that stood still for longer than `MAX_RUN_SECONDS`. Samples at
+    its stops do not count.
     """
     if CHANNELS[name].rests or not recordings:
         return 0.0
@@ -228,14 +242,13 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
 
 
 def longest_run(flags: NDArray[np.bool_]) -> int:
-    """Longest run of true values."""
+    """Number of samples in the longest run of true values; 0 where there is none."""
     return int(np.diff(true_runs(flags)).max(initial=0))
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
-    """Locks of a steering, (lower, upper): where it stayed for three samples in training.
-
-    They lie within a tenth of its extremes.
+    """Lower and upper stop of a steering channel in its unit: the values near its locks at which
+    it stayed for three samples in training, within a tenth of the extremes.
 
     Resampling rings at a stop, so that the extreme itself may lie beyond it. Channels other than
     `STEERING` have no stops.
@@ -259,7 +272,9 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
 
 
 def _moves(recording: Recording) -> NDArray[np.bool_]:
-    """Samples at which the car moves, as far as speed and yaw rate tell."""
+    """Mask (T,) of the samples at which the car moves by its speed or yaw rate; all true without a
+    speed.
+    """
     if "vx" not in recording:
         return np.ones(len(recording), np.bool_)
     is_standing = np.abs(recording["vx"]) < STANDSTILL_SPEED
@@ -269,12 +284,12 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
 
 
 class Cleaned(NamedTuple):
-    """Rows as an estimator receives them."""
+    """Rows after the guard, as an estimator receives them."""
 
     # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is
     # `WAIT`
     rows: FloatArray
-    measured: NDArray[np.bool_]  # which values were accepted, (T, C)
+    measured: NDArray[np.bool_]  # whether values were accepted, (T, C)
     flow: NDArray[np.int8]  # `USE`, `WAIT` or `RESTART` at each row, (T,)
 
 
@@ -366,7 +381,7 @@ def guard_rows(  # type: ignore[no-untyped-def]
     limits
         (C, 6): low, high, jump, longest run in samples, lower and upper stop.
     skippable
-        (C,).
+        Whether the estimator can do without each channel, bool (C,).
     settings
         Columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new
         level has to stand, whether an accepted jump makes the estimator start anew.

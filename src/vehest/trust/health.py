@@ -53,8 +53,8 @@ from vehest.trust.relations import (
 
 # status of an estimate, as the channel ``health`` has it
 VALID = 0
-DEGRADED = 1
-INVALID = 2
+DEGRADED = 1  # code of health of a degraded sample
+INVALID = 2  # code of health of an invalid sample
 
 HOLD_SECONDS = 1.0  # s for which a flag is held after the last statistic fell below its limit
 BRIDGED_SECONDS = 0.5  # s; a channel that is missing for longer makes the estimate invalid
@@ -67,27 +67,32 @@ BRAKING_SECONDS = 0.2  # ax, by which a wheel that stands is locked or lost
 ENERGY_SECONDS = 0.5  # energy of the innovations before a jump
 OFFSET_SECONDS = 4.0  # evidence of an offset in a channel
 RELATION_SECONDS = 1.0  # residual of a relation
-SHORT_SECONDS = 0.25  # both sides of a relation, before their signs and sizes are compared
+# time constant of the means of both sides of a relation, before their signs and sizes are compared
+SHORT_SECONDS = 0.25
 
 # Limits from healthy drives.
 BLOCK_SECONDS = 5.0  # limits are set by the largest value in each block of this length
 HOURS_BETWEEN_FALSE_ALARMS = 100.0  # healthy driving in which a limit is exceeded about once
 DAY_TO_DAY_FACTOR = 1.25  # tyres, track and wind of another day may raise a statistic by this
-MIN_INDEPENDENT_VALUES = 10.0  # of a statistic, that a drive of any length counts for
+# smallest number of independent values of a statistic for which a drive counts
+MIN_INDEPENDENT_VALUES = 10.0
 MIN_RUN_SAMPLES = 4.0  # equal samples in a row: smallest limit
 MIN_REPEATED_SHARE = 0.3  # share of equal samples: smallest limit
 MIN_LIMITS = {"normal": 4.5, "slip": 0.3, "largest": 0.0}
-"""Rule of a statistic -> smallest limit; statistics of ``normal`` are N(0, 1) without a fault."""
+"""`Statistic.rule` -> smallest limit; statistics of ``normal`` are N(0, 1) without a fault."""
 OUTLIER_FACTOR = 2.0  # a block that exceeds the next largest by this is a fault of the recording
-MAX_OUTLIER_SHARE = 0.01  # of the blocks, which are set aside as such faults at most
+MAX_OUTLIER_SHARE = 0.01  # largest share of the blocks that are set aside as such faults
 # yaw rate and vx·yaw_rate over their largest values in training, beyond which a car spins
 SPIN_MARGIN = 1.3
-MAX_RELATIVE_WEIGHT = 5.0  # of one sample in a likelihood ratio, over the mean weight
+# largest weight of one sample in a likelihood ratio, over the mean weight
+MAX_RELATIVE_WEIGHT = 5.0
 STANDSTILL_LIMITS = {"yaw_rate": 0.05, "ay": 0.5}
 """Channel -> value below which the car may be at standstill [rad/s, m/s²]."""
 
 MAX_ORDER = 10  # samples that the autoregression looks back at most
-MAX_COEFFICIENTS = 700  # of the autoregression, which limits its order for the time of a step
+# largest number of coefficients of the autoregression, which limits its order for the time of a
+# step
+MAX_COEFFICIENTS = 700
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 """Channels of the autoregression, besides wheel speeds.
@@ -97,11 +102,11 @@ Of other channels range, gaps and repeated samples are checked.
 
 NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Channel -> its number in the code of a reason."""
-_NAMES = {number: name for name, number in NUMBERS.items()}
+_NAMES = {number: name for name, number in NUMBERS.items()}  # number in a code -> channel
 
-NO_ESTIMATE = 30
-BEYOND_SPEED = 31
-TOO_WIDE = 32
+NO_ESTIMATE = 30  # there is no estimate
+BEYOND_SPEED = 31  # it is beyond the bound by the car's speed
+TOO_WIDE = 32  # its band of sideslip is wider than `vehest.trust.verdict.WIDEST`
 """Kinds of reasons that follow from an estimate, not from its channels (`vehest.trust.verdict`)."""
 
 SLOW_KERNEL = "vehest.trust.health_kernel:health_kernel"  # compiles for tens of seconds
@@ -131,7 +136,7 @@ REASONS: dict[int, tuple[str, float]] = {
     CLOCK_JUMPED: ("the time stamps jump, or all samples are missing", 0.0),
     CLOCK_UNEVEN: ("the time stamps are uneven, or come at another rate", 0.0),
 }
-"""Kind of a reason -> text, and its priority: the most specific reason is reported.
+"""Kind of a reason -> text and priority; of several reasons that with the highest is reported.
 
 code = 10000 kind + 100 (number of the channel) + number of the partner
 """
@@ -152,54 +157,58 @@ def reason_in_words(code: float) -> str:
 
 
 class Health(NamedTuple):
-    """Status of rows."""
+    """Status of T rows and of the estimates from them, with the reason."""
 
     status: FloatArray  # 0 valid, 1 degraded, 2 invalid, (T,)
-    reason: FloatArray  # code, (T,); 0 where there is none
+    reason: FloatArray  # code of the reason (`REASONS`), (T,); 0 where there is none
     ratio: FloatArray  # largest statistic over its limit, (T,)
 
 
 class Statistic(NamedTuple):
-    """One statistic of the kernel."""
+    """Description of one statistic that the kernel compares with a limit at each row."""
 
-    kind: int  # of the reason that it leads to
-    channel: str  # that is accused
+    kind: int  # kind of the reason that it leads to
+    channel: str  # channel that is accused
     partner: str  # other channel of a relation; empty for statistics of one channel
-    seconds: float  # time constant [s]
-    rule: str  # for its limit, see `limits_from`
+    seconds: float  # time constant of its mean [s]; 0 if it has none
+    rule: str  # rule of its limit, see `limits_from`
 
 
 @dataclass(frozen=True)
 class HealthModel:
-    """Normal behaviour of a car's C channels."""
+    """Normal behaviour of a car's C channels, with the limits of the K statistics by which
+    `health_rows` judges rows.
 
-    channels: tuple[str, ...]  # in the order of the rows' columns
-    rate_hz: float  # of the rows [Hz]
-    relations: tuple[Relation, ...]  # between channels
-    constant: tuple[float, ...]  # of the autoregression, one a channel
-    # of the autoregression: lag, channel, former channel
+    Numbers of channels are in the channels' units.
+    """
+
+    channels: tuple[str, ...]  # names of the channels, in the order of the rows' columns
+    rate_hz: float  # sampling rate of the rows [Hz]
+    relations: tuple[Relation, ...]  # relations between channels that were fitted
+    constant: tuple[float, ...]  # constant c of the autoregression, (C,)
+    # coefficients of the autoregression, [lag, predicted channel, former channel], (p, C, C)
     coefficients: tuple[tuple[tuple[float, ...], ...], ...]
-    # inverse of the innovations' covariance; zero for channels that are not modelled
+    # inverse of the innovations' covariance, (C, C); zero for channels that are not modelled
     precision: tuple[tuple[float, ...], ...]
-    deviation: tuple[float, ...]  # of each channel's innovations
+    deviation: tuple[float, ...]  # standard deviation of each channel's innovations
     usual: tuple[float, ...]  # median of each channel
-    largest: tuple[float, ...]  # largest size of each channel in training
+    largest: tuple[float, ...]  # largest absolute value of each channel in training
     longest_gap: tuple[float, ...]  # longest time without a sample of each channel in training [s]
     # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
     standstill: tuple[float, float, float]
     # yaw rate, and its product with the speed, beyond which the car spins if they rise without a
     # jump
     spin: tuple[float, float]
-    speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
-    # size of the innovations at these speeds, in their deviations, one row a speed
+    speeds: tuple[float, ...]  # L speeds of the noise levels [unit of the speed channel]
+    # root mean square of the innovations at these speeds over their deviation, (L, C)
     levels: tuple[tuple[float, ...], ...]
-    # offset that the likelihood ratio finds in each channel of healthy drives, one row
+    # offset that the likelihood ratio finds in each channel of healthy drives, (1, C)
     healthy: tuple[tuple[float, ...], ...] = ()
-    heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in it, one row
-    limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
-    # of each channel, between which alone it is expected to move
+    heaviest: tuple[tuple[float, ...], ...] = ()  # largest weight of one sample in it, (1, C)
+    limits: tuple[float, ...] = ()  # limit of each statistic, (K,), in the order of `statistics`
+    # lower and upper stop of each channel, between which alone it is expected to move, (C, 2)
     stops: tuple[tuple[float, float], ...] = ()
-    # the same for samples that a filter from a faster bus has passed (`front_end`)
+    # limits for samples that a low-pass from a faster bus has passed (`front_end`), (K,)
     limits_behind_front_end: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -268,7 +277,7 @@ class HealthModel:
 
     @property
     def layout(self) -> Layout:
-        """Sizes and columns for the kernel."""
+        """Sizes, columns of channels and numbers of rows that the kernel needs."""
         names = list(self.channels)
         columns = [
             names.index(name) if name in names else -1
@@ -285,7 +294,7 @@ class HealthModel:
 
     @property
     def statistics(self) -> list[Statistic]:
-        """All statistics, in the kernel's order."""
+        """Descriptions of all K statistics, in the order of the kernel's `Statistics`."""
         kinds = {
             "normal": ((kernel.JUMP, 0.0), (kernel.JUMP, 0.0), (kernel.OFFSET, OFFSET_SECONDS)),
             "run": ((kernel.FROZEN, 0.0),),
@@ -307,7 +316,7 @@ class HealthModel:
         ]
 
     def start(self) -> FloatArray:
-        """State before the first row."""
+        """The kernel's `State` before the first row, as a flat array."""
         memory = allocated(State, self.layout)
         views(State, memory, self.layout)[0].energy[:] = 1.0
         return memory
@@ -380,8 +389,8 @@ class HealthModel:
         return tables
 
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
-        """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the
-        latest first, and their power, (C, C).
+        """Matched filter for a step that began p samples ago: weights of the last p innovations,
+        (p, C, C), the latest first, and the variance of their sum, (C, C).
 
         With G_j = I - Σ_{l ≤ j} A_l, the effect of a step after j samples, the score of a step is
         Σ_j G_jᵀ S⁻¹ ε_{k-p+1+j} and its variance Σ_j G_jᵀ S⁻¹ G_j.
@@ -397,7 +406,9 @@ class HealthModel:
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Limits of 7 C + R statistics from files of earlier versions: 23 C + 4 R or 17 C + 3 R."""
+    """Reduce the limits of files of earlier versions, of 23 C + 4 R or 17 C + 3 R statistics for C
+    channels and R relations, to the present 7 C + R; limits of another number stay as they are.
+    """
     forms = {
         23 * channels + 4 * relations: 7 * channels,
         17 * channels + 3 * relations: 5 * channels,
@@ -423,7 +434,7 @@ def _present_limits(limits: Sequence[float], channels: int, relations: int) -> t
 def health_rows(
     packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray
 ) -> Health:
-    """Judge rows, one at a time or all at once, to the same bits.
+    """Judge rows; one at a time or all at once, the result is bitwise the same.
 
     Parameters
     ----------
@@ -441,7 +452,7 @@ def health_rows(
     return Health(*out)
 
 
-_NO_STATISTICS = np.empty((0, 0))
+_NO_STATISTICS = np.empty((0, 0))  # empty statistics, for `health_kernel` where they are not needed
 
 
 def compile_health(*_: object) -> None:
@@ -571,7 +582,9 @@ def learn_health(
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:
-    """The autoregression extended to all channels, with zeros for those that it does not model."""
+    """Fields of `HealthModel` with an autoregression of the ``usable`` channels, extended to all
+    channels, ``names``, by zeros.
+    """
     places = [names.index(name) for name in usable]
     n = len(names)
     constant = np.zeros(n)
@@ -597,7 +610,7 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """Add the mean offset of each channel over all drives, and the largest weight of a sample.
+    """Fill `HealthModel.healthy` and `HealthModel.heaviest` from healthy drives.
 
     It is called twice, since the largest weight of a sample changes the offsets.
     """
@@ -616,7 +629,8 @@ def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> Health
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
-    """Largest values of K statistics in B blocks of `BLOCK_SECONDS`, (B, K), without limits.
+    """Largest value of each of K statistics in each of B blocks of `BLOCK_SECONDS`, (B, K), for
+    `limits_from`.
 
     Parameters
     ----------
@@ -672,7 +686,8 @@ def limits_from(
     are not counted, since recordings have faults of their own: of thirty blocks or more at most
     `MAX_OUTLIER_SHARE`, but one at least; of fewer, none.
 
-    Rules: ``share`` is at most half way from the largest value to 1; ``domain`` is
+    Rules: ``share`` is 0.15 above the largest value, `MIN_REPEATED_SHARE` at least, and at most
+    half way from the largest value to 1; ``domain`` is
     `DAY_TO_DAY_FACTOR` alone; ``run`` has two samples more, and `MIN_RUN_SAMPLES` at least; the
     others have a smallest limit (`MIN_LIMITS`). A limit that would be 0, and that of the share of a
     channel that always repeats, is 1e300, which is never exceeded.
@@ -748,7 +763,7 @@ def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDA
 def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
     """Describe the share of a drive outside the training's range; empty if there is none.
 
-    ``counts`` are of `outside_domain`.
+    ``counts`` is the result of `outside_domain`.
     """
     *numbers, outside, samples = counts.tolist()
     named = [

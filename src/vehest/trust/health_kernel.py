@@ -36,15 +36,15 @@ from vehest.constants import FloatArray
 from vehest.estimators.kernels import compiling
 from vehest.trust.named_arrays import open_views
 
-IntArray = NDArray[np.int64]
+IntArray = NDArray[np.int64]  # array of integers
 # arrays are views without references, so none are counted: two thirds of the time to compile
 part = partial(compiling.part, _nrt=False)
 
 # times the largest size in training, beyond which a value counts as not measured
 PLAUSIBLE = 1000.0
-CLIP = 4.0  # standard deviations
-STEP_CLIP = 8.0  # the same for steps and for the energy
-CALM = 0.3  # of the mean energy: least energy of a calm stretch
+CLIP = 4.0  # standard deviations to which innovations are clipped for offsets
+STEP_CLIP = 8.0  # standard deviations to which they are clipped for steps and for the energy
+CALM = 0.3  # added to the energy, which is 1 on average, so that a calm segment makes no jump
 # times its limit: a statistic remembers no more, so that it is down again soon after a fault
 CAP = 2.0
 INVALID = 1.5  # times its limit, from which on an estimate is invalid and not only degraded
@@ -54,12 +54,13 @@ SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
 REVERSED = -0.5  # correlation below which a relation has the wrong sign
 HOLDS = 0.7  # correlation above which a relation holds
-SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
+SLIDE_SECONDS = 4.0  # s for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
-INSTANT_FEATURES = 6  # that relations which hold for each sample may use
-FIRST_SMALL = 9  # of features: those of drag, which say nothing of signs and units
-N_FEATURES = 13  # this and the next two stand as digits in the shapes below
+INSTANT_FEATURES = 6  # number of first features that relations which hold for each sample may use
+# index of the first small feature: those of drag, which say nothing of signs and units
+FIRST_SMALL = 9
+N_FEATURES = 13  # number of features; this and the next two stand as digits in the shapes below
 N_LEVELS = 5  # speeds at which the noise is known
 
 (
@@ -81,41 +82,45 @@ N_LEVELS = 5  # speeds at which the noise is known
     DROPOUT,
     LATE,
 ) = range(17)
-"""Kinds of reasons."""
+"""Kinds of reasons, whose texts are `vehest.trust.health.REASONS`; `FREE`: no reason."""
 
 
 class Layout(NamedTuple):
-    """Numbers of everything, columns (-1: none), and times in rows."""
+    """Sizes of the kernel's arrays, columns of channels (-1: there is none), and times in rows."""
 
-    channels: int
-    order: int
-    relations: int
-    yaw_rate: int
-    speed: int
-    ay: int
-    ax: int
-    hold: int
-    bridged: int
-    spinning: int
-    settling: int
-    statistics: int
+    channels: int  # C
+    order: int  # p of the autoregression
+    relations: int  # R
+    yaw_rate: int  # column
+    speed: int  # column of the channel that serves as u
+    ay: int  # column
+    ax: int  # column
+    hold: int  # rows for which a flag is held
+    bridged: int  # rows that a channel may be missing beyond its gap limit until it is invalid
+    spinning: int  # rows beyond the spin's limits until the car counts as spinning
+    settling: int  # rows after the start before predictions count
+    statistics: int  # K
 
 
 class Settings(NamedTuple):
-    """Limits of standstill and spin, sampling interval [s], and forgetting factors."""
+    """Limits of standstill and spin, sampling interval, and forgetting factors.
 
-    least_speed: float
-    still_yaw_rate: float
-    still_ay: float
-    step: float
-    spin_yaw_rate: float
-    spin_turning: float
-    forget_share: float
-    forget_ax: float
-    forget_energy: float
+    A forgetting factor is the weight 1 - exp(-step/τ) of the present row in a mean.
+    """
+
+    least_speed: float  # speed below which the car may stand, and that divides at least
+    still_yaw_rate: float  # yaw rate below which it may stand [rad/s]
+    still_ay: float  # ay below which it may stand [m/s²]
+    step: float  # sampling interval [s]
+    spin_yaw_rate: float  # yaw rate beyond which the car may spin [rad/s]
+    spin_turning: float  # yaw rate times speed beyond which it may spin
+    forget_share: float  # forgetting factor of the share of equal samples
+    forget_ax: float  # forgetting factor of the mean of ax
+    forget_energy: float  # forgetting factor of the innovations' energy
+    # forgetting factor of the likelihood ratio of an offset; 0: it does not forget
     forget_offset: float
-    forget_short: float  # of relations, for signs and units
-    forget_relation: float
+    forget_short: float  # forgetting factor of the sides of relations, for signs and units
+    forget_relation: float  # forgetting factor of the residuals of relations
 
 
 class Statistics(NamedTuple):
@@ -129,10 +134,10 @@ class Statistics(NamedTuple):
     step: Annotated[FloatArray, "channels"]  # likelihood ratio of a step that began p samples ago
     offset: Annotated[FloatArray, "channels"]  # likelihood ratio
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
-    share: Annotated[FloatArray, "channels"]  # of equal samples
+    share: Annotated[FloatArray, "channels"]  # share of equal samples
     domain: Annotated[FloatArray, "channels"]  # size over the largest in training
-    slip: Annotated[FloatArray, "channels"]  # of wheels
-    relation: Annotated[FloatArray, "relations"]  # means of the residuals of relations
+    slip: Annotated[FloatArray, "channels"]  # |slip| of a wheel; 0 for other channels
+    relation: Annotated[FloatArray, "relations"]  # |mean residual| of a relation
 
 
 class Model(NamedTuple):
@@ -141,90 +146,91 @@ class Model(NamedTuple):
     [m, q] is of channel m on channel q.
     """
 
-    layout: Layout
-    settings: Settings
-    constant: Annotated[FloatArray, "channels"]  # of the autoregression
-    lags: Annotated[FloatArray, "order channels channels"]  # A [lag, m, q]
+    layout: Layout  # sizes and columns
+    settings: Settings  # limits and forgetting factors
+    constant: Annotated[FloatArray, "channels"]  # c of the autoregression
+    # coefficients of the autoregression, A [lag, m, q]: of channel m at a lag in channel q
+    lags: Annotated[FloatArray, "order channels channels"]
     precision: Annotated[FloatArray, "channels channels"]  # S⁻¹
-    deviation: Annotated[FloatArray, "channels"]  # of the innovations
+    deviation: Annotated[FloatArray, "channels"]  # standard deviation of the innovations
     instant: Annotated[FloatArray, "channels 13"]  # W
     average: Annotated[FloatArray, "relations 13"]  # coefficients of relations
-    rate_gain: Annotated[FloatArray, "relations"]  # of du/dt in them
+    rate_gain: Annotated[FloatArray, "relations"]  # gain of du/dt in each relation
     usual: Annotated[FloatArray, "channels"]  # medians
-    largest: Annotated[FloatArray, "channels"]  # in training
-    speeds: Annotated[FloatArray, "5"]
+    largest: Annotated[FloatArray, "channels"]  # largest absolute value in training
+    speeds: Annotated[FloatArray, "5"]  # speeds at which noise levels are given, ascending
     levels: Annotated[FloatArray, "5 channels"]  # noise at these speeds
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
     # weight of a former innovation in q on a step in m [lag, m, q]
     steps: Annotated[FloatArray, "order channels channels"]
-    step_power: Annotated[FloatArray, "channels channels"]
+    step_power: Annotated[FloatArray, "channels channels"]  # variance of the weighted sum
     healthy: Annotated[FloatArray, "channels"]  # offsets of healthy drives
     heaviest: Annotated[FloatArray, "channels"]  # largest weight of one sample in an offset
     # lower and upper, between which alone a channel is expected to move
     stops: Annotated[FloatArray, "2 channels"]
-    priority: Annotated[FloatArray, "statistics"]  # of reasons
-    limits: Statistics
-    inverse: Statistics  # of the limits
+    priority: Annotated[FloatArray, "statistics"]  # priority of the reason of each
+    limits: Statistics  # limit of each statistic
+    inverse: Statistics  # 1 over the limit
     modelled: Annotated[IntArray, "channels"]  # whether the autoregression holds the channel
-    rests: Annotated[IntArray, "channels"]  # whether it may stand still while the car moves
-    gap_limit: Annotated[IntArray, "channels"]  # rows
-    wheel: Annotated[IntArray, "channels"]  # whether it is a wheel's speed
-    code: Annotated[IntArray, "channels"]  # number in a reason
+    rests: Annotated[IntArray, "channels"]  # whether a channel may stand still while the car moves
+    gap_limit: Annotated[IntArray, "channels"]  # longest gap in training [rows]
+    wheel: Annotated[IntArray, "channels"]  # whether a channel is a wheel's speed
+    code: Annotated[IntArray, "channels"]  # number of the channel in a reason's code
     target: Annotated[IntArray, "relations"]  # column that a relation explains
     versus: Annotated[IntArray, "relations"]  # column that it is held against
     # 1 if a relation uses a channel, 2 if only in a small term
     involved: Annotated[IntArray, "relations channels"]
-    kind: Annotated[IntArray, "statistics"]  # of reason
-    accused: Annotated[IntArray, "statistics"]  # column
-    partner: Annotated[IntArray, "statistics"]  # column; -1: none
+    kind: Annotated[IntArray, "statistics"]  # kind of the reason that it leads to
+    accused: Annotated[IntArray, "statistics"]  # column of the channel that is accused
+    partner: Annotated[IntArray, "statistics"]  # column of the other channel; -1: none
 
 
 class State(NamedTuple):
     """Variables, by the names of the C struct; those from ``x`` on are used within a row only."""
 
-    rows: Annotated[FloatArray, "1"]  # seen
+    rows: Annotated[FloatArray, "1"]  # number of rows so far
     hold: Annotated[FloatArray, "1"]  # rows until a flag is cleared
     reason: Annotated[FloatArray, "1"]  # the last one
     status: Annotated[FloatArray, "1"]  # the last one
-    spinning: Annotated[FloatArray, "1"]  # rows of spin
+    spinning: Annotated[FloatArray, "1"]  # rows for which the spin's limits have been exceeded
     since_jump: Annotated[FloatArray, "1"]  # rows since the yaw rate jumped
-    mean_ax: Annotated[FloatArray, "1"]
-    # lateral velocity, as far as it changed within `SLIDE_SECONDS`
+    mean_ax: Annotated[FloatArray, "1"]  # mean of ax over `BRAKING_SECONDS` of health [m/s²]
+    # change of the lateral velocity within about `SLIDE_SECONDS`
     drift: Annotated[FloatArray, "1"]
-    last: Annotated[FloatArray, "channels"]  # measured value
+    last: Annotated[FloatArray, "channels"]  # last measured value
     # rows without a sample; below zero while predictions settle again
     gap: Annotated[FloatArray, "channels"]
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
-    share: Annotated[FloatArray, "channels"]  # of equal samples
-    past_y: Annotated[FloatArray, "order channels"]
-    innovation: Annotated[FloatArray, "order channels"]
-    energy: Annotated[FloatArray, "channels"]  # of the innovations
+    share: Annotated[FloatArray, "channels"]  # share of equal samples
+    past_y: Annotated[FloatArray, "order channels"]  # y of the last p rows, the latest first
+    innovation: Annotated[FloatArray, "order channels"]  # clipped ε of the last p rows
+    energy: Annotated[FloatArray, "channels"]  # mean square of the innovations over deviation²
     ratio_sum: Annotated[FloatArray, "channels"]  # Σ hᵀS⁻¹ε
     ratio_weight: Annotated[FloatArray, "channels"]  # Σ hᵀS⁻¹h
     average: Annotated[FloatArray, "relations"]  # means of the residuals of relations
-    mean_speed: Annotated[FloatArray, "2"]  # short and long
-    left: Annotated[FloatArray, "relations"]  # short mean of the residual
+    mean_speed: Annotated[FloatArray, "2"]  # means of u: short and long
+    left: Annotated[FloatArray, "relations"]  # short mean of the residual without small terms
     smooth: Annotated[FloatArray, "relations"]  # short mean of the target
-    # means of shown times expected, and of both squares
+    # long means of observed target times expected target, and of the squares of both
     product: Annotated[FloatArray, "relations"]
-    expected_power: Annotated[FloatArray, "relations"]
-    observed_power: Annotated[FloatArray, "relations"]
-    x: Annotated[FloatArray, "channels"]
-    y: Annotated[FloatArray, "channels"]
+    expected_power: Annotated[FloatArray, "relations"]  # mean square of the expected side
+    observed_power: Annotated[FloatArray, "relations"]  # mean square of the observed side
+    x: Annotated[FloatArray, "channels"]  # present values, of which the last replaces a missing one
+    y: Annotated[FloatArray, "channels"]  # x - W φ(x)
     error: Annotated[FloatArray, "channels"]  # ε
     scaled: Annotated[FloatArray, "channels"]  # ε over its level at this speed
-    clipped: Annotated[FloatArray, "channels"]
+    clipped: Annotated[FloatArray, "channels"]  # ε over its level, within `CLIP` deviations
     ratio: Annotated[FloatArray, "channels"]  # likelihood ratio of a jump
     score: Annotated[FloatArray, "channels"]  # S⁻¹ε
-    clipped_score: Annotated[FloatArray, "channels"]
-    stepped: Annotated[FloatArray, "channels"]  # sum over a step
-    level: Annotated[FloatArray, "channels"]  # of the noise
-    feature: Annotated[FloatArray, "13"]
-    by_yaw_rate: Annotated[FloatArray, "13"]  # derivatives of the features
-    by_speed: Annotated[FloatArray, "13"]
+    clipped_score: Annotated[FloatArray, "channels"]  # S⁻¹ times the clipped ε
+    stepped: Annotated[FloatArray, "channels"]  # weighted sum of the last p innovations for a step
+    level: Annotated[FloatArray, "channels"]  # noise at this speed over that at all speeds
+    feature: Annotated[FloatArray, "13"]  # φ(x)
+    by_yaw_rate: Annotated[FloatArray, "13"]  # derivatives of the features by the yaw rate
+    by_speed: Annotated[FloatArray, "13"]  # derivatives of the features by the speed
     slope: Annotated[FloatArray, "channels"]  # J
     effect: Annotated[FloatArray, "channels"]  # h
-    statistics: Statistics
+    statistics: Statistics  # values of this row
 
 
 @compiling.entry(nogil=True, _nrt=False)
@@ -265,7 +271,7 @@ def health_kernel(rows, measured, tables, memory, out, statistics):
 
 @part()
 def _receive(k, rows, measured, model, state):
-    """Take a row.
+    """Take row k into the state: values, gaps, and counts of equal samples.
 
     Returns the channel that has been missing for longest beyond its limit, -1 if none has.
 
@@ -312,7 +318,7 @@ def _value(state, column):
 
 @part()
 def _describe(model, state):
-    """Features with their derivatives, y = x - W φ(x) and the noise at this speed.
+    """Compute the features with their derivatives, y = x - W φ(x) and the noise at this speed.
 
     Returns whether the car stands.
 
@@ -387,7 +393,9 @@ def _describe(model, state):
 
 @part()
 def _predictable(i, model, state):
-    """Whether channel i and the channels of its relation were measured for long enough."""
+    """Whether channel i is modelled, and it and the channels of its relation have been measured for
+    long enough that its prediction counts.
+    """
     r = model.layout.yaw_rate
     u = model.layout.speed
     if state.rows[0] < model.layout.settling or model.modelled[i] == 0 or state.gap[i] != 0.0:
@@ -403,9 +411,8 @@ def _predictable(i, model, state):
 
 @part()
 def _predict(model, state):
-    """Innovations, scaled and clipped, and their scores S⁻¹ε.
-
-    Zero where nothing can be predicted.
+    """Compute the innovations, scaled and clipped, and their scores S⁻¹ε; zero where nothing can be
+    predicted.
 
     ε = y - c - Σ_l A_l y_{k-l}, over the noise level; clipped to `CLIP` deviations for offsets and
     to `STEP_CLIP` for steps. A channel that is missing takes its prediction as y, so that the
@@ -453,10 +460,11 @@ def _predict(model, state):
 
 @part()
 def _look_at_innovations(model, state):
-    """Jumps out of what has been usual for half a second.
+    """Compute the statistic of a jump of each channel: its innovation over those of the last half
+    second.
 
-    z = |(S⁻¹ε)_i|/√(S⁻¹)_ii, over √(`CALM` + energy), the mean square of the channel's own
-    innovations before; the energy is updated afterwards.
+    It is z = |(S⁻¹ε)_i|/√(S⁻¹)_ii over √(`CALM` + energy), with the mean square of the channel's
+    former innovations as energy, which is updated afterwards.
     """
     statistics = state.statistics
     for i in range(model.layout.channels):
@@ -476,7 +484,7 @@ def _look_at_innovations(model, state):
 
 @part()
 def _slope(i, model, state):
-    """J = ∂y/∂xᵢ."""
+    """Write J = ∂y/∂xᵢ of channel i into the state, (C,)."""
     r = model.layout.yaw_rate
     u = model.layout.speed
     for m in range(model.layout.channels):
@@ -491,7 +499,7 @@ def _slope(i, model, state):
 
 @part()
 def _look_for_step(i, counts, model, state):
-    """A step in channel i that began p samples ago.
+    """Compute the statistic of a step in channel i that began p samples ago; 0 unless ``counts``.
 
     z = |Σ_m J_m/level_m · stepped_m|/√(JᵀP J), with both J over the noise level and P the step's
     power.
@@ -510,7 +518,8 @@ def _look_for_step(i, counts, model, state):
 
 @part()
 def _look_for_offset(i, counts, model, state):
-    """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations.
+    """Compute the likelihood ratio of an offset in channel i; h is the offset's effect on the
+    scaled innovations. Unless ``counts``, the row adds nothing.
 
     Numerator and denominator of z (module) are forgotten by λ and λ². From the numerator the offset
     of healthy drives times the weight is subtracted; a sample counts with at most ``heaviest``.
@@ -542,7 +551,7 @@ def _look_for_offset(i, counts, model, state):
 
 @part()
 def _look_for_offsets(model, state):
-    """Steps and offsets of each channel.
+    """Compute the statistics of steps and offsets of each channel.
 
     The largest offset statistic is limited to `CAP` times its limit by scaling the numerators of
     all channels.
@@ -568,7 +577,8 @@ def _look_for_offsets(model, state):
 
 @part()
 def _look_at_values(is_standing, model, state):
-    """Runs and shares of equal samples, range, slip; returns how many wheels are slow.
+    """Compute the statistics of runs and shares of equal samples, range and slip; returns the
+    number of wheels that are slower than expected by more than `SLIPPING`.
 
     Nothing is frozen where the car stands or a channel may rest. The slip of a wheel is 1 - x/x̂,
     with x̂ the speed that its relation expects.
@@ -592,9 +602,9 @@ def _look_at_values(is_standing, model, state):
 
 @part()
 def _look_at_relations(is_standing, model, state):
-    """Means of the residuals of relations.
+    """Compute the statistics of relations, the means of their residuals.
 
-    That of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f.
+    The mean of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f.
 
     The short means of both sides give sign and unit (`_relation_kind`); the long mean of the
     residual is the statistic, at most `CAP` times its limit. While any channel is missing, the
@@ -652,9 +662,10 @@ def _look_at_relations(is_standing, model, state):
 
 @part()
 def _find_reason(slow, model, state):
-    """Kind, channel and partner of the most specific statistic beyond its limit.
+    """Find the statistic beyond its limit whose reason has the highest priority.
 
-    Also returns the largest statistic over its limit.
+    Returns the kind of the reason (`FREE`: there is none), the column of the accused channel, that
+    of its partner (-1: none), and the largest statistic over its limit.
     """
     values = state.statistics.all_values
     highest = 0.0
@@ -698,7 +709,7 @@ def _find_reason(slow, model, state):
 
 @part()
 def _decide(missing_channel, slow, model, state):
-    """Status and reason from all statistics, and the largest of these over its limit.
+    """Status of the row, code of its reason, and the largest statistic over its limit.
 
     Invalid are frozen and repeated samples, wrong signs and units, lost wheels, spin, gaps beyond
     the bridged time, and any statistic but the range from `INVALID` times its limit on; other
@@ -753,7 +764,9 @@ def _decide(missing_channel, slow, model, state):
 
 @part()
 def _wheel(channel, slow, state):
-    """Whether a wheel that slips is locked, lost or neither."""
+    """Kind of the reason for a wheel whose slip is beyond its limit: `LOCKED`, `DROPOUT` (the
+    signal is lost), or `CONTRADICTION` where the wheel is not that slow.
+    """
     if state.x[channel] >= (1.0 - LOST) * (state.x[channel] - state.y[channel]):
         return CONTRADICTION
     return LOCKED if state.mean_ax[0] < -BRAKING or slow > 1 else DROPOUT
@@ -761,9 +774,8 @@ def _wheel(channel, slow, state):
 
 @part()
 def _relation_kind(j, model, state):
-    """Kind of a relation in the last second.
-
-    `FREE` if it holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small.
+    """State of relation j in the last second: `FREE` if it holds, `SIGN` or `UNIT` if it fails by
+    far, -1 if the signals are too small or it is neither.
     """
     product = state.product[j]
     expected = state.expected_power[j]
@@ -780,9 +792,10 @@ def _relation_kind(j, model, state):
 
 @part()
 def _contradiction(model, state):
-    """Kind, channel and partner of relations that fail by far.
+    """Kind, channel and partner (columns; -1: none) of relations that fail by far; `FREE` where
+    none does.
 
-    The one channel that is in all that fail and in none that holds.
+    The channel is the one that is in all relations that fail and in none that holds.
 
     Channels that only ever occur together in failing relations contradict each other; which of them
     is wrong cannot be decided.

@@ -25,12 +25,14 @@ from vehest.constants import FloatArray
 
 ALL_VALUES = "all_values"
 """Field that has the values of all fields after it, in one array."""
-SCALARS = {int: np.int64, float: np.float64}
+SCALARS = {int: np.int64, float: np.float64}  # declared type of a scalar field -> data type
 
 
 @cache
 def _fields(kind: Any) -> dict[str, Any]:
-    """Field -> a named tuple, or data type and shape, which is None of a scalar."""
+    """Fields of a named tuple: name -> another named tuple, or (data type, words of the shape); the
+    shape of a scalar is None.
+    """
     declared_fields: dict[str, Any] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if hasattr(hint, "_fields"):
@@ -44,7 +46,7 @@ def _fields(kind: Any) -> dict[str, Any]:
 
 
 def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any, int]:
-    """Views of a flat array from ``begin`` on, and the place behind the last.
+    """A named tuple of views of a flat array from ``begin`` on, and the index behind the last.
 
     Scalars are arrays without dimensions.
 
@@ -81,7 +83,7 @@ def allocated(kind: Any, sizes: Any) -> FloatArray:
 
 
 class Views(types.Type):  # type: ignore[misc]
-    """Type of a named tuple in compiled code: where it begins, and sizes.
+    """numba's type of a named tuple of views: where they begin in the flat array, and the sizes.
 
     Passing all fields would compile a fifth longer.
     """
@@ -101,9 +103,8 @@ class _Model(models.StructModel):  # type: ignore[misc]
 
 
 def _compiled_type(field_type: Any, sizes: Any) -> Any:
-    """Type of a field, or of a named tuple, in compiled code.
-
-    One of scalars is a tuple of numbers.
+    """numba's type of a field: an array, a number, `Views`, or a tuple of numbers for a named tuple
+    of scalars.
     """
     if hasattr(field_type, "_fields"):
         inner = [_compiled_type(field, sizes) for field in _fields(field_type).values()]
@@ -198,7 +199,7 @@ def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-de
 
 
 def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
-    """Views, a tuple of numbers or a number that begins at ``data``."""
+    """Write the code that reads `Views`, a tuple of numbers or a number at ``data``."""
     if isinstance(of, Views):
         opened = context.make_helper(builder, of)
         opened.data = data

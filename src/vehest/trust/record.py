@@ -19,17 +19,17 @@ from vehest.trust.bands import Bands
 from vehest.trust.guard import GuardLimits
 from vehest.trust.health import HealthModel
 
-TRUST = "trust.yaml"
-FORMAT = 1
+TRUST = "trust.yaml"  # name of the file
+FORMAT = 1  # version of its layout; files of another one are refused
 
 
 @dataclass(frozen=True)
 class About:
-    """The model."""
+    """The model that a `Trust` belongs to."""
 
     estimator: str  # name in the registry
-    variant: str = ""  # what the paper calls it
-    note: str = ""  # why something is missing, for people; empty where nothing is
+    variant: str = ""  # the paper's name of the configuration
+    note: str = ""  # text on why something is missing; empty where nothing is
     model: str = ""  # digest of the model beside which it is kept; empty in a folder of its own
 
 
@@ -37,7 +37,7 @@ class About:
 class Trust:
     """Bands, limits and health of a model; None if not calibrated."""
 
-    about: About  # whose it is
+    about: About  # the model that it was calibrated with
     bands: Bands | None = None  # calibrated half widths
     guard: GuardLimits | None = None  # limits of plausible samples
     health: HealthModel | None = None  # residuals and thresholds of the health flag
@@ -68,7 +68,7 @@ class Trust:
                 )
 
     def for_settings(self, estimator: Estimator) -> Trust:
-        """The parts that apply to the same model with other settings.
+        """The parts that apply to the same model with other settings, those of ``estimator``.
 
         Health is that of all channels together and is left out where these differ; a band counts
         a channel that is not read as not measured.
@@ -118,7 +118,8 @@ def describe_band(
     same_vehicle: bool | None = None,
     car: CarValues = UNKNOWN_CAR,
 ) -> str:
-    """Describe what calibrated the band of an estimate, and why it applies; empty without one.
+    """Describe which vehicles the band of an estimate was calibrated on, and whether and why it is
+    widened; empty without a band.
 
     The rules are those of `is_other_vehicle`.
     """
@@ -198,6 +199,6 @@ def read_trust(folder: Path) -> Trust:
 
 
 def _abbreviated(value: object) -> str:
-    """A value in a message, short."""
+    """Text of a value for a message, of at most 80 characters."""
     text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
     return text if len(text) <= 80 else f"{text[:80]} …"

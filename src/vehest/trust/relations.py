@@ -41,8 +41,9 @@ SPEEDS = (
     "wheel_speed_fl",
     "wheel_speed_fr",
 )
-"""Channels that serve as the speed u, the first that is there."""
+"""Channels that can serve as the speed u; the first that is there does."""
 
+# names of the terms of relations
 FEATURES = (
     "1",
     "r",
@@ -58,9 +59,10 @@ FEATURES = (
     "ax",
     "v r",
 )
-RATE = "du/dt"
-SIDESLIP_DRAG = "v r"
-DRAG = ("r²", "u²", SIDESLIP_DRAG)
+RATE = "du/dt"  # term that is a rate of change, and no feature of one sample
+SIDESLIP_DRAG = "v r"  # feature: ax by the lateral velocity in a turn
+DRAG = ("r²", "u²", SIDESLIP_DRAG)  # small features of ax, which say nothing of its sign and unit
+# term -> symbols of the quantities in it
 _SYMBOLS = dict(
     zip(
         FEATURES,
@@ -86,19 +88,21 @@ _SYMBOLS[RATE] = "u"
 
 LOW_PASS_SECONDS = 0.5  # s, time constant of the low-pass of both sides of a relation
 HUBER = 1.5  # robust standard deviations, beyond which a residual weighs less
-MIN_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
+MIN_SPEED_SHARE = 0.1  # speed over the median speed below which angles say little
 MIN_ROWS = 50  # samples; with fewer a relation is left out, and glitches are not looked for
 
 
 @dataclass(frozen=True)
 class Relation:
-    """One channel as a sum of features of others."""
+    """One channel, the target, as a sum of features of other channels: target = Σ coefficient ·
+    feature.
+    """
 
     target: str  # channel that is explained
-    partner: str  # channel that it is held against, for messages
+    partner: str  # channel that is named as the other side in messages
     # feature, or `RATE`, -> coefficient; the target's units over the feature's
     terms: dict[str, float] = field(default_factory=dict)
-    instant: bool = False  # whether it holds for each sample and not only on average
+    instant: bool = False  # whether the relation holds for each sample, not only on average
 
     def __post_init__(self) -> None:
         """Raise `DataError` for a term that is unknown, or not available at each instant."""
@@ -109,7 +113,7 @@ class Relation:
             check_shape(f"terms.{name}", coefficient)
 
     def involves(self, channel: str, speed: str | None) -> int:
-        """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all.
+        """1 if the relation has a channel, 2 if only in the small terms of drag, 0 if not at all.
 
         ``speed`` is the channel that is used as u.
         """
@@ -126,12 +130,14 @@ class Relation:
 
 
 def speed_channel(channels: Sequence[str]) -> str | None:
-    """The channel that serves as speed."""
+    """The channel that serves as the speed u (`SPEEDS`); None if there is none."""
     return next((name for name in SPEEDS if name in channels), None)
 
 
 def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...], bool]]:
-    """Every relation that channels allow: target, partner, features, whether it is instant."""
+    """Every relation that channels allow, before its coefficients are fitted: target, partner,
+    features, whether it holds at each instant.
+    """
     speed = speed_channel(channels)
     has = set(channels)
     declared: list[tuple[str, str, tuple[str, ...], bool]] = []
@@ -156,7 +162,7 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
 
 
 def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[str, FloatArray]:
-    """Feature -> (T,), of channels as they are measured.
+    """Compute the features of relations from channels as they are measured.
 
     A channel that is not there counts as zeros; without a speed, ``r/u`` and ``ay/u²`` divide by
     ``least_speed``.
@@ -171,7 +177,7 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
     Returns
     -------
     dict
-        Of all `FEATURES` but ``v r``, which needs a relation (`slide_of`).
+        Feature -> (T,), for all `FEATURES` but ``v r``, which needs a relation (`slide_of`).
     """
     any_samples = next(iter(samples.values()))
     speed = speed_channel(list(samples))
@@ -196,9 +202,10 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
 
 
 def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
-    """v r, (T,), with v from the residual of the relation of ay, at most the speed.
+    """The feature ``v r``, (T,): lateral velocity times yaw rate.
 
-    It is integrated with the leakage of `SLIDE_SECONDS`.
+    v is the residual of the relation of ay, integrated with the leakage of `SLIDE_SECONDS`, and at
+    most the speed in size.
 
     Parameters
     ----------
@@ -217,9 +224,10 @@ def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: flo
 
 
 def without_spikes(samples: FloatArray) -> FloatArray:
-    """Replace glitches of single samples by NaN.
+    """Replace glitches of single samples by NaN; the array is a copy.
 
-    Their second difference exceeds ten times its 99.9 % quantile.
+    The deviation of a glitch from the mean of its neighbours exceeds ten times the 99.9 % quantile
+    of all such deviations, and the neighbours differ from each other by less than half of it.
     """
     if len(samples) < MIN_ROWS:
         return samples
@@ -235,7 +243,7 @@ def without_spikes(samples: FloatArray) -> FloatArray:
 
 
 def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording:
-    """These channels of a drive, NaN where a single sample is a glitch."""
+    """The drive with ``channels`` alone, NaN where a single sample is a glitch."""
     selected = recording.select(channels)
     clean = {name: without_spikes(samples) for name, samples in selected.channels.items()}
     return replace(
@@ -246,9 +254,8 @@ def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording
 
 
 def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> float:
-    """Speed below which angles say little.
-
-    A share of the median one [unit of the speed channel].
+    """Smallest speed [unit of the speed channel] at which relations are fitted and by which angles
+    are divided: `MIN_SPEED_SHARE` of the median speed; 1 without a speed channel.
     """
     speed = speed_channel(channels)
     if speed is None:
@@ -268,9 +275,8 @@ def residuals_of(
     relations: Sequence[Relation],
     least_speed: float,
 ) -> FloatArray:
-    """y = x - W φ(x).
-
-    Channels less what relations that hold at each instant explain of them, (T, C).
+    """y = x - W φ(x), (T, C): channels minus what the relations that hold at each instant explain
+    of them, which the autoregression of health then predicts.
     """
     features = features_of(samples, least_speed)
     left = {name: np.array(samples[name], dtype=np.float64) for name in channels}
@@ -285,9 +291,9 @@ def residuals_of(
 def learn_relations(
     recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float
 ) -> list[Relation]:
-    """Coefficients of every relation, from drives at one rate [Hz].
+    """Fit the coefficients of every relation among channels to drives.
 
-    NaN and samples below ``least_speed`` are left out.
+    Samples with NaN and samples below ``least_speed`` are left out.
 
     Both sides are low-passed by the same filter of `LOW_PASS_SECONDS` before the fit. The
     coefficient of v r is -1 by kinematics and not fitted. A relation with fewer than `MIN_ROWS`
@@ -298,7 +304,7 @@ def learn_relations(
     recordings : sequence of Recording
         Healthy drives with all ``channels``.
     channels : sequence of str
-        Among which relations are looked for.
+        Channels among which relations are looked for.
     rate_hz : float
         Sampling rate of all recordings [Hz].
     least_speed : float
@@ -369,7 +375,9 @@ def learn_relations(
 
 
 def _fill_gaps(samples: FloatArray) -> FloatArray:
-    """The last measured value where there is none, the first one before it."""
+    """A copy in which the last finite value replaces NaN, and the first one does at the start;
+    zeros where no value is finite.
+    """
     finite_places = np.flatnonzero(np.isfinite(samples))
     if not len(finite_places):
         return np.zeros_like(samples)

@@ -24,12 +24,13 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_number, check_numbers
 
 FRICTION_SLIP = 0.05
-"""c [rad], error of the slip angle where the friction is e times as large.
+"""c, standard deviation of the slip angle's error where the friction is e times as large [rad].
 
 Chosen on simulated tyres (docs/learned_ukf.md, "Bands on other tyres").
 """
 GAUSSIAN_90 = 1.6448536269514722  # half width of 90 % of a Gaussian, in standard deviations
-# of the tyre term in the squared scales; larger ones are cut off, or refused in a file
+# largest weight of the tyre term in the squared scales; larger ones are cut off, or refused in a
+# file
 MAX_WEIGHT = 1e12
 
 
@@ -38,8 +39,8 @@ class TyreCheck:
     """Constants of the check of one model."""
 
     friction: float  # μ₀, that of the training [1]
-    # of x in the squared scales of v and β: (1.645/q)², so that the factor q of 90 % leaves
-    # 1.645 √x
+    # weights of x in the squared scales of v and β: (1.645/q)², so that after multiplication by
+    # the factor q of 90 % the half width is 1.645 √x
     weights: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -48,7 +49,9 @@ class TyreCheck:
         check_numbers("tyre_check.weights", self.weights, 0.0, MAX_WEIGHT)
 
     def scaled_by(self, factors: tuple[float, float]) -> TyreCheck:
-        """The check of bands whose factors of 90 % are q without it, for v and β."""
+        """The check with the weights for bands whose factors of the 90 % level, for v and β, are
+        ``factors`` without it.
+        """
         vy, sideslip = (
             min((GAUSSIAN_90 / max(factor, 1e-6)) ** 2, MAX_WEIGHT) for factor in factors
         )

@@ -51,13 +51,13 @@ What it says of the car is no more than v = 0 does.
 """
 
 PERSISTENT_FAULT_SECONDS = 2.0
-"""Accusation from which on a fault is persistent.
+"""Time for which a channel has been accused, from which on a fault is persistent.
 
 A single wrong sample is accused for up to 1.6 s, as sums decay.
 """
 
 # kinds of reasons that accuse no sensor
-NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
+NO_FAULT_KINDS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 
 
 def starts_anew(estimator: Estimator) -> bool:
@@ -69,9 +69,10 @@ def starts_anew(estimator: Estimator) -> bool:
 
 
 class Monitor:
-    """Judges samples before and after they are estimated.
+    """Applies health and bands: judges rows before the estimator receives them, and estimates
+    afterwards. Keeps the state between calls.
 
-    Keeps the state between calls. Parts of ``trust`` that are None are not judged.
+    Parts of ``trust`` that are None are not judged.
 
     ``elsewhere``: the car or its tyres are others than those that were calibrated on;
     ``behind_front_end``: rows come through the filter from a faster bus.
@@ -112,7 +113,7 @@ class Monitor:
         Returns
         -------
         Health
-            Of these rows, which `after` completes.
+            Health of these rows, which `after` completes.
         """
         if self.packed_health is None:
             return Health(*np.zeros((3, len(received))))
@@ -145,12 +146,12 @@ class Monitor:
 
         Parameters
         ----------
-        verdict, watched, cleaned : Health
-            Of the same T rows.
+        verdict, watched, cleaned : Health, Watched, Cleaned
+            Results of `before`, of the watch and of the guard for the same T rows.
         vx : array
             Speed of the estimate, (T,) [m/s].
         variance : array
-            Of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
+            Variance of v's error that the method states, (T,) [m²/s²]; NaN where it states none.
         tyre_error : array
             Mean squared error by the tyre check, (T,) [m²/s²]; 0 without one.
         """
@@ -200,25 +201,27 @@ def isolate_rows(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     status, reason
-        Of health, (T,).
+        Status and code of the reason by health, (T,).
     numbers, skippable
-        Of the channels: number in a code, whether the estimator can do without it, (C,).
+        Number of each channel in a code, whether the estimator can do without it, (C,).
     starts_anew
-        Whether the estimator does after a persistent fault.
+        Whether the estimator starts anew after a persistent fault.
     adapts
         Whether it has adapting states, which go back to fitted values while a required channel
         is accused.
     persistent_steps
         Samples of accusation after which a fault is persistent.
+    rows, measured, flow
+        Result of the guard (`Cleaned`).
     state
-        Samples at which any channel was accused since health was last valid, and at which a
-        required one was, (2,).
+        Number of samples since health was last valid at which any channel was accused, and at
+        which a required one was, (2,).
     """
     for k in range(rows.shape[0]):
         kind = int(reason[k]) // 10000
         channel = int(reason[k]) % 10000 // 100
         at_fault = status[k] == INVALID
-        for no_fault in NO_FAULTS:
+        for no_fault in NO_FAULT_KINDS:
             at_fault = at_fault and kind != no_fault
         if at_fault:
             state[0] += 1.0
@@ -251,15 +254,15 @@ def verdict_rows(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     vy, marks : array
-        Of the watch, (T,).
+        Results of the watch (`Watched`), (T,).
     flow, measured : array
-        Of the guard, (T,) and (T, C).
+        Results of the guard (`Cleaned`), (T,) and (T, C).
     required : array
         Channels that the estimator cannot do without, (C,).
     numbers : array
         Their numbers in codes, (C,).
     status, reason : array
-        (T,), changed.
+        Of health, (T,), changed.
     """
     for k in range(vy.shape[0]):
         status_of_row = int(status[k])
@@ -291,7 +294,7 @@ def widen_rows(status, reason, marks, vy, vx, farthest, bands):  # type: ignore[
     Parameters
     ----------
     status, reason, marks : array
-        (T,), of which the first two may be changed.
+        Status and code of the reason, which may be changed, and marks of the watch, (T,).
     vy, vx : array
         Estimate and its speed, (T,) [m/s].
     farthest : float

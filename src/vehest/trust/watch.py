@@ -33,23 +33,24 @@ STARTED = 8  # the estimator started anew at this sample
 class Watched(NamedTuple):
     """Estimates after bounds and bridging."""
 
-    vy: FloatArray  # (T,) [m/s]; NaN before the first estimate only
+    vy: FloatArray  # v, (T,) [m/s]; NaN before the first estimate only
     marks: NDArray[np.int8]  # sum of marks at each row, (T,)
     # whether the estimator diverged at the last row, behind which the others are left out
     lost: bool
 
 
 class Watch:
-    """Watches estimates row after row; keeps the state between calls.
+    """Clips and bridges estimates row after row, and finds that an estimator has diverged; keeps
+    the state between calls.
 
     Parameters
     ----------
     limits : GuardLimits
-        Of which the top speed and the largest tan β count.
+        Only the top speed and the largest tan β are used.
     warm_up : int
         Samples after a start for which an estimator may have no estimate.
     rate_hz : float
-        Of the rows [Hz].
+        Rate of the rows [Hz].
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
@@ -62,7 +63,7 @@ class Watch:
         self.state[0] = math.nan  # no estimate yet
 
     def __call__(self, vy: FloatArray, motion: FloatArray, flow: NDArray[np.int8]) -> Watched:
-        """Go on with the estimator's v, (T,) [m/s], NaN without one.
+        """Process the estimator's v of the next rows, (T,) [m/s], NaN where it has none.
 
         ``motion`` holds accepted vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3), NaN if unknown;
         ``flow`` is of the guard, (T,).
@@ -73,7 +74,7 @@ class Watch:
         return Watched(out[:done], marks[:done], bool(lost))
 
     def c_values(self) -> dict[str, float]:
-        """Values that the template of an export needs."""
+        """Limits and constants of the watch, name -> value, for the C template of an export."""
         return {
             "top_speed": float(self.limits.top_speed),
             "largest_tan_sideslip": float(self.limits.largest_tan_sideslip),
@@ -93,7 +94,7 @@ class Watch:
 def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[no-untyped-def]
     """Bound, bridge and judge estimates, up to the row at which the estimator is lost.
 
-    Returns the rows done, and whether it is lost.
+    Returns the number of rows that were processed, and whether it is lost.
 
     The bound is tan β_max · max(u, 1 m/s), with u the accepted speed, or the remembered one while
     the car spins or no speed is known; the memory fades with `REMEMBERED_SECONDS`. The estimator is

@@ -32,14 +32,17 @@ from torch import Tensor
 from vehest.constants import GRAVITY
 from vehest.vehicle.parameters import check_parameters
 
-TRACK_STATES = ("vy", "yaw_rate")
+TRACK_STATES = ("vy", "yaw_rate")  # names of the states
+# names of the measurements
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
-MAX_FORCE_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
-MIN_FRICTION_SHARE = 0.2  # of the friction that sliding leaves
-MIN_LOAD_SHARE = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
-MIN_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
+MAX_FORCE_RATIO = {"plain": 1.0, "smooth": 10.0}  # tyres -> λ from which on f is 1
+MIN_FRICTION_SHARE = 0.2  # smallest share of the friction that remains while sliding
+MIN_LOAD_SHARE = 0.1  # smallest load of an axle under longitudinal acceleration over that at rest
+# smallest denominator of the tangent of the front slip angle, so that a tyre that slides sideways
+# has a finite one
+MIN_COSINE = 0.05
 
-Tyres = Literal["plain", "smooth"]
+Tyres = Literal["plain", "smooth"]  # Eq. 9 or Eq. 10
 
 
 @dataclass(frozen=True)
@@ -149,8 +152,8 @@ class DugoffTrack:
     front: DugoffAxle  # the front axle's tyres
     rear: DugoffAxle  # the rear axle's tyres
     step: float  # Δt [s]
-    tyres: Tyres = "plain"  # ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
-    minimum_speed: float = 3.0  # see above [m/s]
+    tyres: Tyres = "plain"  # ``plain`` (Eq. 9) or ``smooth`` (Eq. 10)
+    minimum_speed: float = 3.0  # speed below which wheels roll without slip [m/s]
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Axle forces across the body.

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from vehest.vehicle.planar import F1TENTH, FIXED_PARAMETERS, LEARNT, Motion, PlanarCar
 from vehest.vehicle.tyres import PacejkaTyres, Slips, TyreForces
 
-STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
+STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")  # names of the states
 
 PACEJKA: Mapping[str, float] = {
     "friction": 0.8916,
@@ -38,7 +38,9 @@ PACEJKA: Mapping[str, float] = {
         for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))
     },
 }
-"""Where learning Pacejka's curves of the F1TENTH car starts; the same source."""
+"""Initial values of the learnt parameters of Pacejka's curves, for the F1TENTH car; the same
+source.
+"""
 
 TURN = 100.0  # [1/rad] steepness with which a lateral force changes its sign
 UNSCALED = 0.4  # factor of the forces of a tyre network that does not know the friction
@@ -71,13 +73,13 @@ class Perceptron(nn.Sequential):
         self.register_buffer("output_scale", torch.ones(sizes[-1]))
 
     def forward(self, values: Tensor) -> Tensor:
-        """(..., inputs) -> (..., outputs)."""
+        """Outputs (..., outputs) of the network for inputs (..., inputs)."""
         scaled: Tensor = super().forward(values / self.input_scale)  # type: ignore[no-untyped-call]
         return scaled * self.output_scale
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw weights and offsets anew, uniform within one over the root of a layer's inputs
-        (torch's way).
+        """Draw weights and biases anew, uniform within ±1/√n for a layer of n inputs, as torch
+        does.
         """
         with torch.no_grad():
             for layer in self:
@@ -137,7 +139,9 @@ def rk4(
 
 
 class Dynamics(nn.Module):
-    """A planar car with everything that makes it move. Friction stays as it is."""
+    """Base of planar cars: rates of the state, from which transition and observation follow; the
+    friction is constant.
+    """
 
     @abstractmethod
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
@@ -171,7 +175,8 @@ class Dynamics(nn.Module):
         return rk4(self.rates, state, inputs, step)
 
     def observation(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """What sensors read: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (..., 4).
+        """Measurements that sensors show: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (...,
+        4).
 
         Yaw rate and rim speed are those of the state itself.
         """
@@ -204,14 +209,14 @@ class PacejkaCar(Dynamics):
         self.tyres = PacejkaTyres(PACEJKA, with_curvature=with_curvature)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by Pacejka's curves; see `Dynamics.motion`."""
         return self.car.motion(
             state, inputs, self.tyres(self.car.slips(state, inputs), self.car.loads())
         )
 
 
 class ResidualCar(PacejkaCar):
-    """PCR: the same, and a network that adds to its rates.
+    """PCR: `PacejkaCar` with a network that adds to its rates.
 
     The network receives vx, vy, yaw rate, rim speed, steering angle and current, and adds to all
     four rates. Accelerations follow from the corrected rates by kinematics, a_x = vx' - vy r and
@@ -230,7 +235,7 @@ class ResidualCar(PacejkaCar):
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by Pacejka's curves and the network; see `Dynamics.motion`."""
         return _kinematic(
             state,
             super().motion(state, inputs).rates
@@ -254,7 +259,7 @@ class NeuralCar(Dynamics):
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by the network; see `Dynamics.motion`."""
         return _kinematic(state, self.network(torch.cat([state[..., :4], inputs], -1)))
 
 
@@ -284,7 +289,7 @@ class TyreNetworkCar(Dynamics):
         self.network = Perceptron(9 if friction_scaled else 10, *hidden, 4)
 
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
-        """Forces of both axles in the wheels' axes [N].
+        """Forces of both axles in the wheels' axes [N], by the network.
 
         Parameters
         ----------
@@ -318,7 +323,7 @@ class TyreNetworkCar(Dynamics):
         )
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
-        """See `Dynamics.motion`."""
+        """Rates and accelerations by tyre forces of the network; see `Dynamics.motion`."""
         return self.car.motion(
             state, inputs, self.forces(state, inputs, self.car.slips(state, inputs))
         )

@@ -10,15 +10,16 @@ from typing import Any, NamedTuple
 class Range(NamedTuple):
     """Smallest and largest plausible value of a quantity, in its SI unit."""
 
-    lower: float
-    upper: float
+    lower: float  # smallest value
+    upper: float  # largest value
 
 
-# From a car of 40 g on a table to the heaviest road vehicle.
+# plausible ranges, from a car of 40 g on a table to the heaviest road vehicle
 MASS = Range(1e-3, 1e6)  # [kg]
 YAW_INERTIA = Range(1e-7, 1e8)  # [kg m²]
 LENGTH = Range(1e-3, 30.0)  # [m]
 CORNERING_STIFFNESS = Range(1e-3, 1e9)  # [N/rad]
+# parameter of a car -> its plausible range
 RANGES: Mapping[str, Range] = {
     "mass": MASS,
     "yaw_inertia": YAW_INERTIA,

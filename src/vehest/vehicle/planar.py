@@ -37,17 +37,19 @@ F1TENTH: Mapping[str, float] = {
 """A car: fixed parameters, and start values of the learnt ones; as in the public code of
 Węgrzynowski et al. 2024, whose paper has 4.5 kg.
 """
-FIXED_PARAMETERS = ("mass", "wheelbase", "wheel_radius")  # [kg, m, m]
+# names of the parameters that are not learnt [kg, m, m]
+FIXED_PARAMETERS = ("mass", "wheelbase", "wheel_radius")
+# names of the learnt parameters
 LEARNT = tuple(name for name in F1TENTH if name not in FIXED_PARAMETERS)
 
 
 class Motion(NamedTuple):
-    """Rates of a planar car."""
+    """Rates and accelerations of a planar car."""
 
-    rates: Tensor  # dx/dt, (..., 4)
+    rates: Tensor  # rates of vx, vy, yaw rate and rim speed, (..., 4)
     # longitudinal acceleration that a sensor at the centre of gravity reads (...) [m/s²]
     ax: Tensor
-    ay: Tensor  # the lateral one (...) [m/s²]
+    ay: Tensor  # lateral acceleration that it reads (...) [m/s²]
 
 
 class PlanarCar(nn.Module):
@@ -79,7 +81,7 @@ class PlanarCar(nn.Module):
         return self.wheelbase - self.learnt["cg_to_rear_axle"]
 
     def slips(self, state: Tensor, inputs: Tensor) -> Slips:
-        """How the tyres slide; as in the authors' code.
+        """Slip angles and longitudinal slip of the tyres, as in the authors' code.
 
         α_F = atan((vy + l_F r)/vx) - δ, α_R = atan((vy - l_R r)/vx), κ = (ω - vx)/vx with the rim
         speed ω; `SLIP_SPEED_OFFSET` is added to every vx in a denominator. Slip angles are positive

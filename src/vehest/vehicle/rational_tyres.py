@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 
 class AxleForce(NamedTuple):
-    """Lateral force of an axle and what it changes by."""
+    """Lateral force of an axle and its derivatives."""
 
     force: Any  # positive to the left [N]
     per_slip: Any  # ∂F/∂α [N/rad]; ∂F/∂α = c₂ μ (1 - q)/(1 + q)², negative beyond the peak

@@ -24,10 +24,10 @@ from vehest.vehicle.parameters import SingleTrackParameters
 class LateralModel(NamedTuple):
     """dx/dt = A x + B δ, or x⁺ = A x + B δ in steps, and a_y = C x + D δ [m/s²]."""
 
-    A: FloatArray  # (..., 2, 2)
-    B: FloatArray  # (..., 2)
-    C: FloatArray  # (..., 2)
-    D: FloatArray  # (...)
+    A: FloatArray  # state matrix, (..., 2, 2)
+    B: FloatArray  # input vector, (..., 2)
+    C: FloatArray  # output vector of a_y, (..., 2)
+    D: FloatArray  # feedthrough of δ to a_y, (...)
 
     def in_steps(self, step: float) -> LateralModel:
         """Discretise by forward Euler, x⁺ = (I + τA) x + τB δ; C and D stay.

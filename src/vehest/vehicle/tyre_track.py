@@ -25,7 +25,9 @@ from torch import Tensor
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.rational_tyres import AxleForce, rational_axle
 
+# names of the first four states
 MOTION = ("sideslip", "yaw_rate", "sideslip_rate", "yaw_acceleration")
+# names of the tyre parameters, in their order
 TYRE_PARAMETERS = ("c1_front", "c2_front", "c1_rear", "c2_rear", "friction")
 
 
@@ -38,7 +40,7 @@ class TyreTrack:
     # c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of
     # `TYRE_PARAMETERS`
     nominal: tuple[float, float, float, float, float]
-    adapted: Sequence[int]  # which of them are states, as indices
+    adapted: Sequence[int]  # indices of the parameters that are states, in `TYRE_PARAMETERS`
     step: float  # Δt [s]
 
     def parameters(self, states: Tensor) -> list[Tensor]:

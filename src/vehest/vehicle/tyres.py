@@ -13,22 +13,22 @@ SLIP_SPEED_OFFSET = 1e-6  # added to speeds that slips are divided by [m/s]
 
 
 class Slips(NamedTuple):
-    """How tyres slide."""
+    """Slip angles and longitudinal slip of the tyres."""
 
     # slip angle of the front axle [rad], (...), positive where it slides to the left of where it
     # points
     front: Tensor
-    rear: Tensor  # of the rear axle
+    rear: Tensor  # slip angle of the rear axle, likewise
     ratio: Tensor  # longitudinal slip, positive where wheels drive, the same for both axles (...)
 
 
 class TyreForces(NamedTuple):
     """Forces of both axles in the axes of their wheels (...) [N]."""
 
-    front_x: Tensor
-    front_y: Tensor
-    rear_x: Tensor
-    rear_y: Tensor
+    front_x: Tensor  # longitudinal force of the front axle
+    front_y: Tensor  # lateral force of the front axle
+    rear_x: Tensor  # longitudinal force of the rear axle
+    rear_y: Tensor  # lateral force of the rear axle
 
 
 class PositiveParameters(nn.Module):

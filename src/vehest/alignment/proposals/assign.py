@@ -71,36 +71,46 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import abbreviated
 
-MAX_STANDSTILL_SPEED = 0.5  # m/s; a car whose speed never exceeds it did not move
-SCORE_MARGIN = 4.0  # score below that of the best triple, within which an agreement with ax decides
-AX_WEIGHT = 4.0  # of the correlation of d(vx)/dt with ax, added to a triple's score
-MAX_AX_CANDIDATES = 40  # columns at most that are compared with d(vx)/dt, the first ones
-MIN_GRAVITY_CORRELATION = 0.7  # of the gravity in an acceleration with that by an angle
-GRAVITY_WEIGHT = 4.0  # of the correlation of a roll angle with ay beyond vx·yaw_rate
-MAX_LISTED = 8  # columns that a note names at most; further ones are counted
-# of ay over d(vy)/dt + vx·yaw_rate; outside, the speed is questioned
+MAX_STANDSTILL_SPEED = 0.5  # m/s, top speed of a log in which the car did not move
+# largest difference of a triple's score from the best one within which agreement with ax decides
+SCORE_MARGIN = 4.0
+AX_WEIGHT = 4.0  # weight of the correlation of d(vx)/dt with ax in a triple's score
+MAX_AX_CANDIDATES = 40  # largest number of columns that are compared with d(vx)/dt, the first ones
+# smallest correlation of the gravity in an acceleration with that by an angle
+MIN_GRAVITY_CORRELATION = 0.7
+GRAVITY_WEIGHT = 4.0  # weight of the correlation of a roll angle with ay beyond vx·yaw_rate
+MAX_LISTED = 8  # largest number of columns that a note names; further ones are counted
+# range of ay over d(vy)/dt + vx·yaw_rate outside which the speed is questioned
 SPEED_GAIN_RANGE = (0.97, 1.08)
-SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)  # the same where d(vy)/dt is not known
-MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)  # outside, a unit may be wrong instead (`scales`)
-# between the gains by wheel speeds and by ay/yaw_rate, to correct the speed by it
+# range of ay over vx·yaw_rate outside which the speed is questioned, where d(vy)/dt is not known
+SPEED_GAIN_RANGE_WITHOUT_VY = (0.92, 1.08)
+# range of the same outside which a unit may be wrong instead (`scales`)
+MISREAD_SPEED_GAIN_RANGE = (0.74, 1.35)
+# largest difference between the gains by wheel speeds and by ay/yaw_rate with which the speed is
+# corrected
 MAX_WHEEL_GAIN_DIFFERENCE = 0.02
-# of a column with a derivative of a position, to be along an axis of the world
+# smallest correlation of a column along an axis of the world with a derivative of a position
 MIN_WORLD_CORRELATION = 0.98
-# spread of the steps along one coordinate over that along the other; with less the path is straight
+# smallest spread of the steps along one coordinate over that along the other; with less the path is
+# straight
 MIN_WORLD_CROSSING = 0.05
-# of wheels or a course with the yaw rate, from which on they decide left and right
+# smallest correlation of wheels or a course with the yaw rate by which they decide left and right
 MIN_SIDE_CORRELATION = 0.5
-# Hz, of which the nearest is proposed
+# Hz, rates of which the nearest is proposed
 PLAIN_RATES_HZ = (5, 10, 20, 25, 40, 50, 60, 100, 125, 200, 250, 400, 500, 1000, 2000)
 NOMINAL_RATE_HZ = 50.0  # Hz, assumed for a log without times
-# distance of log10(ax over d(vx)/dt) from a whole number, within which a rate is off by decades
+# largest distance of log10(ax over d(vx)/dt) from a whole number with which a rate is off by
+# decades
 MAX_DECADE_ERROR = 0.1
-MIN_COURSE_SAMPLES = 50  # with so many samples of a course or fewer it gives no side
-MIN_COURSE_SPEED_SHARE = 0.2  # of the top speed; the course of a slower car is noise
-MAX_COURSE_STEP = 1.0  # rad from sample to sample; larger steps do not count
-SIDESLIP_RANGE = (0.01, 1.0)  # rad, width of 96 % of a sideslip angle's values; outside it is none
-MAX_IMPOSSIBLE_SHARE = 0.002  # share of samples outside the possible range that may be spikes
-USUAL_MAGNITUDES = {  # 99th percentile, SI units
+MIN_COURSE_SAMPLES = 50  # number of samples of a course that it must exceed to decide a side
+# lowest speed at which a course counts, over the top speed; the course of a slower car is noise
+MIN_COURSE_SPEED_SHARE = 0.2
+MAX_COURSE_STEP = 1.0  # rad, largest change of a course from sample to sample that counts
+SIDESLIP_RANGE = (0.01, 1.0)  # rad, smallest and largest width of 96 % of a sideslip angle's values
+# largest share of samples outside the possible range that may be spikes
+MAX_IMPOSSIBLE_SHARE = 0.002
+# channel -> range of its 99th percentile in cars, SI units
+USUAL_MAGNITUDES = {
     "vx": (1.0, 90.0),
     "yaw_rate": (0.03, 3.0),
     "ay": (0.5, 25.0),
@@ -110,7 +120,8 @@ USUAL_MAGNITUDES = {  # 99th percentile, SI units
     "vy_ref": (0.02, 8.0),
     "sideslip_ref": (0.002, 0.8),
 }
-UNCONFIRMED = "no other column confirms it"
+UNCONFIRMED = "no other column confirms it"  # end of a question on a channel without relations
+# question on a channel with one piece of evidence
 SINGLE_EVIDENCE = (
     "only one piece of evidence, two are needed (relation to other columns, unit, name)"
 )
@@ -238,7 +249,7 @@ def propose(
 
 
 def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
-    """Leave out or question channels whose values no vehicle can have.
+    """Proposals without, or with questions on, channels whose values no vehicle can have.
 
     Parameters
     ----------
@@ -296,7 +307,9 @@ def _is_standing(columns: Sequence[Candidate]) -> bool:
 def _turnings_of_any_axes(
     columns: Sequence[Candidate],
 ) -> tuple[list[Candidate], list[Turning]]:
-    """Triples, best first, with x, y and z as named or, where it explains more, along any axes."""
+    """Columns that are used, and triples, best first, with x, y and z as named or, where it
+    explains more, along any axes.
+    """
     as_named = list(columns)
     any_axes = without_axes(columns)
     turnings = find_turning(as_named)
@@ -319,8 +332,8 @@ def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: floa
 def _best_search(
     columns: Sequence[Candidate], turnings: Sequence[Turning], rate_hz: float
 ) -> Search | None:
-    """Around the triple, among the best ones, that agrees best with an ax; of its accelerations,
-    the one that agrees with a roll angle too. Without triples, around names.
+    """The search around that one of the best triples that agrees best with an ax; of its
+    accelerations, the one that agrees with a roll angle too. Without triples, around names.
     """
     if not turnings:
         turning = turning_by_names(columns)
@@ -393,7 +406,9 @@ def _is_driven_ahead(search: Search) -> bool:
 
 
 def _with_speed_by_ax(named: Turning, columns: Sequence[Candidate], rate_hz: float) -> Turning:
-    """With the unit of speed in which d(vx)/dt agrees best with an ax, where one decides it."""
+    """The triple with the unit of speed in which d(vx)/dt agrees best with an ax, where one decides
+    it.
+    """
     ranked = [(CLOSE_MISMATCH, named)]
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
@@ -492,7 +507,8 @@ def _assign(columns: Sequence[Candidate], search: Search | None, wheels: Wheels)
 def _with_signs_of_gravity(
     proposals: Proposals, motion: Motion, columns: Sequence[Candidate]
 ) -> Proposals:
-    """With the opposite sign, and a question, of a roll or pitch that gravity contradicts.
+    """The proposals with the opposite sign, and a question, of a roll or pitch that gravity
+    contradicts.
 
     A sensor measures ay = d(vy)/dt + vx·yaw_rate + g·sin(roll) and ax = d(vx)/dt - vy·yaw_rate -
     g·sin(pitch).
@@ -536,7 +552,9 @@ def _channels_of_motion(
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
-    """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
+    """Proposals of speed, yaw rate and lateral acceleration, without a speed that was made of
+    wheels.
+    """
     question = ""
     if "ay" in turning.columns:
         figures = f"correlation {turning.correlation:.2f}, gain {turning.scale:.3g}"
@@ -573,7 +591,8 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
 def _ask_for_second_evidence(
     turning: Turning, channels: Mapping[str, Proposal]
 ) -> dict[str, Proposal]:
-    """Question speed, yaw rate and lateral acceleration with a single piece of evidence.
+    """Channels, by name, with a question on speed, yaw rate and lateral acceleration if they have a
+    single piece of evidence.
 
     Pieces are the relation ay ≈ vx·yaw_rate, a relation to another channel, a second measurement,
     the unit of the header and the name. yaw_rate ≈ steer·vx/wheelbase and a lateral velocity
@@ -652,7 +671,9 @@ def _channels_by_name(
 
 
 def _proposal_by_name(column: Candidate, channel: str) -> Proposal:
-    """In the header's unit, or the first in which its magnitude is usual, or at least possible."""
+    """A proposal in the header's unit, or the first in which the column's magnitude is usual, or at
+    least possible.
+    """
     unit = column.unit
     evidence = "name and unit"
     if not unit:
@@ -682,7 +703,9 @@ def _proposal_by_name(column: Candidate, channel: str) -> Proposal:
 def _with_pose(
     proposals: Proposals, columns: Sequence[Candidate], motion: Motion | None
 ) -> Proposals:
-    """With a pose that supplies a missing reference, or notes of what could supply one."""
+    """The proposals with a pose that supplies a missing reference, or notes of what could supply
+    one.
+    """
     if set(REFERENCES) & set(proposals.by_channel):
         return proposals
     proposals = replace(proposals, pose=find_pose(columns, motion))
@@ -759,8 +782,8 @@ def _places(columns: Sequence[Candidate]) -> list[FloatArray]:
 
 
 def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Proposals:
-    """Where the speed is one along an axis of the world, question it, the lateral velocity, and
-    accelerations along such an axis.
+    """The proposals with questions where the speed is one along an axis of the world: on it, the
+    lateral velocity, and accelerations along such an axis.
     """
     speed = proposals.by_channel.get("vx")
     if speed is None or speed.column not in in_world:
@@ -781,7 +804,8 @@ def _ask_about_world_axes(proposals: Proposals, in_world: Collection[str]) -> Pr
 def _ask_about_speed(
     proposals: Proposals, search: Search, wheels: Wheels, columns: Sequence[Candidate]
 ) -> Proposals:
-    """Question the speed where ay/yaw_rate and the wheels agree on another; a note by ay alone.
+    """The proposals with a question on the speed where ay/yaw_rate and the wheels agree on another;
+    with a note by ay alone.
 
     ay is compared with d(vy)/dt + vx·yaw_rate where a reference gives vy. Without one, d(vy)/dt
     makes up some per cent, so that only more than these count.
@@ -821,7 +845,7 @@ def _ask_about_speed(
 def _expected_ay(
     proposals: Proposals, motion: Motion, columns: Sequence[Candidate]
 ) -> tuple[FloatArray, tuple[float, float]]:
-    """ay by the motion, (S,), and the range of ay over it with a right speed."""
+    """ay by the motion, (S,) [m/s²], and the range of ay over it with a right speed."""
     for name in REFERENCES:
         reference = proposals.by_channel.get(name)
         if reference is None or reference.is_weak:
@@ -835,7 +859,7 @@ def _expected_ay(
 
 
 def _excess(*gains: float) -> str:
-    """For example ``2 to 6 % too high``, of a speed by which ay is these times as large."""
+    """Text such as ``2 to 6 % too high``, on a speed by which ay is these times as large."""
     percents = [f"{abs(100.0 * (1.0 / gain - 1.0)):.0f}" for gain in gains]
     return f"{' to '.join(dict.fromkeys(percents))} % too {'high' if gains[0] < 1.0 else 'low'}"
 
@@ -849,8 +873,9 @@ def _with_left_right(
     motion: Motion | None,
     clues: Iterable[tuple[str, float]],
 ) -> Proposals:
-    """With signs by the first clue that decides, else by a pose, else by a heading that may be
-    a compass's, else by gravity along a z axis that points down, else as most columns count.
+    """The proposals with signs by the first clue that decides, else by a pose, else by a heading
+    that may be a compass's, else by gravity along a z axis that points down, else as most columns
+    count.
     """
     for text, agreement in clues:
         if abs(agreement) > MIN_SIDE_CORRELATION:
@@ -916,7 +941,9 @@ def _compass(columns: Sequence[Candidate], motion: Motion | None) -> tuple[str, 
 
 
 def _with_signs_of_majority(proposals: Proposals) -> Proposals:
-    """With signs that nothing but a name suggests set to that of most lateral channels."""
+    """The proposals with signs that nothing but a name suggests set to that of most lateral
+    channels.
+    """
     lateral = [proposal for proposal in proposals.channels if proposal.channel in LATERAL]
     by_name = [
         proposal

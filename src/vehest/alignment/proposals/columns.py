@@ -17,23 +17,30 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 
-SLOW_HZ = 1.0  # Hz; below, a delay of a tenth of a second and vibration matter little
-SLOW_RATE_HZ = 5.0  # Hz, about the rate of low-passed columns
-MAX_SLOW_SAMPLES = 4000  # samples of a low-passed column; a longer one is thinned out further
-# of a column's samples, which a line then bridges; with more it is left out
-MAX_MISSING_SHARE = 0.5
-STRAY_DISTANCE = 20.0  # times the spread of nearly all samples; no sample of a motion lies beyond
-MAX_STRAY_SHARE = 0.002  # of a column's samples; where more lie far outside, none counts as stray
-# samples; a longer column that never decreases is a clock, unless it is named as a position
+# Hz, cut-off of low-passed columns; below it, a delay of a tenth of a second and vibration matter
+# little
+SLOW_HZ = 1.0
+SLOW_RATE_HZ = 5.0  # Hz, approximate rate of low-passed columns
+# largest number of samples of a low-passed column; a longer one is thinned out further
+MAX_SLOW_SAMPLES = 4000
+MAX_MISSING_SHARE = 0.5  # largest share of missing samples of a column, which a line then bridges
+STRAY_DISTANCE = 20.0  # smallest distance of a stray sample, over the spread of nearly all samples
+# largest share of stray samples; where more lie far outside, none counts as stray
+MAX_STRAY_SHARE = 0.002
+# number of samples above which a column that never decreases is a clock, unless it is named as a
+# position
 MIN_CLOCK_SAMPLES = 1000
 HINT_OF_LETTER = 3.0  # strength of hints by three names that differ in the letter of an axis alone
 ROLES_OF_AXES = {"roll_rate", "pitch_rate"}  # roles that no relation to other channels reveals
-MAX_LEVEL_SAMPLES = 200_000  # samples at most in which different values are counted
-_SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")  # of a magnitude
-_LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz](?= \w+$|$)")  # perhaps before a unit
-MIN_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
+MAX_LEVEL_SAMPLES = 200_000  # largest number of samples in which different values are counted
+# matches names of columns that hold the sign of a magnitude
+_SIGN = re.compile(r" (vz|vorzeichen|sign)$|\b(vz|vorzeichen|sign) ")
+# matches the letter of an axis in a name, perhaps before a unit
+_LETTER_OF_AXIS = re.compile(r"^[xyz] | ?[xyz](?= \w+$|$)")
+MIN_LEVELS = 9  # smallest number of values that a motion takes; a gear or a flag takes fewer
 
-UNITS = {  # where the header is silent, the likeliest first
+# channel -> units that are tried where the header states none, the likeliest first
+UNITS = {
     "vx": ("m/s", "km/h", "mph", "knots"),
     "yaw_rate": ("rad/s", "deg/s"),
     "ay": ("m/s²", "g"),
@@ -43,7 +50,8 @@ UNITS = {  # where the header is silent, the likeliest first
     "vy_ref": ("m/s", "km/h"),
     "sideslip_ref": ("rad", "deg"),
 }
-RARE_UNITS = {  # of loggers that write whole numbers; tried where the others explain nothing
+# channel -> units of loggers that write whole numbers, tried where the others explain nothing
+RARE_UNITS = {
     "vx": ("cm/s", "mm/s", "ft/s", "0.01*km/h"),
     "yaw_rate": ("mrad/s", "mdeg/s", "0.1*deg/s", "0.01*deg/s", "deg/min"),
     "ay": ("mg", "cm/s²", "mm/s²", "ft/s²", "0.01*g"),
@@ -55,18 +63,18 @@ RARE_UNITS = {  # of loggers that write whole numbers; tried where the others ex
 class Candidate:
     """A column that may be a channel."""
 
-    name: str  # in its log
-    unit: str  # by the header, as vehest spells it; empty where unknown
-    values: FloatArray  # in the file's unit, without gaps, (T,)
-    slow: FloatArray  # low-passed, at `SLOW_RATE_HZ` or less, (S,)
+    name: str  # name of the column in its log
+    unit: str  # unit by the header, as vehest spells it; empty where unknown
+    values: FloatArray  # samples in the file's unit, without gaps, (T,)
+    slow: FloatArray  # low-passed samples, at `SLOW_RATE_HZ` or less, (S,)
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
-    is_wheel_mean: bool = False  # whether it is the mean of wheels, and no column of the log
+    is_wheel_mean: bool = False  # whether this is the mean of wheels, and no column of the log
     device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
 
     @cached_property
     def size(self) -> float:
-        """99th percentile of the magnitude, of what is slow, in the file's unit; thousands of
-        triples of columns ask for it.
+        """99th percentile of the magnitude of the low-passed samples, in the file's unit; thousands
+        of triples of columns ask for it.
         """
         return largest(self.slow)
 
@@ -92,7 +100,7 @@ class Candidate:
         return self.hints.get(role, -max(self.hints.values(), default=0.0))
 
     def units(self, channel: str) -> Sequence[str]:
-        """The header's unit, or those to try for a channel."""
+        """The header's unit, or those to try for a channel where it states none."""
         return [self.unit] if self.unit else UNITS[channel]
 
     def measures(self, channel: str) -> bool:
@@ -255,7 +263,7 @@ def _stray(values: FloatArray) -> NDArray[np.bool_]:
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
-    """Low-passed at `SLOW_HZ` and thinned out.
+    """Samples low-passed at `SLOW_HZ` and thinned out.
 
     Parameters
     ----------
@@ -278,7 +286,7 @@ def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def correlation(left: FloatArray, right: FloatArray) -> float:
-    """Of two signals about their means; 0 where one does not change.
+    """Correlation of two signals about their means; 0 where one does not change.
 
     Parameters
     ----------
@@ -292,5 +300,5 @@ def correlation(left: FloatArray, right: FloatArray) -> float:
 
 
 def largest(samples: FloatArray) -> float:
-    """99th percentile of the magnitude."""
+    """99th percentile of the magnitude of samples."""
     return float(np.quantile(np.abs(samples), 0.99))

@@ -31,32 +31,35 @@ from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
-CLEAR_CORRELATION = 0.6  # correlation that decides where nothing else comes near
-CLEAR_LATERAL_CORRELATION = 0.45  # of relations with derivatives of noisy channels
-# of a lateral velocity: correlation that decides where its name agrees, and where its score starts
+CLEAR_CORRELATION = 0.6  # smallest correlation that decides where nothing else comes near
+# smallest correlation that decides, of relations with derivatives of noisy channels
+CLEAR_LATERAL_CORRELATION = 0.45
+# smallest correlation of a lateral velocity that decides where its name agrees, and where its score
+# starts
 MIN_STRENGTH = 0.3
-RIVAL_MARGIN = 2.0  # score below that of the chosen column, within which another one is a rival
-# logarithm of the gain of an acceleration to d(vx)/dt, within which pitch, grade and slip explain
-# it
+RIVAL_MARGIN = 2.0  # largest difference of the score of a rival from that of the chosen column
+# largest |logarithm| of the gain of an acceleration to d(vx)/dt that pitch, grade and slip explain
 MAX_AX_MISMATCH = 1.1
-# of score, for a reference's column as a channel that the car measures itself; more where its bus
-# has a column of that name
+# penalty on the score of a reference's column as a channel that the car measures itself
 REFERENCE_PENALTY = 2.5
+# penalty on that score where the car's bus has a column of that name
 REFERENCE_PENALTY_WITH_BUS = 8.0
-MIN_SECOND_SCORE = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
-MAX_CENTRE_SHARE = 0.1  # of a command's range, by which straight ahead may lie beside nil
-CRAWL_SHARE = 0.05  # of the top speed, below which a sideslip angle has no meaning
+MIN_SECOND_SCORE = 3.0 + STRONG  # smallest score of a sideslip angle besides a lateral velocity
+MAX_CENTRE_SHARE = 0.1  # largest distance of straight ahead from zero, over a command's range
+CRAWL_SHARE = 0.05  # speed over the top speed below which a sideslip angle has no meaning
+# text on a column that the motion does not clearly confirm
 UNCLEAR = "the motion does not clearly confirm it"
-MIN_SIDESLIP_CORRELATION = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
-REFERENCES = ("vy_ref", "sideslip_ref")
+MIN_SIDESLIP_CORRELATION = 0.9  # smallest correlation of a sideslip angle with atan2(vy, vx)
+REFERENCES = ("vy_ref", "sideslip_ref")  # channels of a reference that are sought
 NAMED_LIKE = {
     "ax": ("ax",),
     **dict.fromkeys(("steer", "handwheel"), ("steer", "handwheel")),
     **dict.fromkeys(REFERENCES, REFERENCES),
 }
 """Channel -> roles of which the name of its column suggests one."""
-MAX_ANGLES = {"steer": 0.8, "handwheel": 16.0}  # rad
-MAX_STRAIGHT_ANGLE = 0.1  # rad that a road wheel may show there, of an angle
+# rad, largest angle of the road wheels and of the steering wheel
+MAX_ANGLES = {"steer": 0.8, "handwheel": 16.0}
+MAX_STRAIGHT_ANGLE = 0.1  # rad, largest angle of a road wheel straight ahead
 # wheelbase, and wheelbase times steering ratio, of cars [m]
 POSSIBLE_LENGTHS = {
     "steer": (1.2, 7.0),
@@ -67,46 +70,49 @@ USUAL_LENGTHS = {
     "steer": (1.8, 5.0),
     "handwheel": (25.0, 80.0),
 }
-TYPICAL_LENGTHS = {"steer": 2.7, "handwheel": 43.0}  # m
+# wheelbase, and wheelbase times steering ratio, of a typical car [m]
+TYPICAL_LENGTHS = {"steer": 2.7, "handwheel": 43.0}
 MIN_MODEL_WHEELBASE = 0.08  # m, wheelbase of the smallest model
-MAX_MODEL_SPEED = 20.0  # m/s; a drive that is slower throughout may be that of a model
-MIN_CALM_SAMPLES = 100  # samples in slow corners; with fewer all of the drive are used
-# of a length by half of the slow corners from that by all; a lane change at one speed has more
+MAX_MODEL_SPEED = 20.0  # m/s, top speed of a model car
+# smallest number of samples in slow corners; with fewer all of the drive are used
+MIN_CALM_SAMPLES = 100
+# largest relative difference of a length by half of the slow corners from that by all; a lane
+# change at one speed has more
 MAX_HALF_DIFFERENCE = 0.2
 
 
 class Offer(NamedTuple):
     """A column as a channel, with the score of its evidence."""
 
-    score: float
-    column: Candidate
-    proposal: Proposal
+    score: float  # score of its evidence
+    column: Candidate  # the column
+    proposal: Proposal  # the proposal of this channel
 
 
 class Agreement(NamedTuple):
-    """How a column in some unit agrees with a motion."""
+    """Agreement of a column, as a channel in some unit, with a motion."""
 
-    channel: str  # that it would be
-    unit: str  # of the column
-    strength: float = 0.0  # absolute correlation; 0 where hardly anything is common
-    sign: int = 1  # of the correlation
-    scale: float = math.inf  # that should be 1
-    text: str = ""  # for people
+    channel: str  # channel that the column would be
+    unit: str  # unit of the column
+    strength: float = 0.0  # absolute correlation; 0 where both have hardly anything in common
+    sign: int = 1  # sign of the correlation
+    scale: float = math.inf  # gain, which should be 1
+    text: str = ""  # text for people
 
     @property
     def mismatch(self) -> float:
-        """Logarithm of the scale."""
+        """Magnitude of the logarithm of the scale."""
         return abs(math.log(self.scale))
 
 
 class Angle(NamedTuple):
-    """Possible angle of steering."""
+    """An angle of steering that a column may be."""
 
     oddness: float  # logarithm of the length over that of a usual car
     channel: str  # ``steer`` or ``handwheel``
-    unit: str  # of the column
+    unit: str  # unit of the column
     length: float  # wheelbase, or that times the steering ratio, by slow cornering [m]
-    largest: float  # angle, less that of straight ahead [rad]
+    largest: float  # largest angle, less that of straight ahead [rad]
     is_repeatable: bool  # whether both halves of the slow corners give nearly this length
 
 
@@ -169,7 +175,9 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
 
 
 def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
-    """Asked where another column comes near, or has the name that the chosen one lacks."""
+    """The chosen proposal, with a question where another column comes near, or has the name that
+    the chosen one lacks.
+    """
 
     def is_named(offer: Offer) -> bool:
         return any(role in offer.column.hints for role in NAMED_LIKE[offer.proposal.channel])
@@ -200,7 +208,7 @@ def may_be_ax(column: Candidate) -> bool:
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:
     """A column as longitudinal acceleration, by its agreement with d(vx)/dt and its name; None
-    where neither speaks for it.
+    where neither supports it.
     """
     if not may_be_ax(column):
         return None

@@ -14,6 +14,7 @@ from functools import cache
 STRONG = 4.0  # score of a role that a name states
 WEAK = 2.0  # score of a role that a name may state
 
+# role -> pattern of names that state it, searched for in the name without blanks
 _STRONG = {  # role -> pattern, searched for in the name without blanks
     "other": (
         r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|"
@@ -82,6 +83,7 @@ _STRONG = {  # role -> pattern, searched for in the name without blanks
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",
 }
+# role -> pattern of names that may state it
 _WEAK = {
     "yaw_rate": r"gyro|gier|dpsi|^r$|^w$|^omega$|yaw|wimu",
     "ay": r"quer$|^quer|lateral|^lat",
@@ -92,44 +94,57 @@ _WEAK = {
     "sideslip_ref": r"slip",
     "heading": r"yaw|^phi$|head|^theta$",
 }
+# matches names of reference sensors
 _REFERENCE = re.compile(
     r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|"
     r"optitrack|true|truth|\bgt\b|datron|s350|"
     r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys|"
     r"from (yaw|pose|positions?)\b"
 )
+# matches names of signals on the car's own bus
 _BUS = re.compile(
     r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|"
     r"^algt\d"
 )
+# matches names of frames of the world
 _WORLD_FRAME = re.compile(r"\b(world|global|map|utm|earth)\b")
-# of a quantity along an axis of the world, which no channel is
+# matches names of quantities along an axis of the world, which no channel is
 _WORLD_AXIS = re.compile(
     r"\b(east|north|down|ost|nord|ned|enu|ecef)(ward)?\b|(east|north|ecef)|"
     r"\b(v|vel|velocity|speed|spd|acc|acceleration)( ?[en]| d| up)$"
 )
+# matches names of rates of the steering angle
 _STEERING_RATE = re.compile(
     r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|"
     r"deltadot|ddelta"
 )
+# matches names of filtered signals
 _FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
+# matches words that say nothing on the quantity
 _UNTELLING = re.compile(r"\b(body|bdy|frame|chassis|device)\b")
+# matches names of set values
 _SET_VALUE = re.compile(r"\b(target|soll|desired|demand(ed)?|set ?point|wunsch|cmd|command)|soll\b")
+# matches names of quantities of a trailer
 _TRAILER = re.compile(
     r"trailer|anhaenger|auflieger|\b(hitch|drawbar|deichsel|dolly|articulation)\b"
 )
+# matches names of estimates by a filter
 _ESTIMATE = re.compile(r"\b([eu]?kf|kalman|est|estimate[ds]?|estimation|observer|beobachter)\b")
+# wheel -> pattern of its names
 _CORNERS = {
     "fl": r"fl|vl|lf|fro?nt ?le(?:ft)?|vorne? ?links|left ?front|avant ?gauche",
     "fr": r"fr|vr|rf|fro?nt ?ri(?:ght)?|vorne? ?rechts|right ?front|avant ?droite?",
     "rl": r"rl|hl|lr|re(?:ar)? ?le(?:ft)?|hinten ?links|left ?rear|arri[eè]re ?gauche",
     "rr": r"rr|hr|re(?:ar)? ?ri(?:ght)?|hinten ?rechts|right ?rear|arri[eè]re ?droite?",
 }
+# matches names of quantities of a wheel other than its speed
 _NO_SPEED_OF_A_WHEEL = re.compile(
     r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|"
     r"winkel|disp|damp|tyre|tire"
 )
+# axle -> pattern of its names
 _AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
+# matches names of speeds of wheels
 _WHEEL_SPEED = re.compile(
     r"wh(ee)?l|rad|roue|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws[ps]?\b|vel"
 )
@@ -147,15 +162,18 @@ _EXPLAINED = {
     "heading": ("yaw_rate",),
 }
 """Role -> roles that a part of its names suggests: the yaw in a yaw rate is no heading."""
+# unit -> quantity
 _QUANTITIES = {
     **dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"),
     **dict.fromkeys(("m/s²", "g"), "acc"),
     **dict.fromkeys(("rad/s", "deg/s"), "rate"),
 }
-_UNITS_OF_WHEELS = ("m/s", "km/h", "mph", "rpm", "rad/s", "rev/s")
+_UNITS_OF_WHEELS = ("m/s", "km/h", "mph", "rpm", "rad/s", "rev/s")  # units of wheel speeds
 _NO_QUANTITY = ("heading", "latitude", "longitude", "position_x", "position_y")
 """Roles of angles and positions, which are in none of these units."""
+# matches a unit at the end of a name
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2|radps|rads|degps|degs|dps)$")
+# letter -> its plain spelling
 _PLAIN = str.maketrans(
     {
         "ä": "ae",
@@ -170,6 +188,7 @@ _PLAIN = str.maketrans(
         "δ": "delta",
     }
 )
+# words of the longitudinal and the lateral of two names
 _PAIRS = (
     ("x", "y"),
     ("u", "v"),
@@ -201,7 +220,7 @@ def bare(name: str) -> str:
 @cache
 def hints(name: str, unit: str = "") -> dict[str, float]:
     """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it,
-    says of what quantity it is.
+    tells the quantity.
 
     Parameters
     ----------

@@ -10,12 +10,13 @@ from vehest.alignment.motion import Motion, rms
 from vehest.alignment.proposals.columns import Candidate, correlation, slow_of
 from vehest.data.units import factor_to_si
 
+# part of a pose -> role of its name
 PARTS = {"x": "position_x", "y": "position_y", "yaw": "heading"}
-LENGTH_UNITS = ("m", "mm")
-MIN_CORRELATION = 0.7  # of speed and yaw rate with the derivatives
-MAX_SPEED_GAIN = 1.4  # within which the speeds must be equal
-MAX_RADIANS = 7.0  # of an angle that is wrapped
-MAX_YAW_RATE = 7.0  # rad/s; beyond, an angle was wrapped
+LENGTH_UNITS = ("m", "mm")  # units of positions that are tried
+MIN_CORRELATION = 0.7  # smallest correlation of speed and yaw rate with the derivatives of a pose
+MAX_SPEED_GAIN = 1.4  # largest ratio of the speed to that by the pose, or its inverse
+MAX_RADIANS = 7.0  # largest magnitude of an angle that is taken to be in radians
+MAX_YAW_RATE = 7.0  # rad/s, largest yaw rate; beyond it, an angle was wrapped
 
 
 def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
@@ -30,8 +31,8 @@ def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
 def find_pose(
     columns: Sequence[Candidate], motion: Motion | None
 ) -> tuple[tuple[str, str, str], ...]:
-    """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty
-    where there is none, or no motion.
+    """Part, column and unit of each part of a pose whose derivatives are the known speed and yaw
+    rate; empty where there is none, or no motion.
 
     Parameters
     ----------

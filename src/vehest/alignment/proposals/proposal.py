@@ -32,24 +32,24 @@ TILT = {"roll": "ax", "roll_rate": "ax", "pitch": "ay", "pitch_rate": "ay"}
 
 @dataclass(frozen=True)
 class Proposal:
-    """Channel of a column."""
+    """Proposal that a column is a channel."""
 
-    column: str  # its name in the log
-    channel: str  # as `vehest data channels` lists it
-    unit: str  # of the column, as vehest spells it
+    column: str  # name of the column in the log
+    channel: str  # channel, as `vehest data channels` lists it
+    unit: str  # unit of the column, as vehest spells it
     sign: int = 1  # -1 where its positive direction is opposite to ISO 8855
-    evidence: tuple[str, ...] = ()  # for people
-    question: str = ""  # that the log leaves open; empty where it decides all
-    factor: float = 1.0  # by which the column is multiplied to be in ``unit``
+    evidence: tuple[str, ...] = ()  # pieces of evidence, for people
+    question: str = ""  # question that the log leaves open; empty where it decides all
+    factor: float = 1.0  # factor that brings the column to ``unit``
     offset: float = 0.0  # value of the column at zero, in its own unit
     alternatives: tuple[str, ...] = ()  # channels, units or columns that fit equally well
-    delay: float = 0.0  # by which it is late, as far as it is known [s]
-    is_weak: bool = False  # whether it is left out unless an answer confirms it
+    delay: float = 0.0  # time by which the column is late, as far as it is known [s]
+    is_weak: bool = False  # whether this proposal is left out unless an answer confirms it
     is_by_name: bool = False  # whether its name is all that supports it, and no relation to others
     is_repeated: bool = False  # whether another column measures the same
 
     def describe(self) -> str:
-        """For example ``yaw_rate: column 'Gyro', deg/s, sign -1: name and unit``."""
+        """Text such as ``yaw_rate: column 'Gyro', deg/s, sign -1: name and unit``."""
         parts = [f"column '{self.column}'", self.unit]
         parts += [f"sign {self.sign}"] if self.sign != 1 else []
         parts += [f"factor {self.factor:.5g}"] if self.factor != 1.0 else []
@@ -57,7 +57,7 @@ class Proposal:
         return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence)}"
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON.
+        """Fields as plain values, for JSON.
 
         Returns
         -------
@@ -71,7 +71,7 @@ class Proposal:
         return plain
 
     def is_impossible(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Which values of the column no vehicle can have, (T,).
+        """Whether values of the column are such as no vehicle can have, (T,).
 
         Parameters
         ----------
@@ -88,15 +88,15 @@ class Proposal:
         return np.asarray(factor * (values - self.offset))
 
     def with_evidence(self, *evidence: str) -> Proposal:
-        """The same with further evidence."""
+        """The proposal with further evidence."""
         return replace(self, evidence=(*self.evidence, *evidence))
 
     def questioned(self, question: str) -> Proposal:
-        """The same with a question, unless it has one."""
+        """The proposal with a question, unless it has one already."""
         return replace(self, question=self.question or question)
 
     def merged_with(self, earlier: Proposal | None) -> Proposal:
-        """The same with the evidence and questions of an earlier proposal for this column."""
+        """The proposal with the evidence and questions of an earlier one for this column."""
         if earlier is None or earlier.column != self.column:
             return self
         return replace(
@@ -111,10 +111,13 @@ class Proposal:
 class Proposals:
     """Proposals for a log."""
 
-    channels: tuple[Proposal, ...]
-    left_right: str = ""  # evidence of which way is left; empty where the log has none
-    wheel_radius: float | None = None  # for vx from the wheels [m]; None where vx has a column
-    rate_hz: float | None = None  # of a log without times, by the accelerations; else None
+    channels: tuple[Proposal, ...]  # proposals of channels
+    # evidence by which left and right are told apart; empty where the log has none
+    left_right: str = ""
+    # rolling radius by which vx is made from the wheels [m]; None where vx has a column
+    wheel_radius: float | None = None
+    # rate of a log without times, by the accelerations [Hz]; else None
+    rate_hz: float | None = None
     unused: tuple[str, ...] = ()  # columns that belong to no channel
     pose: tuple[tuple[str, str, str], ...] = ()  # part (``x``, ``y``, ``yaw``), column and unit
     notes: tuple[str, ...] = ()  # further remarks
@@ -125,16 +128,16 @@ class Proposals:
         return {proposal.channel: proposal for proposal in self.channels}
 
     def with_notes(self, *notes: str) -> Proposals:
-        """The same with further remarks."""
+        """The proposals with further remarks."""
         return replace(self, notes=(*self.notes, *notes))
 
     def changed(self, changes: Mapping[str, Proposal]) -> Proposals:
-        """The same with other proposals for some channels."""
+        """The proposals with others for some channels."""
         channels = tuple(changes.get(proposal.channel, proposal) for proposal in self.channels)
         return replace(self, channels=channels)
 
     def keeping(self, channels: Sequence[Proposal], notes: Sequence[str] = ()) -> Proposals:
-        """The same with these of its channels and further remarks.
+        """Only these of the proposals, with further remarks.
 
         A radius stays only with a wheel's speed.
         """
@@ -143,7 +146,7 @@ class Proposals:
         return replace(self, channels=tuple(channels), wheel_radius=radius).with_notes(*notes)
 
     def mirrored(self) -> Proposals:
-        """The same for a mirrored car: signs of `LATERAL` channels and of pitch reversed.
+        """The proposals for a mirrored car: signs of `LATERAL` channels and of pitch reversed.
 
         A log alone cannot tell a car from its mirror image: all relations between its channels stay
         true if every lateral sign is reversed.
@@ -157,7 +160,7 @@ class Proposals:
         )
 
     def with_tilt_signs(self) -> Proposals:
-        """The same with the signs of roll and pitch by the axes that other channels reveal.
+        """The proposals with the signs of roll and pitch by the axes that other channels reveal.
 
         Roll counts about the axis of ax, pitch about that of ay; a question unless ax, ay and the
         yaw rate are along the axes of one right-handed set, as forward-left-up or

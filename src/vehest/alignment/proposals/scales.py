@@ -24,27 +24,29 @@ from vehest.alignment.proposals.turning import (
 from vehest.alignment.proposals.wheels import RADIUS_RANGE, Wheels
 from vehest.alignment.signs import relations_of
 
-MAX_UNIT_MISMATCH = 0.1  # logarithm of a wrong factor over that of a unit, which explains it
-MAX_RIGHT_MISMATCH = 0.2  # logarithm of a gain that is right, with pitch, roll and slip
-MAX_COST = 1.5  # of one relation; beyond, it is no more wrong
-IMPLAUSIBLE_COST = 1.0  # of a channel whose size no car has
-MIN_COST_SHARE = 0.5  # of the logarithm of the wrong gain, by which one explanation must be better
+# largest |logarithm| of a wrong factor over that of a unit that explains it
+MAX_UNIT_MISMATCH = 0.1
+MAX_RIGHT_MISMATCH = 0.2  # largest |logarithm| of a right gain, with pitch, roll and slip
+MAX_COST = 1.5  # largest cost of one relation; beyond it, it is no more wrong
+IMPLAUSIBLE_COST = 1.0  # cost of a channel whose size no car has
+# smallest difference by which one explanation must be better, over the logarithm of the wrong gain
+MIN_COST_SHARE = 0.5
 EXPLANATIONS = (("vx",), ("yaw_rate",), ("ay",), ("ay", "ax"))
 """Channels that are too large by one factor; both accelerations come from one sensor."""
 
 
 @dataclass(frozen=True)
 class WrongScale:
-    """Channels of which one explains that ay is not vx·yaw_rate."""
+    """Channels of which one, by a wrong scale, explains that ay is not vx·yaw_rate."""
 
     factors: Mapping[str, float]  # channel -> factor by which it would be too large
     columns: Mapping[str, Candidate]  # channel -> its column, in the unit in which it was read
-    evidence: tuple[str, ...]  # relations that are wrong
+    evidence: tuple[str, ...]  # texts on the relations that are wrong
     is_decided: bool  # whether a second relation agrees with this explanation and no other
 
     @property
     def question(self) -> str:
-        """For each of the channels."""
+        """Text of the question for each of the channels."""
         evidence = " and ".join(self.evidence)
         if self.is_decided:
             return (
@@ -223,14 +225,14 @@ def is_scale_wrong(turning: Turning) -> bool:
 class _Check:
     """A size that depends on channels and has a usual range."""
 
-    text: str  # for people
-    size: float
-    powers: Mapping[str, int]  # of each channel in the size
-    low: float = math.exp(-MAX_RIGHT_MISMATCH)
-    high: float = math.exp(MAX_RIGHT_MISMATCH)
+    text: str  # text for people
+    size: float  # the size
+    powers: Mapping[str, int]  # channel -> its power in the size
+    low: float = math.exp(-MAX_RIGHT_MISMATCH)  # lower end of the usual range
+    high: float = math.exp(MAX_RIGHT_MISMATCH)  # upper end of the usual range
 
     def cost(self, factors: Mapping[str, float]) -> float:
-        """Logarithm of the distance from the range, were channels too large by factors."""
+        """Logarithm of the distance from the range, if channels were too large by factors."""
         size = self.size
         for name, factor in factors.items():
             size /= factor ** self.powers.get(name, 0)
@@ -284,7 +286,9 @@ def _checks(
 
 
 def _implausibility(turning: Turning, factors: Mapping[str, float]) -> float:
-    """Cost of sizes of speed, yaw rate and ay that no car has, were they too large by factors."""
+    """Cost of sizes of speed, yaw rate and ay that no car has, if they were too large by
+    factors.
+    """
     return IMPLAUSIBLE_COST * sum(
         not is_plausible(column.size / factors.get(name, 1.0), name, turning.units[name])
         for name, column in turning.columns.items()

@@ -26,15 +26,15 @@ from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_re
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
 
-MIN_CORRELATION = 0.75  # |correlation| of ay with vx·yaw_rate; triples with less are dropped
-UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
+MIN_CORRELATION = 0.75  # smallest |correlation| of ay with vx·yaw_rate of a triple
+UNIT_PENALTIES = {"mph": 0.1, "knots": 0.2}  # unit of speed -> penalty on its mismatch
 RARITY = 0.25  # penalty of a rare unit on its mismatch
 # logarithms of a gain that should be 1
-CLOSE_MISMATCH = 0.3  # within, units explain it
-FAR_MISMATCH = 0.6  # beyond, they do not
-MAX_EVIDENT_MISMATCH = 0.1  # within, the gain alone indicates an acceleration
-# cost (|logarithm of a gain| and penalties) by which the next best units must be worse, or units
-# are asked for
+CLOSE_MISMATCH = 0.3  # largest |logarithm| of a gain that units explain
+FAR_MISMATCH = 0.6  # smallest |logarithm| of a gain that units do not explain
+MAX_EVIDENT_MISMATCH = 0.1  # largest |logarithm| of a gain that alone indicates an acceleration
+# smallest difference of the cost (|logarithm of a gain| and penalties) of the next best units with
+# which they are not asked for
 MIN_COST_MARGIN = 0.2
 # channel -> range of its 99th percentile, SI units; a size outside is implausible
 RANGES = {
@@ -42,9 +42,10 @@ RANGES = {
     "yaw_rate": (0.02, 8.0),
     "ay": (0.3, 60.0),
 }
-MAX_COLUMNS = 60  # columns tried as one channel at most, the best by name
-MAX_TURNINGS = 8  # triples vx, yaw_rate, ay, at most, that rare units are tried for and returned
-MIN_SCORE = 6.0  # of a triple; those with less are dropped
+MAX_COLUMNS = 60  # largest number of columns that are tried as one channel, the best by name
+# largest number of triples vx, yaw_rate, ay that rare units are tried for and returned
+MAX_TURNINGS = 8
+MIN_SCORE = 6.0  # smallest score of a triple
 FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
 """Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a
 clear name decides.
@@ -56,44 +57,45 @@ NO_MOTION = (
 """Roles whose columns are no yaw rate, no acceleration and, but for the first, no speed."""
 ACCELERATIONS = {"ax", "ay", "az"}
 """Roles whose columns are no speed and no yaw rate: gravity is as even as a steady speed."""
-# of units that the header does not state, which one gain can decide; two of them fit most gains
+# largest number of units that the header does not state and one gain can decide; two of them fit
+# most gains
 MAX_DECIDED_RARE_UNITS = 1
-UNNAMED_PENALTY = 3.0  # of score, for a column that no name speaks for where one speaks for another
-# correlation beyond which ay was computed of vx·yaw_rate, and not measured
+UNNAMED_PENALTY = 3.0  # penalty on the score of a column without a name where another one has it
+# correlation above which ay was computed from vx·yaw_rate, and not measured
 MIN_COMPUTED_CORRELATION = 0.9995
-COMPUTED_PENALTY = 6.0  # of score, for that, where another column is named as ay
+COMPUTED_PENALTY = 6.0  # penalty on the score of such an ay, where another column is named as ay
 NAMELESS_RANK = 0.5  # rank of a column whose name suggests nothing
-STANDSTILL_SPEED_SHARE = 0.02  # of the top speed; below, the car may stand
-MIN_REPEAT_CORRELATION = 0.97  # correlation of one quantity measured twice
-# of columns that are named alike; wheels slip
+STANDSTILL_SPEED_SHARE = 0.02  # speed over the top speed below which the car may stand
+MIN_REPEAT_CORRELATION = 0.97  # smallest correlation of one quantity that is measured twice
+# channel -> the same of columns that are named alike; wheels slip
 MIN_NAMED_REPEAT_CORRELATION = {
     "vx": 0.7,
     "yaw_rate": 0.9,
 }
-# of a column with ay; one with more repeats ay, or is an angle of lean
+# correlation with ay above which a column repeats ay, or is an angle of lean
 MIN_AY_REPEAT_CORRELATION = 0.99
-# of ay with another column named so; with more the user is asked which one has gravity
+# correlation of ay with another column named so above which the user is asked which one has gravity
 MIN_AY_RIVAL_CORRELATION = 0.7
-# of the steps from sample to sample, within which a column is a copy; two sensors differ by as much
+# largest difference of a copy, over the steps from sample to sample; two sensors differ by as much
 # as their noise
 MAX_COPY_DIFFERENCE = 0.05
-# |logarithm| of the ratio of the sizes of two columns; with more, one does not repeat the other
+# largest |logarithm| of the ratio of the sizes of two columns of which one repeats the other
 MAX_REPEAT_MISMATCH = 0.35
-MAX_REPEAT_UNITS = 2  # units to try; a speed that seems to be in others may be in counts
+# number of units that are tried; a speed that seems to be in others may be in counts
+MAX_REPEAT_UNITS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """Columns that may be speed, yaw rate and lateral acceleration."""
+    """Columns that may be speed, yaw rate and lateral acceleration, with their units."""
 
-    columns: Mapping[
-        str, Candidate
-    ]  # by channel; without ``ay`` where only names suggest the other two
-    units: Mapping[str, str]  # by channel
+    # channel -> column; without ``ay`` where only names suggest the other two
+    columns: Mapping[str, Candidate]
+    units: Mapping[str, str]  # channel -> unit
     decided: bool  # whether no other units explain the scale as well
-    correlation: float = 0.0  # of ay with vx·yaw_rate, with its sign
+    correlation: float = 0.0  # correlation of ay with vx·yaw_rate, with its sign
     scale: float = 1.0  # ay over vx·yaw_rate in these units, positive
-    score: float = 0.0  # of all evidence
+    score: float = 0.0  # score of all evidence
 
     @property
     def is_reversing(self) -> bool:
@@ -151,10 +153,9 @@ class Search:
     """A motion, and the columns that are left beside it."""
 
     turning: Turning  # speed, yaw rate and lateral acceleration
-    motion: Motion  # by these, ay = +vx·yaw_rate
-    free: list[
-        Candidate
-    ]  # columns without a channel that repeat none; those that get one are removed
+    motion: Motion  # motion by these, ay = +vx·yaw_rate
+    # columns without a channel that repeat none; those that get one are removed
+    free: list[Candidate]
 
 
 def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
@@ -321,15 +322,15 @@ def is_plausible(size: float, channel: str, unit: str) -> bool:
 
 
 class NameEvidence(NamedTuple):
-    """What the names of all columns of a log say, beside the three that are tried."""
+    """Evidence of the names of all columns of a log, besides the three that are tried."""
 
-    strongest: Mapping[str, float]  # by channel: the clearest name of any column for it
-    n_ay: int  # columns that are named like a lateral acceleration
+    strongest: Mapping[str, float]  # channel -> strength of the clearest name of any column for it
+    n_ay: int  # number of columns that are named like a lateral acceleration
     is_bus: bool  # whether one of these is a signal of a bus
 
     @classmethod
     def of(cls, columns: Sequence[Candidate]) -> NameEvidence:
-        """Of the columns of a log."""
+        """Evidence of the names of these columns."""
         accelerations = [column for column in columns if "ay" in column.hints]
         return cls(
             {
@@ -344,10 +345,10 @@ class NameEvidence(NamedTuple):
 class UnitChoice(NamedTuple):
     """A unit that a column may have as a channel."""
 
-    unit: str
-    factor: float  # to SI
-    is_implausible: bool  # by the size that the column then has
-    rarity: float  # cost
+    unit: str  # the unit
+    factor: float  # factor to SI
+    is_implausible: bool  # whether no car has the size that the column then has
+    rarity: float  # penalty of a rare unit
 
 
 def _unit_choices(
@@ -398,8 +399,8 @@ def _scored(
     *,
     try_rare_units: bool = False,
 ) -> Turning:
-    """With the units that explain the gain of ay to vx·yaw_rate best, and the score of all
-    evidence.
+    """The triple with the units that explain the gain of ay to vx·yaw_rate best, and the score of
+    all evidence.
     """
     ranked = _ranked([choices[name][column] for name, column in named.items()], file_gain)
     if try_rare_units and ranked[0][0] >= FAR_MISMATCH:
@@ -440,16 +441,16 @@ def _scored(
 class Repeat(NamedTuple):
     """A column that measures the same as another one."""
 
-    column: Candidate
-    unit: str
-    sign: int
+    column: Candidate  # the column
+    unit: str  # unit of the column
+    sign: int  # sign by which it counts as the other one
 
     def si(self, channel: str, values: FloatArray) -> FloatArray:
-        """Samples of a channel, of values as the column has them."""
+        """Samples of a channel in SI units, from values as the column has them."""
         return values * (self.sign * si_factor(self.unit, channel))
 
     def proposal(self, channel: str, *evidence: str, **more: Any) -> Proposal:
-        """The column as a channel; ``more`` are further fields of the proposal."""
+        """The proposal of the column as a channel; ``more`` are further fields of it."""
         return Proposal(self.column.name, channel, self.unit, self.sign, evidence, **more)
 
 
@@ -531,7 +532,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
 
 
 def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
-    """With the speed as vx_ref where it is named as a reference, or like the lateral velocity.
+    """Channels, by name, with the speed as vx_ref where it is named as a reference, or like the
+    lateral velocity.
 
     Wheels supply the car's own speed.
 
@@ -561,7 +563,7 @@ def reference_speed(channels: dict[str, Proposal]) -> dict[str, Proposal]:
 
 
 def _is_copy(repeat: Repeat, first: Repeat, channel: str) -> bool:
-    """Whether a column holds the samples of another one, but for unit, sign and rounding."""
+    """Whether a column holds the samples of another one, except for unit, sign and rounding."""
     if first.column.is_wheel_mean or repeat.column.is_reference != first.column.is_reference:
         return False
     copy, samples = (each.si(channel, each.column.values) for each in (repeat, first))
@@ -631,7 +633,9 @@ def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[P
 
 
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
-    """The car's own and the reference's of columns that measure the same; others are left out."""
+    """Proposals of the car's own and the reference's, of columns that measure the same; others are
+    left out.
+    """
     plain = [repeat for repeat in family if not is_filtered(repeat.column.name)] or list(family)
     of_car = [repeat for repeat in plain if repeat.column.is_of_bus] or [
         repeat for repeat in plain if not repeat.column.is_reference

@@ -24,24 +24,27 @@ from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.alignment.proposals.turning import RANGES
 from vehest.constants import FloatArray
 
-USUAL_RADIUS = 0.31  # m, of cars
-NOMINAL_RADIUS = 0.3  # m, by which a speed at the rim is brought to rad/s and back
-RADIUS_RANGE = (0.2, 0.55)  # m, of cars; a unit that gives another radius is implausible
-MIN_MODEL_RADIUS = 0.02  # m, of models up to MAX_MODEL_SPEED
-MAX_MODEL_SPEED = 20.0  # m/s; a car whose wheels are faster is no model
-MAX_SPEED = 110.0  # m/s; a unit that gives a higher top speed is implausible
-MIN_TOP_SPEED = 1.0  # m/s; a unit that gives a lower top speed is implausible
-UNIT_PENALTIES = {  # of units tried where the header is silent; a rare one only if no other fits
+USUAL_RADIUS = 0.31  # m, rolling radius of a usual car
+NOMINAL_RADIUS = 0.3  # m, radius by which a speed at the rim is converted to rad/s and back
+# m, smallest and largest radius of cars; a unit that gives another one is implausible
+RADIUS_RANGE = (0.2, 0.55)
+MIN_MODEL_RADIUS = 0.02  # m, smallest radius of models up to MAX_MODEL_SPEED
+MAX_MODEL_SPEED = 20.0  # m/s, highest speed of the wheels of a model
+MAX_SPEED = 110.0  # m/s, highest top speed; a unit that gives a higher one is implausible
+MIN_TOP_SPEED = 1.0  # m/s, lowest top speed; a unit that gives a lower one is implausible
+# unit that is tried where the header states none -> its cost; a rare one only if no other fits
+UNIT_PENALTIES = {
     **dict.fromkeys(("km/h", "m/s", "rpm", "rad/s"), 0.0),
     "mph": 0.2,
     **dict.fromkeys(("cm/s", "mm/s", "ft/s", "0.01*km/h", "rev/s", "deg/s"), 1.0),
 }
-# cost by which the next best unit must be worse, or the user is asked for it
+# smallest difference of the cost of the next best unit with which the user is not asked
 MIN_COST_MARGIN = 0.25
 IMPLAUSIBLE = 3.0  # cost of a unit that gives an impossible speed or radius
-MAX_RIM_MISMATCH = 0.3  # of a speed at the rim to that of the car, as a logarithm
-PREFIX = "wheel_speed_"
-# a speedometer over the wheels' speed at the rim: none reads too little, many too much
+MAX_RIM_MISMATCH = 0.3  # largest |logarithm| of the ratio of a speed at the rim to that of the car
+PREFIX = "wheel_speed_"  # start of the channels of wheel speeds
+# smallest and largest ratio of a speedometer to the wheels' speed at the rim: none reads too
+# little, many too much
 SPEEDOMETER_GAIN_RANGE = (
     0.98,
     1.08,
@@ -51,8 +54,8 @@ Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its sp
 
 
 def find_wheels(columns: Sequence[Candidate]) -> tuple[Wheels, list[str]]:
-    """Columns that are named for a wheel each, of several for one the first; notes of those that
-    are left out for their unit.
+    """Columns that are named for one wheel each, the first where there are several; and notes on
+    those that are left out for their unit.
     """
     wheels: dict[str, Candidate] = {}
     left_out: dict[str, list[str]] = {}
@@ -157,8 +160,8 @@ def speed_of_wheels(
 def wheel_proposals(
     wheels: Wheels, motion: Motion | None, *, has_speed: bool, is_wheel_mean: bool
 ) -> tuple[list[Proposal], float | None]:
-    """A channel each, and the rolling radius by which they make the speed, if it has no column; of
-    it, the motion's may be made.
+    """Proposals of a channel for each wheel, and the rolling radius by which they make the speed,
+    if it has no column.
 
     Parameters
     ----------
@@ -266,7 +269,7 @@ def _units_of(wheels: Wheels) -> Sequence[str]:
 
 
 def _penalty(wheels: Wheels, unit: str) -> float:
-    """What a unit that no header states costs against the likelier ones."""
+    """Cost of a unit that no header states, relative to the likelier ones."""
     return 0.0 if _header_unit(wheels) else UNIT_PENALTIES[unit]
 
 

@@ -53,7 +53,9 @@ def car_filter_in_c(car_filter: CarFilter) -> dict[str, Any]:
 
 
 def _dynamics_in_c(dynamics: Dynamics) -> dict[str, Any]:
-    """Physical numbers, curves, and the network's layers, inputs first."""
+    """Physical numbers, tyre curves and the network's layers, from the inputs on, for the
+    template.
+    """
     values, (mass, wheelbase, _) = physical_of(dynamics)
     p = dict(zip((*LEARNT, *PACEJKA), values.tolist(), strict=True))
     weight = mass * GRAVITY / wheelbase
@@ -74,7 +76,9 @@ def _dynamics_in_c(dynamics: Dynamics) -> dict[str, Any]:
 
 
 def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
-    """A covariance that is constant, or linear in the state by its factor; see `compiled_noise`."""
+    """A noise covariance for the template: a constant one, or the factor of one that depends
+    linearly on the state (`compiled_noise`).
+    """
     if not isinstance(noise, CompiledNoise):
         return {"constant": noise[0], "weight": None}
     constant, weight, offset, *numbers = noise.car

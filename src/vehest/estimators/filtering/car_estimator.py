@@ -32,10 +32,11 @@ from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES
 
-REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")
-MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")
-INPUTS = ("steer", "motor_current")
-# m/s, m/s, rad/s, m/s: standard deviations of a start that is not given
+REFERENCES = ("vx_ref", "vy_ref", "yaw_rate_ref")  # channels of the true states in training
+MEASURED = ("ax", "ay", "yaw_rate", "motor_speed")  # channels of the filter's measurements
+INPUTS = ("steer", "motor_current")  # channels of the filter's inputs
+# m/s, m/s, rad/s, m/s: standard deviations of vx, vy, yaw rate and rim speed at a start that is not
+# given
 UNKNOWN = (0.5, 0.3, 0.1, 0.1)
 
 
@@ -52,18 +53,19 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
     learns_from = REFERENCES
     states = STATES
     adapts = True  # friction is a state
-    network: CarFilter
-    # settings
-    car: Any
-    friction: float
+    network: CarFilter  # filter with its learnt dynamics and noise
+    car: Any  # parameters of the car
+    friction: float  # friction at the start [1]
 
     @property
     def filter(self) -> CarFilter:
-        """The network, which is the filter whose dynamics and noise are learnt."""
+        """The trained module: the filter whose dynamics and noise are learnt."""
         return self.network
 
     def _samples(self, recording: Recording) -> tuple[FloatArray, FloatArray]:
-        """Measurements (T, 4), the rim speed last, and inputs (T, 2), held where missing."""
+        """Measurements (T, 4), with the motor's speed as rim speed [m/s] last, and inputs (T, 2),
+        held where missing.
+        """
         measurements = recording.stack(MEASURED)
         measurements[:, 3] *= self.car.wheel_radius
         return measurements, _hold_missing(recording.stack(INPUTS))
@@ -113,7 +115,7 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
     def _estimate_all(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
     ) -> list[Estimate]:
-        """Recordings of one length are filtered together."""
+        """Estimate checked recordings; those of one length are filtered as one batch."""
         estimates: dict[int, Estimate] = {}
         for length in dict.fromkeys(len(recording) for recording in recordings):
             rows = [row for row, recording in enumerate(recordings) if len(recording) == length]
@@ -163,9 +165,8 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
         return estimates
 
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
-        """A recording as its filter takes it.
-
-        True states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
+        """A recording as the `Drive` that trains the filter: true states (T, 5), with the friction
+        of the settings, inputs (T, 2) and measurements (T, 4).
 
         Raises
         ------
@@ -186,7 +187,7 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
         )
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """From the first measurement."""
+        """The stepwise filter in the state that the first measurement gives."""
         network = self.network
         mean, covariance = (part.numpy() for part in self._start(first.measurement, None))
         with torch.no_grad():
@@ -201,7 +202,9 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
             )
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """Measurements that are NaN are skipped, inputs held."""
+        """Measurements and inputs of one sample for the filter: NaN measurements are skipped,
+        inputs that are NaN are held in ``memory``.
+        """
         if not memory:
             memory |= {"inputs": np.zeros(2), "noises": self.network.noise_at()}
         measurement = sample[1:5].copy()
@@ -211,9 +214,8 @@ class CarFilterEstimator(Network, SigmaPointEstimator):
 
 
 def _hold_missing(values: FloatArray) -> FloatArray:
-    """The last value where one is missing; 0 before the first.
-
-    Each column of (T, p) by itself.
+    """A copy of (T, p) in which the last finite value of the column replaces NaN, 0 before the
+    first.
     """
     last = np.maximum.accumulate(
         np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None])

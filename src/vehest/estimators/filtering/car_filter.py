@@ -39,13 +39,17 @@ from vehest.filters.unscented_scan import (
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
+# kind of the covariances of process and measurement
 NoiseKind = Literal["constant", "state_dependent"]
-
-PROCESS = (1e-3, 1e-3, 1e-2, 1e-2)  # variances to begin with, of one sample's step
+# initial variances, before training: of vx, vy, yaw rate and rim speed over one sample's step
+PROCESS = (1e-3, 1e-3, 1e-2, 1e-2)
+# `NoiseKind` -> variance of the friction's step [1]
 FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
+# initial variances of ax, ay [m²/s⁴], yaw rate [rad²/s²] and rim speed [m²/s²] as measurements
 OBSERVATION = (50.0, 50.0, 0.1, 0.1)
+# variances of vx, vy, yaw rate and rim speed at a known first state
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
-PACE = 10.0  # by which noise learns faster than in units of its deviations
+PACE = 10.0  # factor by which noise learns faster than in units of its deviations
 # added to variances: the rim speed is measured, and is its own reference
 OBSERVED_EXACTLY = (
     0.0,
@@ -53,7 +57,7 @@ OBSERVED_EXACTLY = (
     0.0,
     1e-3,
 )
-KAPPA = -2.0  # of the symmetric sigma points
+KAPPA = -2.0  # κ of the symmetric sigma points
 MIN_ENTROPY = -9.0  # [nat] of the process noise
 
 
@@ -67,8 +71,8 @@ class CarFilter(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
-    process_noise: Any
-    observation_noise: Any
+    process_noise: Any  # model of the covariance of the process noise
+    observation_noise: Any  # model of the covariance of the measurements
     mirror = (  # signs of states, inputs and measurements, left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
@@ -102,18 +106,18 @@ class CarFilter(nn.Module):
         self.rule = symmetric_rule(n, KAPPA)
 
     def reset(self, generator: torch.Generator) -> None:
-        """Draw everything that is random to begin with anew."""
+        """Draw the initial weights of dynamics and noise anew."""
         self.dynamics.reset(generator)
         for noise in (self.process_noise, self.observation_noise):
             if isinstance(noise, StateDependentNoise):
                 noise.reset(generator)
 
     def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """States one sample later, (B, 5)."""
+        """States one sample after ``states``, (B, 5), by the dynamics."""
         return moved(self.point_model(), states, inputs)
 
     def point_model(self) -> PointModel:
-        """The dynamics as the filter takes them: compiled where they can be."""
+        """The dynamics as functions of sigma points for the filter: compiled where possible."""
         dtype = next(self.parameters()).dtype
         if is_compilable(self.dynamics):
             return CompiledPlanarCar(self.dynamics, self.step, self.lower, dtype)
@@ -125,7 +129,7 @@ class CarFilter(nn.Module):
         )
 
     def initial_covariance(self) -> Tensor:
-        """Covariance of a state that is known, (5, 5)."""
+        """Covariance of an initial state that is known, (5, 5)."""
         covariance: Tensor = self.initial_noise(
             self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0)
         )
@@ -140,7 +144,7 @@ class CarFilter(nn.Module):
         model: PointModel | None = None,
         gate: Gate | None = None,
     ) -> NonlinearFiltered:
-        """Filter sequences.
+        """Filter B sequences of T samples.
 
         Parameters
         ----------
@@ -184,7 +188,7 @@ class CarFilter(nn.Module):
         )
 
     def noise_at(self) -> tuple[StepNoise, StepNoise]:
-        """Process and observation noise of filters at work.
+        """Process and observation noise for filters in use, without gradients.
 
         Constant covariances are arrays (1, 5, 5) and (1, 4, 4); those that depend on the state are
         `CompiledNoise`. The process noise has at least the entropy `MIN_ENTROPY`.
@@ -199,7 +203,8 @@ class CarFilter(nn.Module):
             return process.numpy(), self.observation_noise(zero_state, zero_state).numpy()
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
-        """Start noise from one-step and measurement residuals at the true states of drives.
+        """Initialise the noise from one-step and measurement residuals at the true states of
+        drives.
 
         The friction, which the true states hold as a constant, and the initial state keep the
         variances that they have, but for a friction that may start anywhere within a spread: it has
@@ -281,9 +286,8 @@ class CarFilter(nn.Module):
         return torch.cat(means, 1), torch.cat(covariances, 1)
 
     def estimate_for_validation(self, drives: Drive) -> Tensor:
-        """Estimated states, (B, T, 5), as in use.
-
-        Without gradients, and without any true state but the first.
+        """Estimated states, (B, T, 5), as in use: without gradients, and without any true state but
+        the first.
         """
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())

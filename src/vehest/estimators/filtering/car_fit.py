@@ -24,8 +24,11 @@ from vehest.training.through_filter import (
 )
 from vehest.vehicle.dynamics import Perceptron, TyreNetworkCar
 
-SLIP = 0.3  # rad and 1, what slips are divided by before a network sees them
-# of vx, vy, yaw rate and rim speed: the inverse of how much they change from sample to sample
+# rad and 1, values by which slip angles and longitudinal slip are divided before a network sees
+# them
+SLIP = 0.3
+# weights of squared errors of vx, vy, yaw rate and rim speed: the inverse of how much they change
+# from sample to sample
 WEIGHTS = (0.2225, 0.5064, 0.1566, 0.1145)
 
 
@@ -76,7 +79,8 @@ def training_phases(
     *,
     learns_dynamics: bool,
 ) -> list[Phase]:
-    """The dynamics by one-step errors, then dynamics and noise, or noise alone, through the filter.
+    """The phases of the training: the dynamics by one-step errors, then dynamics and noise, or
+    noise alone, through the filter.
 
     Errors of states are weighted by `WEIGHTS`. The friction counts through the filter only, with
     the weight 1; validation judges vx, vy and yaw rate alone.

@@ -49,16 +49,17 @@ from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.robust import robust_squares_of_array
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
-Inputs = Literal["full", "imu"]
-Curve = Literal["plain", "smooth"]
+Inputs = Literal["full", "imu"]  # channels that are read: with or without measured tyre forces
+Curve = Literal["plain", "smooth"]  # Dugoff's tyres by Eq. 9 or Eq. 10
 
 WHEEL_FORCES = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
 """Lateral force of an axle -> channels of its wheels."""
-INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")
+INERTIAL = ("yaw_rate", "vx", "ay", "steer", "ax")  # channels without tyre forces
 CHANNELS: dict[str, tuple[str, ...]] = {
     "full": (*INERTIAL, *(wheel for pair in WHEEL_FORCES.values() for wheel in pair)),
     "imu": INERTIAL,
 }
+"""Setting ``inputs`` -> channels that the filter reads."""
 MAX_SAMPLES_TOGETHER = 200_000  # samples that are filtered at a time
 
 
@@ -67,7 +68,7 @@ class PseudoMeasurement:
     """Sideslip angles that a network adds to T samples."""
 
     sideslip: FloatArray  # β_DD, (T,) [rad]
-    variance: FloatArray  # of the angle as the filter's measurement, (T,) [rad²]
+    variance: FloatArray  # variance of the angle as the filter's measurement, (T,) [rad²]
     # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the
     # filter's
     process: FloatArray | None = None
@@ -93,28 +94,33 @@ class DugoffFilter(SigmaPointEstimator):
     covariance_of = TRACK_STATES
     axle_tyres: FloatArray
     levels: dict[str, float]
-    # settings
-    inputs: Inputs
-    curve: Curve
-    minimum_speed: float
+    inputs: Inputs  # channels that are read
+    curve: Curve  # Dugoff's tyres by Eq. 9 or Eq. 10
+    minimum_speed: float  # speed below which wheels roll without slip [m/s]
+    # lateral acceleration from which on forces are trusted, see `in_nonlinear_range` [m/s²]
     nonlinear_from: float
-    linear_below: float
+    linear_below: float  # lateral acceleration below which they are not trusted any more [m/s²]
+    # number of samples over which errors are correlated, by which variances of measurements are
+    # multiplied
     correlated_samples: float
-    car: LoadedCar
+    car: LoadedCar  # parameters of the car
 
     def require_fitted(self) -> None:
-        """Check that tyres and levels are given or found.
+        """Check that tyres and noise levels have values.
 
         Raises
         ------
         ConfigurationError
-            Tyres or levels are neither given nor found.
+            Tyres or levels are neither given in the settings nor fitted.
         """
         self.track()
         self.noise_covariances(self.levels)
 
     def track(self) -> DugoffTrack:
-        """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
+        """The car model with the present tyres.
+
+        Raises `ConfigurationError` where the tyres are neither given nor identified.
+        """
         if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(
                 f"estimator '{self.name}' has no tyres yet; fit or load it first, or give "
@@ -127,9 +133,8 @@ class DugoffFilter(SigmaPointEstimator):
         return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
-        """Covariance of a step, (2, 2), and covariances of measurements, (2, 4, 4).
-
-        The first of measurements is that of the linear range, the second that of the other.
+        """Covariance of the process noise of a step, (2, 2), and covariances of the measurements,
+        (2, 4, 4), first in the linear, then in the non-linear range.
 
         Raises
         ------
@@ -173,7 +178,7 @@ class DugoffFilter(SigmaPointEstimator):
         return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
-        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²].
+        """Whether forces are trusted, (T,), by the measured lateral acceleration (T,) [m/s²].
 
         See `in_nonlinear_range`.
         """
@@ -208,7 +213,7 @@ class DugoffFilter(SigmaPointEstimator):
     def _estimate_all(
         self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]
     ) -> list[Estimate]:
-        """Recordings of similar length are filtered together."""
+        """Estimate checked recordings; those of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
         for rows, steps in self.filtered(
             recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)
@@ -234,7 +239,7 @@ class DugoffFilter(SigmaPointEstimator):
     def pseudo_measurements(
         self, recordings: Sequence[Recording]
     ) -> list[PseudoMeasurement] | None:
-        """Sideslip angles that a network adds to each recording; none: there is no network."""
+        """Sideslip angles that a network adds to each recording; None without a network."""
         return None
 
     def filtered(
@@ -247,8 +252,8 @@ class DugoffFilter(SigmaPointEstimator):
     ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
         """Filter recordings in groups of similar length, padded to the longest of each.
 
-        Yields the rows of each group and its filtered states. Levels are searched, and networks
-        trained, without a gate: noise that is too small would close it.
+        Yields the indices of each group's recordings, and their filtered states. Levels are
+        searched, and networks trained, without a gate: noise that is too small would close it.
         """
         model = TrackFilter(self.track())
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
@@ -272,7 +277,9 @@ class DugoffFilter(SigmaPointEstimator):
                 yield rows, passed.steps
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """The filter before its first sample: straight ahead with wide deviations, or rolling."""
+        """The stepwise filter before its first sample: straight ahead with wide deviations, or
+        rolling without slip below the minimum speed.
+        """
         track_filter = TrackFilter(self.track())
         mean, covariance = (
             part[0].numpy() for part in track_filter.start(torch.as_tensor(first.inputs)[None])
@@ -287,7 +294,9 @@ class DugoffFilter(SigmaPointEstimator):
         )
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """Measurements, none below the minimum speed, and the noise of the car's present range."""
+        """Measurements of one sample for the filter, none below the minimum speed, and their noise
+        in the present, linear or non-linear, range.
+        """
         if not memory:
             process, sensors = (noise.numpy() for noise in self.noise_covariances(self.levels))
             memory |= {"process": process, "noise": process, "sensors": sensors, "trusts": False}
@@ -305,9 +314,8 @@ class DugoffFilter(SigmaPointEstimator):
     def with_pseudo(
         self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
     ) -> tuple[FloatArray, FloatArray]:
-        """A measurement (m,) and its covariance with those that a network adds.
-
-        The network's process noise is left in ``memory``.
+        """Append the measurement of a network, if there is one, to the sensors' measurement (m,)
+        and its covariance; the network's process noise is stored in ``memory``.
         """
         return measurement, noise
 
@@ -315,7 +323,8 @@ class DugoffFilter(SigmaPointEstimator):
 def with_angles(
     measurements: Tensor, noise: Tensor, angles: Sequence[PseudoMeasurement]
 ) -> tuple[Tensor, Tensor]:
-    """Measurements (B, T, 5) and covariances (B, T, 5, 5) with a network's angles as the last.
+    """Append a network's angles to measurements as the fifth: measurements (B, T, 5) and
+    covariances (B, T, 5, 5).
 
     The fifth measurement is NaN beyond the end of a shorter recording.
 

@@ -23,17 +23,21 @@ from vehest.estimators.filtering.tyre_fit import axle_motion
 from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres
 
 BOUNDS = ((2.0, 60.0), (0.3, 2.0), (0.0, 0.05))
-"""Cornering stiffness over the axle's load at rest [1/rad], friction [1], reduction [s/m]."""
-MAX_SAMPLES = 1500  # evenly thinned to
-POPULATION = 15  # a parameter
+"""Ranges that are searched: cornering stiffness over the axle's load at rest [1/rad], friction [1],
+reduction [s/m].
+"""
+MAX_SAMPLES = 1500  # samples of all recordings that are used, evenly thinned
+POPULATION = 15  # candidates of the genetic algorithm for each parameter
 
 
 class DugoffFit(NamedTuple):
-    """Tyres of the front and of the rear axle, in the order of `DugoffAxle`."""
+    """Identified tyres: rows are the front and the rear axle, columns are in the order of
+    `DugoffAxle`.
+    """
 
-    parameters: FloatArray  # (2, 3)
+    parameters: FloatArray  # cornering stiffness [N/rad], friction [1], reduction [s/m], (2, 3)
     spread: FloatArray  # half of the range of each over restarts, (2, 3)
-    residual_rms: FloatArray  # of the forces, (2,) [N]
+    residual_rms: FloatArray  # root mean square of the force's residual, (2,) [N]
 
 
 def fit_dugoff(

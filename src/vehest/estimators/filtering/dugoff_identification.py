@@ -30,8 +30,10 @@ from vehest.vehicle.dugoff import LoadedCar
 
 # Powers of ten that are searched; that of process_yaw_rate is a setting.
 BOXES = {"process_vy": (-5.0, 0.0), "force_factor": (0.0, 2.0)}
+# Powers of ten from which searches start.
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-# Length of the segments in which the steering angle deviates least from a straight line [s].
+# Length of the segments, those in which the steering angle deviates least from a straight line over
+# time, by which levels of sensors are read [s].
 QUIET_SECONDS = 0.5
 
 
@@ -129,7 +131,8 @@ def search_levels(
     seed: int,
     context: FitContext,
 ) -> SearchRecord:
-    """Levels with the smallest error of sideslip, as powers of ten, (K,).
+    """Search the noise levels with the smallest error of sideslip; the result has them as powers of
+    ten, (K,).
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ class GatedFilter(Estimator):
     )
 
     def gate_in_use(self) -> Gate | None:
-        """The gate of estimates.
+        """The gate on innovations that estimates use.
 
         It opens again after a contradiction of half a second, see `Gate`; None where no gate is
         set.
@@ -32,16 +32,18 @@ class GatedFilter(Estimator):
 
     @property
     def gate_suffix(self) -> str:
-        """Suffix of a variant's name."""
+        """Part of a variant's name that states the gate; empty without one."""
         return "" if self.gate is None else f"_gate{self.gate:g}"
 
     @property
     def gate_title(self) -> str:
-        """Suffix of the title."""
+        """Part of the title that states the gate; empty without one."""
         return "" if self.gate is None else f", innovations gated at {self.gate:g} sigma"
 
     def c_values(self) -> dict[str, Any]:
-        """Limit and patience of the gate; patience is 0 without one."""
+        """Limit of the squared normalised innovation, and patience of the gate [samples], for the C
+        template; both are 0 without a gate.
+        """
         gate = self.gate_in_use()
         return {
             "limit": 0.0 if gate is None else gate.deviations**2,

@@ -61,9 +61,8 @@ def rational_c_values(
 
 
 def _tyre_state(name: str) -> dict[str, str]:
-    """A tyre parameter that is a state.
-
-    Its axle, and the member of the axle's force that is its slope.
+    """Template values of a tyre parameter that is a state: its name, its axle, and the field of the
+    axle's force that has the derivative by it.
     """
     if name == "friction":
         return {"name": name, "axle": "both", "slope": "per_log_friction"}

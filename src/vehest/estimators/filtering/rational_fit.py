@@ -44,20 +44,22 @@ SLIP_OFFSET_DEVIATION = math.radians(0.15)
 # Powers of ten that are searched: levels of ay and steer over that of the yaw rate, and that of
 # tyres.
 BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}
+# Powers of ten from which searches start.
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
-LIMIT_MARGIN = 0.01  # of a box's width: a search that ends nearer to a limit ended on it
-START_YAW_RATE_LEVEL = 0.01  # rad/s
-N_CALIBRATIONS = 2  # how often the level of the yaw rate is scaled
+# largest distance from a limit at which a search ended on it, over the width of the box
+LIMIT_MARGIN = 0.01
+START_YAW_RATE_LEVEL = 0.01  # rad/s, level of the yaw rate before it is scaled
+N_CALIBRATIONS = 2  # number of times that the level of the yaw rate is scaled
 
 Drive = tuple[FloatArray, FloatArray]
 """Samples (T, 4) of a filter's channels, and the reference sideslip [rad], (T,)."""
 
 
 class CurveFit(NamedTuple):
-    """Axle curves that were fitted."""
+    """Fitted force curves of both axles."""
 
-    curves: FloatArray  # (4,), in the order of `CURVES`; c₁ = ∞ where tyres are linear
-    covariance: FloatArray  # of their logarithms, (4, 4)
+    curves: FloatArray  # parameters, (4,), in the order of `CURVES`; c₁ = ∞ where tyres are linear
+    covariance: FloatArray  # covariance of the logarithms of the parameters, (4, 4)
     metrics: dict[str, float]  # curves, halves of their 95 % intervals, rms of residual forces [N]
 
 
@@ -112,7 +114,7 @@ def fit_axle_curves(
 def _covariances_of_logarithms(
     motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit
 ) -> list[FloatArray]:
-    """Covariance of the logarithms of each axle's parameters.
+    """Covariance of the logarithms of each axle's parameters, one matrix an axle.
 
     It has three parts: that of least squares, a common scale of all forces, and an offset of all
     slip angles, whose effect is the difference to a fit to shifted angles.
@@ -133,7 +135,9 @@ def _covariances_of_logarithms(
 
 
 def searched_levels(unknown: Sequence[str]) -> tuple[str, ...]:
-    """Levels of those that are not given that are searched; that of the yaw rate is calibrated."""
+    """Those of the ``unknown`` noise levels that are searched: all but that of the yaw rate, which
+    is calibrated.
+    """
     return tuple(name for name in unknown if name != "yaw_rate")
 
 
@@ -142,15 +146,16 @@ class LevelSearch:
     """Search for the noise levels with the smallest error of sideslip on drives."""
 
     names: tuple[str, ...]  # searched levels
-    levels: Mapping[str, float]  # all levels, `LEVELS`; NaN where they are not given
+    levels: Mapping[str, float]  # levels by name, `LEVELS`; NaN where they are not given
     tyre_level: float  # drift of tyre parameters where it is not searched [1/√s]
-    filter_samples: Callable[[FloatArray, Mapping[str, float]], FilteredStates]  # by these levels
-    drives: Sequence[Drive]
+    # filters samples (T, 4) with given noise levels
+    filter_samples: Callable[[FloatArray, Mapping[str, float]], FilteredStates]
+    drives: Sequence[Drive]  # training drives, on which the error is measured
     minimum_speed: float  # slower samples do not count [m/s]
     skip: int  # first samples of a drive that do not count
 
     def run(self, training: NoiseTuningSettings, seed: int, context: FitContext) -> SearchRecord:
-        """Search powers of ten of ``names`` within `BOXES`, (K,)."""
+        """Search the powers of ten of the levels ``names``, (K,), within `BOXES`."""
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels_at(powers)
@@ -162,13 +167,13 @@ class LevelSearch:
         return training.search(cost, boxes, starts, seed, context)
 
     def n_at_limits(self, powers: FloatArray) -> int:
-        """How many levels lie at a limit of the search."""
+        """Number of levels that lie at a limit of the search, at powers of ten (K,)."""
         boxes = np.array([BOXES[name] for name in self.names])
         distance = np.minimum(powers - boxes[:, 0], boxes[:, 1] - powers)
         return int((distance < LIMIT_MARGIN * np.ptp(boxes, axis=1)).sum())
 
     def levels_at(self, powers: FloatArray) -> dict[str, float]:
-        """All levels at powers of ten of the searched ones.
+        """Levels by name, at powers of ten of the searched ones.
 
         Sensors' levels are scaled until the normalised innovations squared are 1 on average.
         """
@@ -236,7 +241,7 @@ def mean_squared_error(
 
 
 def drives_of(recordings: Sequence[Recording], channels: Sequence[str]) -> list[Drive]:
-    """Samples of channels and reference sideslip of recordings.
+    """Samples of channels and reference sideslip of recordings, for the search of levels.
 
     Raises
     ------
@@ -247,7 +252,7 @@ def drives_of(recordings: Sequence[Recording], channels: Sequence[str]) -> list[
 
 
 def _reference_sideslip(recording: Recording) -> FloatArray:
-    """Reference sideslip [rad], (T,)."""
+    """Reference sideslip of a recording [rad], (T,): ``sideslip_ref``, else by ``vy_ref``."""
     if "sideslip_ref" not in recording and "vy_ref" not in recording:
         raise DataError(
             f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels "

@@ -38,7 +38,7 @@ from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
-Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
+Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]  # keys of `KINDS`
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")
 """Noise levels: of the gyroscope [rad/s], the accelerometer [m/s²], the steering angle [rad/√s],
@@ -50,19 +50,19 @@ CURVES = TYRE_PARAMETERS[:4]
 # Standard deviations of β [rad], r [rad/s], β' [rad/s] and r' [rad/s²] of a motion that is only
 # assumed.
 ROLLING = (0.05, 0.2, 1.0, 2.0)
-# Bounds of the same states.
+# Largest absolute values of β [rad], r [rad/s], β' [rad/s] and r' [rad/s²].
 MAX_MOTION = (1.5, 5.0, 20.0, 100.0)
 MAX_SIDESLIP_DEVIATION = 1.0  # standard deviation of β [rad] beyond which the motion restarts
 # Standard deviations at the start by which tyre parameters may always differ from their start
 # values.
 MIN_TYRE_BOUND = 3.0
-FRICTION_DEVIATION = 0.1  # of the logarithm of friction at the start
+FRICTION_DEVIATION = 0.1  # standard deviation of the logarithm of friction at the start
 
 
 class TyreKind(NamedTuple):
-    """A kind of tyres."""
+    """A kind of tyre model: its curves, and which of its parameters are states."""
 
-    variant: str  # in names of variants
+    variant: str  # part of a variant's name
     title: str  # the paper's name
     curve_names: tuple[str, ...]  # parameters of its axle curves, of `CURVES`
     adapted: tuple[str, ...]  # tyre parameters that are states, of `TYRE_PARAMETERS`
@@ -73,7 +73,8 @@ class TyreKind(NamedTuple):
         return LEVELS if self.adapted else LEVELS[:3]
 
 
-STIFFNESSES = ("c2_front", "c2_rear")
+STIFFNESSES = ("c2_front", "c2_rear")  # parameters of linear tyres
+# setting ``tyres`` -> kind of tyres
 KINDS: dict[str, TyreKind] = {
     "linear": TyreKind("lint", "LINT", STIFFNESSES, STIFFNESSES),
     "rational": TyreKind("ratt", "RATT", CURVES, ()),
@@ -86,12 +87,12 @@ KINDS: dict[str, TyreKind] = {
 class RationalModel:
     """A single track on rational tyres, with the limits and the start of its filter."""
 
-    car: SingleTrackParameters  # its cornering stiffnesses are not used
+    car: SingleTrackParameters  # parameters of the car; its cornering stiffnesses are not used
     curves: FloatArray  # axle curves at friction 1, (4,), in the order of `CURVES`; c₁ = ∞: linear
-    curve_covariance: FloatArray  # of the logarithms of the curves at the start, (4, 4)
+    curve_covariance: FloatArray  # covariance of the curves' logarithms at the start, (4, 4)
     adapted: tuple[str, ...]  # tyre parameters that are states
     step: float  # Δt [s]
-    minimum_speed: float  # below it wheels roll without slip [m/s]
+    minimum_speed: float  # speed below which wheels roll without slip [m/s]
     adapt_above: float  # |u r| below which tyre parameters stay [m/s²]
     largest_sideslip: float  # |β| beyond which motion and tyres restart [rad]
     tyre_bound: float  # factor by which tyre parameters may differ from their start values
@@ -297,7 +298,9 @@ def filter_unscented(
 def _empty_states(
     steps: int, n: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Arrays for the fields of `FilteredStates` but the last one."""
+    """Empty arrays for all fields of `FilteredStates` but ``last``, for T = ``steps`` samples and n
+    states.
+    """
     return (
         np.empty((steps, n)),
         np.empty((steps, n)),

@@ -11,8 +11,9 @@ from vehest.declared import UNSET, setting
 from vehest.estimators.base import rate
 from vehest.estimators.recursive import Recursive
 
-TYPICAL_WHEELBASE = 2.7  # m
-TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not given
+TYPICAL_WHEELBASE = 2.7  # m, of the car for which the defaults of the settings are
+# distance of the centre of gravity from the rear axle over the wheelbase, where it is not given
+TYPICAL_REAR = 0.48
 WHEELBASE_POWERS = {
     "axle_lag": 0.5,
     "residual_time": 0.5,
@@ -35,7 +36,7 @@ WHEELBASE_POWERS = {
 
 Times and speeds scale with the root; tyres of small cars slip more.
 """
-REFERENCE_POINTS = ("cg", "rear_axle", "imu")
+REFERENCE_POINTS = ("cg", "rear_axle", "imu")  # points of the car at which v may be estimated
 
 
 class SelfCalibratingSettings(Recursive):
@@ -68,7 +69,9 @@ class SelfCalibratingSettings(Recursive):
         (4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]"
     )
     grip: float = setting(14.0, "median of the prior of a_max", unit="m/s²", positive=True)
-    grip_deviation: float = setting(0.55, "deviation of its logarithm", positive=True)
+    grip_deviation: float = setting(
+        0.55, "standard deviation of the logarithm of a_max's prior", positive=True
+    )
     grip_excess: float = setting(
         2.0,
         "deviation over a second of accelerations beyond a grip limit",
@@ -82,9 +85,11 @@ class SelfCalibratingSettings(Recursive):
     compliance: float = setting(
         0.0045, "prior of C of a car of 2.7 m", unit="rad s²/m", positive=True
     )
-    compliance_deviation: float = setting(0.5, "its deviation over C", positive=True)
+    compliance_deviation: float = setting(
+        0.5, "standard deviation of C's prior over C", positive=True
+    )
     leakage: float = setting(0.03, "prior of κ", least=-0.5, most=0.5)
-    leakage_deviation: float = setting(0.05, "its deviation", positive=True)
+    leakage_deviation: float = setting(0.05, "standard deviation of κ's prior", positive=True)
     imu_deviation: float = setting(
         0.02, "deviation of a given imu_to_rear_axle over the wheelbase", positive=True
     )
@@ -94,7 +99,9 @@ class SelfCalibratingSettings(Recursive):
         least=-1.0,
         most=2.0,
     )
-    place_deviation: float = setting(0.5, "its deviation", positive=True)
+    place_deviation: float = setting(
+        0.5, "standard deviation of b's prior over the wheelbase", positive=True
+    )
     point_deviation: float = setting(
         0.05, "deviation of the reference point's place over the wheelbase, in bands", least=0.0
     )
@@ -115,16 +122,28 @@ class SelfCalibratingSettings(Recursive):
     axle_constant: float = setting(
         0.007, "size s of the axle's error: constant", unit="m/s", positive=True
     )
-    axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
-    axle_per_slip: float = setting(0.03, "size over speed, prior of C and |φ|", least=0.0)
+    axle_per_speed: float = setting(
+        0.0009, "size s of the axle's error: factor of the speed", least=0.0
+    )
+    axle_per_slip: float = setting(
+        0.03, "size s of the axle's error: factor of speed · prior of C · |φ|", least=0.0
+    )
     axle_per_bend: float = setting(
-        4.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0
+        4.0,
+        "size s of the axle's error: factor of speed · prior of C · (φ' - 1)",
+        unit="m/s²",
+        least=0.0,
     )
     axle_per_slope: float = setting(
-        0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0
+        0.05,
+        "size s of the axle's error: factor of speed · prior of C · φ'",
+        unit="m/s²",
+        least=0.0,
     )
     axle_white: float = setting(0.03, "white error of the axle", unit="m/s", positive=True)
-    axle_white_share: float = setting(0.3, "white share of its variance", least=0.0)
+    axle_white_share: float = setting(
+        0.3, "white part of the axle's error: variance over s²", least=0.0
+    )
     gate: float = setting(3.0, "deviations at which an innovation is cut off", positive=True)
     memory: float = setting(
         150.0,
@@ -191,7 +210,7 @@ class SelfCalibratingSettings(Recursive):
     )
 
     def check(self) -> None:
-        """Check the car's geometry and the grip limits against each other.
+        """Check the car's geometry and the grip limits.
 
         Raises
         ------
@@ -243,12 +262,13 @@ class SelfCalibratingSettings(Recursive):
         return mean, self.place_deviation * self.wheelbase
 
 
+# names of the settings that are numbers
 NUMERIC = tuple(
     field.name
     for field in fields(SelfCalibratingSettings.settings_type)
     if isinstance(field.default, int | float)
 )
-DERIVED = ("dt", "point", "is_moved", "network_rear", "yaw_rate_max", "without_ax")
+DERIVED = ("dt", "point", "is_moved", "network_rear", "yaw_rate_max", "without_ax")  # see `Numbers`
 # Importable by its name, without which the cache of compiled code does not recognise the type.
 Numbers: Any = namedtuple("Numbers", NUMERIC + DERIVED)  # type: ignore[misc]
 """Numbers that the compiled recursion reads: settings, scaled to the car, and derived ones.

@@ -20,15 +20,15 @@ class FilterPass(NamedTuple):
     """The likeliest filter of the bank over a drive of T samples."""
 
     samples: FloatArray  # yaw rate [rad/s], u [m/s], ay, ax [m/s²] as the filter used them, (T, 4)
-    means: FloatArray  # (T, 8)
-    covariances: FloatArray  # (T, 8, 8)
+    means: FloatArray  # filtered means of the states, (T, 8)
+    covariances: FloatArray  # covariances of the states, (T, 8, 8)
     network: FloatArray  # v of the network [m/s], (T,)
     turning: FloatArray  # change of the low-passed yaw rate in each sample [rad/s], (T,)
     lateral: FloatArray  # size of the low-passed ay [m/s²], (T,)
 
 
 def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
-    """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
+    """Smooth a whole drive: v [m/s] at the reference point and its variance [m²/s²], (T, 2).
 
     The filter that is likeliest at the drive's end is smoothed, its parameters included. Network
     and steady cornering count by their weights at the end, and lateral accelerations beyond what
@@ -77,7 +77,7 @@ def smooth(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArr
 def _filter_pass(
     estimator: Any, samples: FloatArray, state: kernel.State, likeliest: int
 ) -> FilterPass:
-    """The bank's recursion, one sample after another, with the states of its likeliest filter.
+    """Run the bank's recursion forwards and record the states of its likeliest filter.
 
     Parameters
     ----------

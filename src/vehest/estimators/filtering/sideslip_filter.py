@@ -29,7 +29,7 @@ from vehest.filters.noise_levels import high_passed_level
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
-MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
+MEASURED = [0, 2]  # indices of yaw rate and lateral acceleration among the channels
 # rad and rad/s, standard deviation of a state that a protocol passes
 EXACT_STATE_DEVIATION = 1e-6
 
@@ -40,12 +40,12 @@ class FilteredStates(NamedTuple):
     mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
     # standard deviations of all states, (T, n), where the filter gives them
     deviation: FloatArray | None
-    covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
-    # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T,
-    # 2)
+    covariance: FloatArray  # covariance of sideslip angle and yaw rate, (T, 2, 2)
+    # innovation of yaw rate and lateral acceleration in the filter's order, (T, 2), 0 where nothing
+    # was measured
     innovation: FloatArray
-    innovation_covariance: FloatArray  # (T, 2, 2)
-    measured: NDArray[np.bool_]  # (T, 2)
+    innovation_covariance: FloatArray  # covariance of the innovations, (T, 2, 2)
+    measured: NDArray[np.bool_]  # whether each of both was measured and not refused, (T, 2)
     last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self, rows: slice = slice(None)) -> tuple[FloatArray, FloatArray]:
@@ -70,7 +70,8 @@ class FilterState(NamedTuple):
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
     state: Gaussian[FloatArray]  # after that sample, or before the first
-    refused: NDArray[np.int64]  # how often on end each measurement was refused, see `Gate`
+    # number of times in a row that yaw rate and lateral acceleration were refused, (2,), see `Gate`
+    refused: NDArray[np.int64]
 
 
 class SideslipFilter(GatedFilter, Recursive):
@@ -88,7 +89,7 @@ class SideslipFilter(GatedFilter, Recursive):
     )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
-        """The model in steps at forward speeds vx, (T,) [m/s].
+        """The single-track model in discrete time at forward speeds vx, (T,) [m/s].
 
         x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k].
         """
@@ -99,9 +100,10 @@ class SideslipFilter(GatedFilter, Recursive):
     def first_motion(
         self, sample: FloatArray, deviation: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """β and r before the first sample.
+        """Mean and covariance of the state before the first sample, β [rad] and r [rad/s] first.
 
-        0 with standard deviations (n ≥ 2), further states too, or a known initial state.
+        The mean is 0 with the standard deviations ``deviation``, (n,), n ≥ 2; a known initial state
+        replaces that of β and r.
         """
         mean = np.zeros(len(deviation))
         variance = np.square(deviation)
@@ -117,7 +119,9 @@ class SideslipFilter(GatedFilter, Recursive):
     def first_gaussian(
         self, sample: FloatArray, initial_state: Mapping[str, float]
     ) -> Gaussian[FloatArray]:
-        """State before the first sample; see `first_state`."""
+        """Mean and covariance of the state before the first sample; arguments as of
+        `Estimator.first_state`.
+        """
 
     def filter_samples(
         self,
@@ -147,11 +151,14 @@ class SideslipFilter(GatedFilter, Recursive):
         )
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
-        """Quantities of an `Estimate` by further states, (T, n): name -> (T,)."""
+        """Quantities of an `Estimate` that follow from states beyond β and r: name -> (T,).
+
+        ``states`` are all states, (T, n).
+        """
         return {}
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> FilterState:
-        """State before the first sample, its gate closed."""
+        """State before the first sample, at which the gate has refused nothing."""
         return FilterState(
             None,
             self.first_gaussian(sample, initial_state),
@@ -189,12 +196,13 @@ class SideslipFilter(GatedFilter, Recursive):
 def read_levels(
     recordings: Sequence[Recording], names: Sequence[str], cutoff: float, min_level: float = 0.0
 ) -> dict[str, float]:
-    """Standard deviations of measured channels of all recordings above a frequency, by name.
+    """Noise levels of measured channels: name -> standard deviation above a frequency, over all
+    recordings.
 
     Parameters
     ----------
     recordings : sequence of Recording
-        Taken together.
+        Recordings, whose samples are taken together.
     names : sequence of str
         Channels.
     cutoff : float

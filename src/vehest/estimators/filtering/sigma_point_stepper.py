@@ -17,12 +17,12 @@ from vehest.filters.unscented_scan import StepNoise, UnscentedStepper
 
 
 class FilterStep(NamedTuple):
-    """A sample as a filter takes it; see `UnscentedStepper.step`."""
+    """A sample in the form that `UnscentedStepper.step` takes."""
 
-    measurement: FloatArray  # (m,)
-    inputs: FloatArray  # (p,)
-    process_noise: StepNoise  # of the step that led to the sample
-    observation_noise: StepNoise  # of the measurement
+    measurement: FloatArray  # measured values, (m,), NaN where nothing was measured
+    inputs: FloatArray  # inputs of the model, (p,)
+    process_noise: StepNoise  # covariance of the step that led to the sample
+    observation_noise: StepNoise  # covariance of the measurement
 
 
 class SigmaPointEstimator(GatedFilter):
@@ -32,9 +32,9 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
-        """A sample of ``channels``, (C,), as the filter takes it.
+        """Convert a sample of ``channels``, (C,), into the filter's measurement, inputs and noise.
 
-        ``memory`` is what earlier samples left, empty at first.
+        ``memory`` is a dictionary that keeps values from sample to sample; it is empty at first.
         """
 
     @abstractmethod
@@ -54,7 +54,7 @@ class SigmaPointEstimator(GatedFilter):
 
 
 def normalised_innovations(steps: Filtered[Tensor]) -> tuple[FloatArray, FloatArray]:
-    """Normalised innovation squared eᵀS⁻¹e, and how many numbers were measured, (B, T) each.
+    """Normalised innovation squared eᵀS⁻¹e, and number of measured values, (B, T) each.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def normalised_innovations(steps: Filtered[Tensor]) -> tuple[FloatArray, FloatAr
 
 
 class SigmaPointStepper(Stepper):
-    """The filter of such an estimator, one sample at a time.
+    """Runs the filter of a `SigmaPointEstimator` one sample at a time.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class SigmaPointStepper(Stepper):
         self._memory: dict[str, Any] = {}
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """States at the time of the sample, and the variance of the lateral velocity [m²/s²].
+        """States at the time of the sample, name -> value [SI], and ``vy_variance`` [m²/s²].
 
         The filter starts from the first sample; a sample's inputs act until the next one.
         """

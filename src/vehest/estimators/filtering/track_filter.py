@@ -24,20 +24,21 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
+# how `error_over` combines errors: mean square over all samples, or squared mean of the recordings'
+# root mean squares
 Over = Literal["samples", "recordings"]
-
-# m/s, rad/s: standard deviations of a motion that is not given, and of a car that rolls
+# m/s, rad/s: standard deviations of v and r where they are not given, and of a car that rolls
 UNKNOWN_MOTION = (
     0.5,
     0.2,
 )
-ROLLING = np.diag(np.square(UNKNOWN_MOTION))
-EXACT_STATE_DEVIATION = 1e-6  # the same of a state that is given
+ROLLING = np.diag(np.square(UNKNOWN_MOTION))  # covariance of (v, r) of a car that rolls
+EXACT_STATE_DEVIATION = 1e-6  # m/s, rad/s: standard deviation of a state that is given
 KAPPA = 1.0  # n + κ = 3
 
 
 class TrackFilter:
-    """States v and r.
+    """Unscented filter of v [m/s] and r [rad/s] over a `DugoffTrack`.
 
     Measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward speed, steering
     angle and ax.
@@ -140,12 +141,10 @@ class TrackFilter:
 def in_nonlinear_range(
     ay: FloatArray, enter: float, leave: float, before: bool = False
 ) -> NDArray[np.bool_]:
-    """Whether the car behaves non-linearly, with a hysteresis.
+    """Mask (T,) of the samples at which the car behaves non-linearly, with a hysteresis.
 
-    From |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, less than that.
-
-    Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first
-    sample.
+    It does from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, which is smaller. A NaN in ay, (T,)
+    [m/s²], changes nothing; ``before`` is the value before the first sample.
 
     Source: Bertipaglia et al. 2024, Section IV-C, which gives no thresholds.
     """
@@ -156,9 +155,9 @@ def in_nonlinear_range(
 
 
 def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
-    """One figure of the errors of several recordings.
+    """Combine the squared errors of several recordings into one figure, for a search of levels.
 
-    ``sums`` has the sum of squared errors and the number of samples of each.
+    ``sums`` has the sum of squared errors and the number of samples of each recording.
 
     ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the
     recordings' root mean squared errors, in which a recording counts by its error, not by the
@@ -176,9 +175,10 @@ def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
 
 
 def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
-    """Groups of rows of similar length, each of at most so many samples when padded.
+    """Group sequences by length, so that they can be padded and filtered together.
 
-    A group has at least one row.
+    Yields the indices of each group, which has at least one sequence, and at most ``max_samples``
+    samples when padded if it has more.
     """
     rows: list[int] = []
     for row in sorted(range(len(lengths)), key=lambda index: -lengths[index]):
@@ -191,9 +191,9 @@ def groups_of(lengths: Sequence[int], max_samples: int) -> Iterator[list[int]]:
 
 
 def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
-    """Arrays (T, n) of different lengths as one, (B, max T, n).
+    """Stack arrays (T, n) of different lengths into one, (B, max T, n).
 
-    Shorter ones are filled with a value or, for None, with their last row.
+    Shorter ones are filled with ``fill`` or, for None, with their last row.
     """
     longest = max(len(array) for array in arrays)
     return np.stack(

@@ -28,7 +28,7 @@ from vehest.vehicle.dugoff import LoadedCar
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.rational_tyres import rational_axle
 
-Kind = Literal["linear", "rational"]
+Kind = Literal["linear", "rational"]  # kind of an axle's curve, see `axle_force`
 
 PARAMETERS: dict[str, tuple[str, ...]] = {
     "linear": ("cornering_stiffness",),
@@ -36,21 +36,23 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
 }
 """Names of an axle's parameters, by the kind of its curve: [N/rad]; [rad²], [N/rad]."""
 
+# parameter -> smallest and largest value that a fit may give
 BOUNDS = {"cornering_stiffness": (1e2, 1e8), "c1": (1e-5, 1.0), "c2": (1e2, 1e8)}
-# where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+# rad, slip angle at which road tyres have their largest force: two in three between 6 and 13
+# degrees, assumed
 PEAK_SLIP = math.radians(9.0)
-PEAK_SPREAD = 0.4  # standard deviation of its logarithm
+PEAK_SPREAD = 0.4  # standard deviation of the logarithm of `PEAK_SLIP`
 # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
 ROAD_TYRE_LOG_C1 = (
     math.log(0.5 * PEAK_SLIP**2),
     2.0 * PEAK_SPREAD,
 )
-# of the residuals, as a share of the scale of forces: a curve may fit without any
+# smallest spread of the residuals over the scale of forces, since a curve may fit exactly
 MIN_SPREAD = 1e-6
-PASSES = 3  # of weighing what is known against what the drives leave unexplained
+PASSES = 3  # fits, each of which weighs the prior of c₁ against the residuals of the last one
 # s, window of the polynomial (Savitzky & Golay) by which forces and slips are smoothed
 SMOOTHING_SECONDS = 0.5
-SMOOTHING_ORDER = 2  # its degree; a window of as few samples is refused
+SMOOTHING_ORDER = 2  # degree of the smoothing polynomial; a window of as few samples is refused
 BLOCK_SECONDS = 10.0  # s; residuals further apart than this count as independent
 MIN_SAMPLES = 100  # samples fast enough in all recordings together; fewer are refused
 NORMAL_95 = 1.959964  # half width of the 95 % interval of a Gaussian, in standard deviations
@@ -58,7 +60,9 @@ NORMAL_95 = 1.959964  # half width of the 95 % interval of a Gaussian, in standa
 
 @dataclass(frozen=True, eq=False)
 class AxleMotion:
-    """Motion of the axles along drives; slips and forces have a row an axle, front and rear."""
+    """Slip angles and lateral forces of the axles along drives, N samples in all; the rows are the
+    front and the rear axle.
+    """
 
     slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
     force: FloatArray  # lateral forces, (2, N) [N]
@@ -70,23 +74,23 @@ class AxleMotion:
 
 @dataclass(frozen=True, eq=False)
 class TyreFit:
-    """Curves of both axles."""
+    """Fitted force curves of both axles, and the samples that they were fitted to."""
 
-    kind: Kind
+    kind: Kind  # kind of both curves
     front: FloatArray  # parameters of the front axle in the order of `PARAMETERS`, (P,)
     rear: FloatArray  # those of the rear axle
-    covariance: FloatArray  # of the front and of the rear parameters, (2, P, P)
-    residual_rms: FloatArray  # of the front and of the rear force, (2,) [N]
+    covariance: FloatArray  # covariance of the front and of the rear parameters, (2, P, P)
+    residual_rms: FloatArray  # root mean square residual of front and rear force, (2,) [N]
     slip: FloatArray  # slip angles that were fitted to, (2, N) [rad]
     force: FloatArray  # forces that were fitted to, (2, N) [N]
 
     @property
     def interval(self) -> FloatArray:
-        """Half of the 95 % confidence interval of each parameter, (2, P)."""
+        """Half width of the 95 % confidence interval of each parameter, (2, P)."""
         return NORMAL_95 * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def curve(self, axle: Literal["front", "rear"], slip: FloatArray) -> FloatArray:
-        """Force of an axle [N] at slip angles [rad]; same shape."""
+        """Lateral force of an axle [N] at slip angles [rad], of the same shape."""
         return axle_force(self.kind, getattr(self, axle), slip)
 
 
@@ -109,7 +113,7 @@ def axle_motion(
     *,
     measured_forces: bool = False,
 ) -> AxleMotion:
-    """Slip angles and forces of the axles along drives.
+    """Compute slip angles and lateral forces of the axles along drives, to fit curves to.
 
     Yaw acceleration is the slope of a second-order polynomial through half a second of the yaw rate
     (Savitzky and Golay); whatever else enters is smoothed by the same polynomial, so that slips and
@@ -180,7 +184,9 @@ def _motion_of(
     *,
     measured_forces: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Slips and forces of one drive, (2, T) each, and what it was driven with, (3, T)."""
+    """Slip angles and forces of one drive, (2, T) each, and speed, steering angle and longitudinal
+    acceleration (`AxleMotion.driven`), (3, T).
+    """
     front, rear, mass, inertia = (
         float(value)
         for value in (
@@ -262,7 +268,7 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
 def _fitted(
     kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Parameters of one axle, their covariance and the rms of what is left.
+    """Fit the curve of one axle: parameters, their covariance and the rms of residual forces.
 
     Logarithms are fitted, so that all stay positive.
 

@@ -16,7 +16,7 @@ from numba.extending import intrinsic, overload
 
 from vehest.lanes import Lanes, each, least, most
 
-_F = numba.float32
+_F = numba.float32  # converts the constants of the polynomials
 
 
 def tanh(x: Any) -> Any:
@@ -61,12 +61,12 @@ def rational_tanh(x: Any) -> Any:
     return _F(2.0) * n * d / (d * d + n * n)
 
 
-_rational_tanh = numba.njit(inline="always")(rational_tanh)
+_rational_tanh = numba.njit(inline="always")(rational_tanh)  # `rational_tanh`, compiled and inlined
 
 
 @overload(tanh)
 def _compiled_tanh(x):
-    """Choose the rational function for float32, otherwise the library's."""
+    """numba's implementation of `tanh`: the rational function for float32, else the library's."""
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _rational_tanh(x)
     return (lambda x: each(math.tanh, x)) if isinstance(x, Lanes) else (lambda x: math.tanh(x))
@@ -74,7 +74,7 @@ def _compiled_tanh(x):
 
 @overload(sigmoid)
 def _compiled_sigmoid(x):
-    """Logistic function by the tanh of its precision."""
+    """numba's implementation of `sigmoid`, by the tanh of the argument's precision."""
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _F(0.5) + _F(0.5) * _rational_tanh(_F(0.5) * x)
     return lambda x: 0.5 + 0.5 * tanh(0.5 * x)
@@ -82,7 +82,7 @@ def _compiled_sigmoid(x):
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _of_bits(typing: Any, bits: Any) -> Any:
-    """The float32 with the bits of an int32."""
+    """Reinterpret the bits of an int32 as a float32."""
     return types.float32(types.int32), lambda context, builder, sig, args: builder.bitcast(
         args[0], ir.FloatType()
     )
@@ -90,7 +90,8 @@ def _of_bits(typing: Any, bits: Any) -> Any:
 
 @overload(softplus)
 def _compiled_softplus(x):
-    """Softplus in float32, by exp(-|x|) = 2ⁿ exp(r) and log(1 + e) = 2 artanh(e/(2 + e)).
+    """numba's implementation of `softplus` in float32, by exp(-|x|) = 2ⁿ exp(r) and log(1 + e) = 2
+    artanh(e/(2 + e)).
 
     |r| < 0.35; exp(r) is the polynomial of Cephes' expf, artanh its series.
     """
@@ -116,7 +117,8 @@ def _compiled_softplus(x):
 
 @overload(arctan)
 def _compiled_arctan(x):
-    """Abramowitz & Stegun, equation 4.4.49, and π/2 - arctan(1/x) beyond 1.
+    """numba's implementation of `arctan` in float32: the polynomial of Abramowitz & Stegun,
+    equation 4.4.49, and π/2 - arctan(1/x) beyond 1.
 
     The polynomial in y² is evaluated at y = min(|x|, 1)/max(|x|, 1), so that both branches share
     it.

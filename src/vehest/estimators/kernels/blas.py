@@ -8,11 +8,11 @@ from functools import cache
 import scipy.linalg.cython_blas  # noqa: F401 - loads the library that compiled code calls
 from threadpoolctl import ThreadpoolController
 
-_controller = cache(ThreadpoolController)
+_controller = cache(ThreadpoolController)  # controller of the numbers of threads, made once
 
 
 def single_blas_thread() -> AbstractContextManager[object]:
-    """Matrix products within stay on their thread.
+    """Context in which each matrix product of BLAS uses only the thread that calls it.
 
     Those of small blocks gain nothing from more, and several threads call them.
     """

@@ -19,17 +19,17 @@ import numba
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that Python calls, kept in the compile cache.
+    """Decorator that compiles a function which Python calls, and keeps it in the compile cache.
 
-    ``options`` as those of ``numba.njit``.
+    ``options`` are those of ``numba.njit``.
     """
     return numba.njit(cache=True, error_model="numpy", **options)  # type: ignore[no-any-return]
 
 
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a function that only compiled functions call.
+    """Decorator that compiles a function which only compiled functions call, as a part of these.
 
-    ``options`` as those of ``numba.njit``.
+    ``options`` are those of ``numba.njit``.
 
     With ``_nrt=False`` it counts no references of arrays, which compiles sooner; it may then
     neither make nor return one.

@@ -32,8 +32,8 @@ from vehest.vehicle.dugoff import (
 
 # rows of inputs (speed, steering angle, longitudinal acceleration) before saved derivatives
 DRIVEN = 3
-PLAIN = MAX_FORCE_RATIO["plain"]
-SMOOTH = MAX_FORCE_RATIO["smooth"]
+PLAIN = MAX_FORCE_RATIO["plain"]  # λ from which on tyres of Eq. 9 are linear
+SMOOTH = MAX_FORCE_RATIO["smooth"]  # λ from which on tyres of Eq. 10 are linear
 
 
 class CompiledDugoffTrack(PointModel):
@@ -52,7 +52,7 @@ class CompiledDugoffTrack(PointModel):
     """
 
     is_compiled = True
-    scratch_rows = 4
+    scratch_rows = 4  # rows of inputs for each point in which entries store numbers
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
@@ -75,7 +75,7 @@ class CompiledDugoffTrack(PointModel):
 
 @piece
 def _set_row(values, row, b, vector, end):
-    """Write a vector to a row of the sequences from b to ``end``."""
+    """Write a vector, one lane a sequence, to the sequences from b to ``end`` of a row."""
     store_some(values, row * values.shape[values.ndim - 1] + b, vector, end - b)
 
 
@@ -188,7 +188,9 @@ def _save_slopes(inputs, entry, s, b, by_front, by_rear, end):
 
 @piece
 def _saved_slopes(inputs, entry, s, b):
-    """Derivatives that `_save_slopes` saved for point s."""
+    """Derivatives by the lateral velocities of the front and the rear axle that `_save_slopes`
+    saved for point s.
+    """
     row = DRIVEN + 4 * s + 2 * entry
     return at_row(inputs, row, b), at_row(inputs, row + 1, b)
 

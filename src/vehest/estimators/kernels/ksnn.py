@@ -57,7 +57,7 @@ CHANNELS = 4  # inputs of a sample: yaw rate, speed, ay, ax
 
 
 def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int, ...]]:
-    """Parameters of a network by name, with their shapes."""
+    """Shapes of the parameters of a network with P = ``n_local`` and Q = ``n_hidden``, by name."""
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
         ("gamma", "beta", "linear_weight"), (n_local, 2)
     )
@@ -71,8 +71,8 @@ def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int
 
 
 def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
-    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6
-    Q).
+    """Pack parameters by name, (..., P, 2) or (..., P, 2, Q), into rows of local models, (..., P, 8
+    + 6 Q), which the recursion reads.
 
     A row is [γ₁, γ₂, β₁, β₂, w₁, b of f₁, w₁, b of f₂, (w₂, b₂, w₃) of each neuron of f₁, then of
     f₂]. The two biases of a feedback function are added; a missing one is 0.
@@ -208,7 +208,7 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
 
 @part(_nrt=False)
 def _forward(car, room, k, v, u):
-    """v and û after step k in all lanes.
+    """Compute v and û [m/s] after step k in all lanes.
 
     Leaves ``saved`` rows and neurons' ``outputs`` for `_backward`.
 
@@ -290,7 +290,8 @@ def _forward(car, room, k, v, u):
 
 @part(_nrt=False)
 def _model(position, n_local):
-    """First active local model of each lane.
+    """Index of the first active local model of each lane, by the ``position`` of its |ω| among the
+    centres.
 
     The active models of a lane are this one and the next; φ is zero for all others.
     """
@@ -320,9 +321,9 @@ def _chosen(theta, column, model, n_local, row):
 
 @part(_nrt=False)
 def _backward(car, room, k, v_bar, u_bar, sums):
-    """Adjoint of step k.
+    """Adjoint of step k: returns v̄ and û̄ before the step from those after it, and adds the
+    gradients of parameters to ``sums``.
 
-    v̄ and û̄ before it from those after it; adds the gradients of parameters to ``sums``.
 
     Equations: see the module. ``sums`` has a vector for each entry of ``theta``, so that no lane
     waits for another.

@@ -51,17 +51,19 @@ from vehest.vehicle.dynamics import (
 )
 from vehest.vehicle.tyres import SLIP_SPEED_OFFSET
 
-BLOCK = 110  # points at a time
+BLOCK = 110  # largest number of sigma points that are computed together
+# numbers of the kinds of cars, see `_kind_of`
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
 
+# options of numba for these functions
 _FAST = {"nogil": True, "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"}}
-compiled = entry(**_FAST)
-piece = part(**_FAST)
+compiled = entry(**_FAST)  # decorator of functions that Python calls
+piece = part(**_FAST)  # decorator of functions that only compiled ones call
 
 
 @piece
 def copy_rows(rows, out):
-    """The first rows of ``out`` become ``rows``.
+    """Copy ``rows`` into the first rows of ``out``.
 
     An assignment would take longer to compile: it checks shapes and words a message.
     """
@@ -78,7 +80,7 @@ class CompiledPlanarCar(PointModel):
     dynamics : Dynamics
         The car, one that `is_compilable`; gradients go to its parameters where they are wanted.
     step : float
-        [s].
+        Time step [s].
     lower : Sequence[float] | None
         Smallest possible value of each state.
     dtype : torch.dtype
@@ -119,13 +121,15 @@ class CompiledPlanarCar(PointModel):
         return single_blas_thread()
 
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
-        """Gradients and whether they are required; otherwise they are never written."""
+        """Arrays for the gradients by the parameters, and whether they are required; if not, they
+        are placeholders that are never written.
+        """
         learning = bool(self.parameters)
         return (*(gradients if learning else (*self.car[0][:6], self.car[1])), learning)
 
 
 def is_compilable(dynamics: Dynamics) -> bool:
-    """Whether there is compiled code for a car."""
+    """Whether there is compiled code for a car's dynamics."""
     return _kind_of(dynamics) is not None
 
 
@@ -148,7 +152,8 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 
 @piece
 def _columns(points, first, end, padding, x):
-    """Points of some sequences side by side.
+    """Write the points of the sequences ``first`` to ``end`` side by side into the columns of
+    ``x``.
 
     Columns beyond them are ``padding`` times the last one.
     """
@@ -165,7 +170,9 @@ def _columns(points, first, end, padding, x):
 
 @piece
 def _driven(inputs, first, end, count, u):
-    """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
+    """Write the inputs of the columns of `_columns`; rows of u are steering angle, its sine and
+    cosine, and motor current.
+    """
     for b in range(first, end):
         sine = math.sin(inputs[0, b])
         cosine = math.cos(inputs[0, b])
@@ -178,7 +185,7 @@ def _driven(inputs, first, end, count, u):
 
 @piece
 def _scatter_points(rows, points, first, end):
-    """Rows back into points of some sequences."""
+    """Write rows back into the points of the sequences ``first`` to ``end``."""
     count = points.shape[0]
     for b in range(first, end):
         for s in range(count):
@@ -197,9 +204,8 @@ def _hidden(below, transposed, offset, above):
 
 @piece
 def _rise(above, below, flat, nothing):
-    """Slope of a squashed value, its distances from both ends multiplied.
-
-    None where it has reached one but for rounding.
+    """Slope of a logistic function, as the product of its distances from both ends, ``above`` and
+    ``below``; ``nothing`` where it has reached an end but for rounding.
 
     At a crawl slips change by a million per m/s, and rounding would count.
     """
@@ -223,7 +229,7 @@ def _network(layers, f, h1, h2, o):
 
 @piece
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):
-    """Writes ``f_bar``, and adds to the gradients when learning.
+    """Adjoint of `_network`: writes ``f_bar``, and adds to the gradients when learning.
 
     ``o_bar`` is (4, P) and ``f_bar`` (P, F). ō W₃ -> h̄₂, times σ', W₂ -> h̄₁, times σ', W₁ -> f̄;
     gradients of weights are products of a layer's values and the gradients above it.
@@ -325,7 +331,9 @@ def _loads(theta, constants):
 
 @piece
 def _forces(x, car, slips, o, forces):
-    """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
+    """Write the axle forces [N], in the rows rear x, front x, rear y, front y, and behind them what
+    else the adjoint needs.
+    """
     _, theta, constants, kind = car
     points = x.shape[1]
     turn = constants[4]
@@ -354,8 +362,8 @@ def _forces(x, car, slips, o, forces):
 
 @piece
 def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):
-    """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and
-    adds to the others.
+    """Adjoint of `_forces`: writes ``o_bar`` and ``slips_bar`` from the gradients of the forces
+    (rows of ``slope``), and adds to ``x_bar`` and, when learning, ``dtheta``.
     """
     _, theta, constants, kind = car
     points = x.shape[1]
@@ -421,7 +429,9 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
 
 @piece
 def _chassis(x, u, car, forces, out):
-    """Rows of ``out`` are ax, ay, dr/dt, dω/dt."""
+    """Write the accelerations of the chassis; rows of ``out`` are ax, ay [m/s²], dr/dt [rad/s²] and
+    the rate of the rim speed.
+    """
     _, theta, constants, _ = car
     mass, wheelbase, radius = constants[:3]
     lr, inertia, drag0, drag1, drag2, powertrain, torque, viscous, coulomb = theta[:9]
@@ -455,9 +465,8 @@ def _chassis(x, u, car, forces, out):
 
 @piece
 def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):
-    """Writes the gradients of the forces, rows of ``slope``, and adds to the others.
-
-    ``out`` is what `_chassis` wrote.
+    """Adjoint of `_chassis`: writes the gradients of the forces, rows of ``slope``, and adds to
+    ``x_bar`` and, when learning, ``dtheta``. ``out`` is what `_chassis` wrote.
     """
     _, theta, constants, _ = car
     mass, wheelbase, radius = constants[:3]
@@ -521,7 +530,9 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
 
 @piece
 def _motion(x, u, car, room, out):
-    """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is saved for the adjoint."""
+    """Compute a car's motion from its state; rows of ``out`` are as of `_chassis`. ``room`` saves
+    everything else for the adjoint.
+    """
     layers, _, _, kind = car
     f, slips, h1, h2, o, forces, plain = room
     _slips_and_features(x, u, car, f, slips)
@@ -545,7 +556,9 @@ def _motion(x, u, car, room, out):
 
 @piece
 def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):
-    """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
+    """Adjoint of `_motion`: adds to ``x_bar`` and, when learning, to the gradients of
+    parameters.
+    """
     layers, theta, constants, kind = car
     f, slips, h1, h2, o, forces, plain = room
     points = x.shape[1]
@@ -628,7 +641,7 @@ def _rates(x, motion, rates):
 
 @piece
 def _block_of(sequences, count):
-    """Sequences in a block, so that blocks are about equal."""
+    """Number of sequences in a block of at most `BLOCK` points, so that blocks are about equal."""
     max_sequences = max(BLOCK // count, 1)
     pieces = (sequences + max_sequences - 1) // max_sequences
     return (sequences + pieces - 1) // pieces
@@ -652,8 +665,8 @@ def _gather_points(points, inputs, first, end):
 
 @piece
 def _room(points, x, car):
-    """Memory for the network's features of so many points, slips, both hidden layers, its outputs,
-    forces, and rates without what it adds.
+    """Allocate what a motion saves for its adjoint: the network's features, slips, both hidden
+    layers, the network's outputs, forces, and rates without what the network adds.
     """
     (T1, _, T2) = car[0][:3]
     columns = x.shape[1]
@@ -671,7 +684,7 @@ def _room(points, x, car):
 
 @piece
 def _stages(x0, u, car, rooms):
-    """States and rates at the four stages of the Runge-Kutta method."""
+    """Compute states and rates at the four stages of the Runge-Kutta method from the states x0."""
     step = car[2][3]
     half = x0.dtype.type(0.5)
     x = np.empty((4, *x0.shape), x0.dtype)

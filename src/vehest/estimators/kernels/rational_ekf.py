@@ -25,7 +25,7 @@ from vehest.filters.gating import refuses
 from vehest.filters.kalman_scan import make_symmetric
 from vehest.vehicle.rational_tyres import rational_axle
 
-_axle = numba.njit(rational_axle)
+_axle = numba.njit(rational_axle)  # `rational_axle`, compiled
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -182,7 +182,7 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
 
 @numba.njit(inline="always")
 def _propagate(cov, per_rate, per_turn, step, product):
-    """A P Aᵀ, in place.
+    """Propagate the covariance, P ← A P Aᵀ, in place.
 
     β and r are moved by their rates, β' and r' come from all states, tyre parameters stay.
     """
@@ -215,7 +215,9 @@ def _propagate(cov, per_rate, per_turn, step, product):
 
 @numba.njit(inline="always")
 def _add_noise(cov, front, car, speed, step, variances, wandering):
-    """Q = Δt B Λ Bᵀ of the steering angle and of tyre parameters that wander; Eqs. 41 to 45."""
+    """Add the process noise Q = Δt B Λ Bᵀ of the steering angle and, if ``wandering``, of the tyre
+    parameters to the covariance, in place; Eqs. 41 to 45.
+    """
     rate = front.per_slip * (1.0 / (car[0] * speed))
     acceleration = car[2] * front.per_slip / car[1]
     spread = step * variances[2]
@@ -244,11 +246,10 @@ def _innovate(
     S,
     measured,
 ):
-    """Innovations of yaw rate and ay, their covariance S and P Hᵀ.
+    """Write the innovations of yaw rate and ay, their covariance S, and P Hᵀ into ``cross``.
 
-    Of what was not measured 0, the identity's rows and 0.
-
-    What is refused counts as not measured.
+    For a value that was not measured or is refused by the gate these are 0, the identity's row and
+    0.
     """
     vx = sample[1]
     for i in range(len(mean)):
@@ -281,7 +282,7 @@ def _innovate(
 
 @numba.njit(inline="always")
 def _gain(cross, S, holds_tyres, gain):
-    """K = P Hᵀ S⁻¹; the rows of tyre parameters are 0 where these stay."""
+    """Write the gain K = P Hᵀ S⁻¹; the rows of tyre parameters are 0 where these stay."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
     for i in range(len(gain)):
         gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
@@ -292,9 +293,9 @@ def _gain(cross, S, holds_tyres, gain):
 
 @numba.njit(inline="always")
 def _reduce(cov, gain, cross, vx, crossfall, variances, measured, product):
-    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row.
+    """Update the covariance, P ← (I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row.
 
-    Joseph's form, which holds for any gain.
+    This is Joseph's form, which holds for any gain.
     """
     n = len(cov)
     for i in range(n):

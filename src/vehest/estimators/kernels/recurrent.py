@@ -29,15 +29,17 @@ from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.recursion import add, gather, slopes_of, squared_error, step_of_adam
 from vehest.lanes import load, store, total, width
 
-GRU = 3  # gates, by which a cell is also identified
-LSTM = 4  # gates, likewise
+GRU = 3  # number of gates of a GRU, which also identifies this kind of cell
+LSTM = 4  # number of gates of an LSTM, which also identifies this kind of cell
 SAVED_ROWS = 6  # rows of the hidden state's size that a step saves: the gates and two more
 BLOCK = 4  # inputs whose weights' gradients are summed together
 
 
 @entry(nogil=True)
 def loop(flat, constants, series, starts, targets, batch, values, gradient, losses, adam):
-    """See `vehest.estimators.kernels.recursion.Recursion`.
+    """Predictions of GRU or LSTM members, and perhaps gradients and steps of Adam; for the
+    arguments see `vehest.estimators.kernels.recursion.Recursion`.
+
 
     ``constants`` are the number of gates (`GRU` or `LSTM`), H, N, and mean and scale of the output.
     The state, (2 H, lanes), is hidden state and cell in the forward pass and their gradients in the
@@ -104,7 +106,7 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
 
 @part(_nrt=False)
 def _arguments(flat, size, room, k):
-    """Save the arguments of the gates at step k and return where.
+    """Save the arguments of the gates at step k, and return the place of the first.
 
     A GRU candidate's is without U_n h, which is one row later.
     """
@@ -240,7 +242,7 @@ def _row_of_state(gates, g):
 
 @part(_nrt=False)
 def _to_state(flat, size, saved, first, state):
-    """Add what goes through the gates' arguments to the adjoint of the state before."""
+    """Add what passes through the gates' arguments to the adjoint of the state before the step."""
     gates, states, channels = size
     lanes = width(flat)
     row = states * width(flat)
@@ -256,10 +258,10 @@ def _to_state(flat, size, saved, first, state):
 
 @part(_nrt=False)
 def _sum(size, room, sums):
-    """Gradients by the weights.
+    """Add the gradients by the weights to ``sums``.
 
-    Products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in
-    registers.
+    They are products of the arguments' adjoints and the inputs, over all steps, a few inputs at a
+    time in registers.
     """
     gates, states, channels = size
     windows, saved, _ = room

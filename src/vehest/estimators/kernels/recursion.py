@@ -20,14 +20,14 @@ from vehest.estimators.kernels.compiling import part
 from vehest.estimators.kernels.threads import over_members
 from vehest.lanes import load, store
 
-Floats = NDArray[Any]
+Floats = NDArray[Any]  # array of numbers of either precision
 
-DECAYS = (0.9, 0.999)
-EPSILON = 1e-8  # of Adam
+DECAYS = (0.9, 0.999)  # β₁ and β₂ of Adam
+EPSILON = 1e-8  # ε of Adam
 
 
 class Recursion(NamedTuple):
-    """A network's compiled recursion.
+    """A network's compiled recursion, with which members predict and are trained.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class Recursion(NamedTuple):
         losses: Floats,
         adam: Any = None,
     ) -> Floats:
-        """Values, (M, B), by all threads.
+        """Run the loop on all threads; returns predictions, (M, B).
 
         Members are rows of every array but ``series``; each thread works on a range of them.
         """
@@ -156,8 +156,8 @@ class Recursion(NamedTuple):
 
 @part(_nrt=False)
 def gather(series, channels, starts, first, rows, windows, stride):
-    """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of
-    lanes a sample, as many as fit.
+    """Copy the windows ``first`` and later of a series, (T · channels,), into ``windows``, one a
+    lane, as many as fit; a sample has ``stride`` rows of lanes.
 
     Lanes without a window repeat the last one.
     """
@@ -172,12 +172,11 @@ def gather(series, channels, starts, first, rows, windows, stride):
 
 @part(_nrt=False)
 def slopes_of(values, targets, first, squared, scratch):
-    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``.
+    """Write the derivatives of the loss by the predictions of a block of lanes into ``scratch``; 0
+    in lanes without a window.
 
-    0 in lanes without a window.
-
-    It is 2 (v - target)/B where squared errors are minimised (``squared``), else the weight that
-    ``targets`` has.
+    A derivative is 2 (v - target)/B where squared errors are minimised (``squared``), else the
+    weight that ``targets`` has.
     """
     count = values.size
     for lane in range(scratch.size):
@@ -204,7 +203,9 @@ def squared_error(values, targets):
 
 @part(_nrt=False)
 def step_of_adam(flat, gradient, adam, m, batches):
-    """Step ``batches`` of this call for member m, as `torch.optim.Adam`, back into the bounds.
+    """Take step number ``batches`` of this call for member m as `torch.optim.Adam` does, and clip
+    the parameters to their bounds.
+
 
     Source: Kingma & Ba 2015, Algorithm 1.
 

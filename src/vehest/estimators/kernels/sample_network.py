@@ -28,13 +28,14 @@ from torch import Tensor
 
 from vehest.estimators.kernels.threads import over_members
 
+# decorator of compiled functions
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 
-LEVELS = 256  # dropout drops a whole number of so many parts of hidden values
-LAYERS = 3  # two hidden ones and the output
+LEVELS = 256  # the share of dropout is rounded to a multiple of 1/256
+LAYERS = 3  # number of layers: two hidden ones and the output
 
 Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
-"""Loss of outputs (B, O) and targets (B,): the mean.
+"""Function that returns the mean loss of outputs (B, O) for targets (B,).
 
 Its gradient by the outputs, (B, O), is written into the last argument.
 """
@@ -54,7 +55,7 @@ def outputs_of(
     parameters : Sequence[Tensor]
         Weights and biases by turns from the inputs on, (M, C, H), (M, H), and so on.
     seeds : Tensor | None, default None
-        One a member, int64 (M,), from which its mask follows; none: no dropout.
+        Seed of each member's dropout mask, int64 (M,); None: no dropout.
     dropout : float, default 0.0
         Share of hidden values that are dropped, rounded to a 256th; the others are scaled so that
         their mean stays.
@@ -85,9 +86,9 @@ def losses_of(
     table : Tensor
         Inputs, (N, C).
     targets : Tensor
-        (N,).
+        Targets of the inputs, (N,).
     rows : Tensor
-        Which of them each member is trained on, int64 (M, B).
+        Indices of the inputs that each member is trained on, int64 (M, B).
     parameters : Sequence[Tensor]
         See `outputs_of`; likewise ``seeds`` and ``dropout``.
     criterion : Criterion

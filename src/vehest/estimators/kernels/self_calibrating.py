@@ -30,7 +30,9 @@ from vehest.lanes import VECTOR_BYTES, choose, least, load, most, root, store, t
 
 STATES = 8  # states of a filter, which the next line names
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
-CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
+# number of candidates for v: this bank, the network that comes with vehest, steady cornering with
+# the priors
+CANDIDATES = 3
 BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, those of the candidates' residuals, the mean
 # square of the axle's error s e over the last moments, and the lateral acceleration that the drive
@@ -38,8 +40,8 @@ BANK, NETWORK, STEADY = range(CANDIDATES)
 LAGGED = 17  # number of lagged signals
 YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
 SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIDE, REACHED = range(10, LAGGED)
-# of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals,
-# and last v
+# number of moments of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments
+# of the residuals, and last v
 MOMENTS = 8
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(MOMENTS)
 # Rows of the bank, with a filter in each lane: states, the upper triangle of the covariances, then
@@ -59,25 +61,26 @@ AT = np.array(
         for i in range(STATES)
     ]
 )
-# in numbers of float64: VECTOR_BYTES // 8 lanes in each row
+# as an index of float64 values: VECTOR_BYTES // 8 lanes in each row
 AT = (STATES + AT) * (VECTOR_BYTES // 8)
-MIN_GRIP_SHARE = 0.3  # of a grip limit that remains at any longitudinal acceleration
+MIN_GRIP_SHARE = 0.3  # smallest share of a grip limit that remains at any longitudinal acceleration
 ROLLING_DEVIATION = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
-# of |e|, in deviations of its prior, above which b stays: a slide does not show the unit's place
+# largest |e|, in deviations of its prior, at which b is estimated; beyond it b stays: a slide does
+# not show the unit's place
 MAX_ERROR_OF_PLACE = 1.0
 LEAST_AY = 1e-9  # m/s²: avoids a division by zero
 
 
 class State(NamedTuple):
-    """What is carried from sample to sample; J filters, a window of N samples."""
+    """State of the recursion between samples, with J filters and a window of N samples."""
 
-    means: FloatArray  # (J, 8)
-    covariances: FloatArray  # (J, 8, 8)
-    log_weights: FloatArray  # (J,)
-    lags: FloatArray  # (17,)
-    candidates: FloatArray  # (3, 8)
-    weights: FloatArray  # (3,), of the candidates
-    last: FloatArray  # (4,), the sample before
+    means: FloatArray  # means of the filters' states, (J, 8)
+    covariances: FloatArray  # covariances of the filters' states, (J, 8, 8)
+    log_weights: FloatArray  # logarithms of the filters' weights, (J,)
+    lags: FloatArray  # lagged signals, (17,)
+    candidates: FloatArray  # low-passed values and moments of the candidates, (3, `MOMENTS`)
+    weights: FloatArray  # weights of the candidates, (3,)
+    last: FloatArray  # the last sample, (4,)
     # (N, 4), the last samples, the oldest first; those before the first sample repeat it
     window: FloatArray
 
@@ -176,7 +179,9 @@ def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):
 
 @part()
 def _measured_sum(f, first, second, factor, measured, variance):
-    """A state plus a factor times another, as measured: residual and its variance."""
+    """Prepare an update with the measurement of one state plus ``factor`` times another: returns
+    the residual and its variance, and writes the covariances with the states into the rows `CROSS`.
+    """
     lanes = width(f)
     for i in range(STATES):
         store(f, (CROSS + i) * lanes, load(f, AT[i, first]) + factor * load(f, AT[i, second]))
@@ -577,7 +582,9 @@ def _weigh(bank, log_weights):
 
 @part()
 def _mixture(bank, moments):
-    """Mean and variance of the states over the bank, differences between filters included."""
+    """Write mean and variance of the states over the bank, differences between filters included,
+    into ``moments``, (16,).
+    """
     lanes = width(bank)
     for i in range(STATES):
         mean = 0.0
@@ -595,9 +602,9 @@ def _mixture(bank, moments):
 
 @part()
 def _at_point(bank, is_moved, point, yaw_rate, moments):
-    """Mean and variance over the bank of v at the reference point, v + ω (point - b).
+    """Mean and variance over the bank of v at the reference point, v + ω (point - b) [m/s].
 
-    Of v itself where that point is the inertial unit (``is_moved`` 0).
+    They are those of v itself where that point is the inertial unit (``is_moved`` 0).
     """
     lanes = width(bank)
     lever = is_moved * yaw_rate
@@ -619,7 +626,7 @@ def _at_point(bank, is_moved, point, yaw_rate, moments):
 
 @part()
 def _normalise(log_weights, weights, count):
-    """Weights of sum 1 from the first ``count`` logarithms; in loops as in `_weigh`."""
+    """Write weights of sum 1 from the first ``count`` logarithms of weights."""
     largest = log_weights[0]
     total = 0.0
     for j in range(count):

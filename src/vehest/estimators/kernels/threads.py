@@ -12,13 +12,14 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
 
-PIECES = 4  # for each thread, so that a delayed thread leaves its share to the others
-_allowed = ContextVar("_allowed", default=0)
+# pieces of work for each thread, so that a delayed thread leaves its share to the others
+PIECES = 4
+_allowed = ContextVar("_allowed", default=0)  # threads for members; 0: as many as torch's
 
 
 @contextmanager
 def threads_for_members() -> Iterator[None]:
-    """Within, `over_members` has the threads that torch was allowed, and torch one.
+    """Context in which `over_members` uses the threads that torch was allowed, and torch one.
 
     Its small operations would wait for threads held up.
     """

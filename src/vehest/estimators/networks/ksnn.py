@@ -17,7 +17,8 @@ from vehest.estimators.networks.compiled import CompiledNetwork
 
 GAMMA_START = 0.98  # mean of the initial γ
 GAMMA_SPREAD = 0.01  # standard deviation of the initial γ, which are 1 at most
-INITIAL_DEVIATION = 0.1  # of the initial β from 1, and of linear and output weights from 0
+# standard deviation of the initial β from 1, and of linear and output weights from 0
+INITIAL_DEVIATION = 0.1
 
 
 class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
@@ -36,14 +37,14 @@ class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
     """
 
     yaw_rate_max: Tensor
-    gamma: nn.Parameter
-    beta: nn.Parameter
-    linear_weight: nn.Parameter
-    linear_bias: nn.Parameter
-    hidden_weight: nn.Parameter
-    output_weight: nn.Parameter
-    hidden_bias: nn.Parameter
-    output_bias: nn.Parameter
+    gamma: nn.Parameter  # γ₁ and γ₂ of each local model, (P, 2)
+    beta: nn.Parameter  # β₁ and β₂ of each local model, (P, 2)
+    linear_weight: nn.Parameter  # w₁ of f₁ and f₂, (P, 2)
+    linear_bias: nn.Parameter  # b₁ of f₁ and f₂, (P, 2), if there are biases
+    hidden_weight: nn.Parameter  # w₂ of Q neurons of f₁ and f₂, (P, 2, Q)
+    output_weight: nn.Parameter  # w₃ of Q neurons of f₁ and f₂, (P, 2, Q)
+    hidden_bias: nn.Parameter  # b₂ of Q neurons of f₁ and f₂, (P, 2, Q), if there are biases
+    output_bias: nn.Parameter  # b₃ of f₁ and f₂, (P, 2), if there are biases
 
     def __init__(self, settings: Any, yaw_rate_max: float = 1.0) -> None:
         super().__init__()

@@ -18,6 +18,7 @@ from vehest.estimators.networks.compiled import CompiledNetwork
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.estimators.networks.windowed import WindowedEstimator
 
+# entry of both benchmarks in the first comparison on a new car
 TRIAL = Trial(
     7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)"
 )
@@ -26,16 +27,16 @@ TRIAL = Trial(
 class HiddenStateEstimator(Network):
     """A family that is named by the size of its hidden state."""
 
-    n_states: int
-    network_type: ClassVar[Any]
+    n_states: int  # length of the hidden state
+    network_type: ClassVar[Any]  # class of the network
 
     def new_network(self) -> Any:
-        """A network of these sizes."""
+        """An untrained network of the settings' sizes."""
         return self.network_type(self.settings)
 
     @property
     def variant(self) -> str:
-        """Name of the structure."""
+        """Identifier by the size of the hidden state."""
         return f"states_{self.n_states}"
 
     @property
@@ -51,7 +52,7 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     (...).
     """
 
-    n_gates: ClassVar[int]  # of the cell
+    n_gates: ClassVar[int]  # number of gates of the cell
 
     def __init__(self, settings: Any) -> None:
         channels = len(RecurrentEstimator.channels)
@@ -109,7 +110,7 @@ class RecurrentEstimator(HiddenStateEstimator, WindowedEstimator):
     template = "window_recurrent"
 
     def c_values(self) -> dict[str, Any]:
-        """Weights and sizes."""
+        """Weights and sizes of the network for the C template."""
         weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
         gates, states, _ = weights["input_weight"].shape
         return {**weights, "window": self.settings.window, "gates": gates, "states": states}

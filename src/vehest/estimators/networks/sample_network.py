@@ -30,7 +30,7 @@ from vehest.training.robust import robust_criterion
 from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
 from vehest.training.sequences import record_of_phases, train_phases
 
-CORNERS = ("fl", "fr", "rl", "rr")
+CORNERS = ("fl", "fr", "rl", "rr")  # suffixes of the channels of the four wheels
 IMU = ("ax", "ay", "vx", "steer", "yaw_rate")  # motion and steering, without tyre forces
 INPUTS: dict[str, tuple[str, ...]] = {
     "full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)),
@@ -40,19 +40,20 @@ INPUTS: dict[str, tuple[str, ...]] = {
 without.
 """
 
+# scaling of inputs: to [0, 1], or to mean 0 and standard deviation 1
 Normalisation = Literal["range", "standard"]
 NORMALISATION_SUFFIXES: dict[str, str] = {"range": "", "standard": "_standard"}
 """Normalisation -> suffix of the variant's name."""
 
 SAMPLES_TOGETHER = 50_000  # samples that are estimated at a time
-STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
+MAX_SIDESLIP = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
 class SampleNetworkEstimator(Network):
     """An estimator with a `SampleNetwork`."""
 
-    network: SampleNetwork
-    network_inputs: tuple[str, ...]  # measured channels that the network sees
+    network: SampleNetwork  # the networks
+    network_inputs: tuple[str, ...]  # measured channels that the network reads
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
     dropout: float = setting(
         0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0
@@ -62,7 +63,9 @@ class SampleNetworkEstimator(Network):
     )
 
     def check(self) -> None:
-        """Layers have neurons, and not too many."""
+        """Check the widths of the layers; raises `ConfigurationError`: none, or too many
+        neurons.
+        """
         super().check()
         if min(self.hidden) < 1 or max(self.hidden) > MAX_WIDTH:
             raise ConfigurationError(
@@ -159,9 +162,9 @@ class SampleNetwork(nn.Module):
     Source: Bertipaglia et al. 2024, Section III-A.
     """
 
-    input_low: Tensor
-    input_span: Tensor
-    unit: Tensor
+    input_low: Tensor  # offset of each input, (C,) [SI]: its smallest value or its mean
+    input_span: Tensor  # scale of each input, (C,) [SI]: its range or its standard deviation
+    unit: Tensor  # root mean square of the targets [rad], a scalar
 
     def __init__(
         self, n_inputs: int, hidden: tuple[int, int], n_outputs: int, members: int = 1
@@ -208,7 +211,7 @@ class SampleNetwork(nn.Module):
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
 
     def scaled(self, inputs: Tensor) -> Tensor:
-        """Inputs as the network takes them, (..., C), of measured ones in SI units.
+        """Scale measured inputs [SI], (..., C), for the network.
 
         With ``range`` those of training lie in 0 … 1. A channel that was constant in training has
         the largest float32 as its span, so that it stays near 0 whatever it becomes.
@@ -216,7 +219,7 @@ class SampleNetwork(nn.Module):
         return (inputs - self.input_low) / self.input_span
 
     def samples(self, inputs: FloatArray, sideslip: FloatArray) -> Samples:
-        """Measured inputs (N, C) and sideslip angles (N,) [rad] as the network takes them."""
+        """Scale measured inputs (N, C) and sideslip angles (N,) [rad] into samples for training."""
         measured_inputs, angles = (
             torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip)
         )
@@ -250,7 +253,7 @@ class SampleNetwork(nn.Module):
         return {
             name: tensor.detach().numpy().astype(np.float64)
             for name, tensor in self.state_dict().items()
-        } | {"steepest": STEEPEST}
+        } | {"steepest": MAX_SIDESLIP}
 
     def validation_losses(self, samples: Samples, criterion: Criterion) -> Tensor:
         """Losses on samples without dropout, (M,).
@@ -275,8 +278,8 @@ def learnt_samples(
     estimator: str,
     minimum_speed: float = -np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,)
-    [rad], recordings one after another.
+    """Inputs (N, C) and reference sideslip angles (`reference_sideslip`), (N,) [rad], to train a
+    network on, recordings one after another.
 
     Samples slower than ``minimum_speed`` [m/s] are left out.
 
@@ -306,5 +309,5 @@ def reference_sideslip(recording: Recording) -> FloatArray:
 
 
 def clip_sideslip(sideslip: FloatArray) -> FloatArray:
-    """Sideslip angles within `STEEPEST`, since the lateral velocity is vx tan β."""
-    return np.clip(sideslip, -STEEPEST, STEEPEST)
+    """Sideslip angles [rad] clipped to ±`MAX_SIDESLIP`, since the lateral velocity is vx tan β."""
+    return np.clip(sideslip, -MAX_SIDESLIP, MAX_SIDESLIP)

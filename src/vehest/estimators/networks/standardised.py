@@ -20,10 +20,10 @@ class StandardisedNetwork(nn.Module):
     of what is predicted of one instant is ``outputs``.
     """
 
-    input_mean: Tensor
-    input_scale: Tensor
-    output_mean: Tensor
-    output_scale: Tensor
+    input_mean: Tensor  # mean of each channel in training, (C,) [SI]
+    input_scale: Tensor  # standard deviation of each channel in training, (C,) [SI]
+    output_mean: Tensor  # mean of each prediction in training, of the shape ``outputs`` [SI]
+    output_scale: Tensor  # standard deviation of each prediction in training, likewise
 
     def __init__(self, n_channels: int, outputs: tuple[int, ...] = ()) -> None:
         super().__init__()
@@ -57,5 +57,5 @@ class StandardisedNetwork(nn.Module):
             scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
 
     def prepared(self, series: Tensor) -> Tensor:
-        """Standardised measurements."""
+        """Standardise measurements, (..., C), as ``forward`` takes them."""
         return (series - self.input_mean) / self.input_scale

@@ -7,7 +7,7 @@ It trains them on sequences, estimates, and runs them online.
     recording --run, SAMPLES_TOGETHER at a time, the state carried on--> velocities
 
 Without ``truncate_steps`` an epoch has sequences of one length at random places. With it, drives
-are cut whole, and a step of the optimiser follows each stretch of a batch, whose hidden state the
+are cut whole, and a step of the optimiser follows each segment of a batch, whose hidden state the
 next one continues.
 """
 
@@ -42,11 +42,13 @@ from vehest.training.sequences import (
     train_phases,
 )
 
+# output -> channel that it is trained on
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
 """Channels and outputs that change sign in a mirror, left for right; the others stay."""
 SAMPLES_TOGETHER = 10_000  # samples that are estimated at a time
 
+# trial of both networks in the first comparison on a new car
 TRIAL = Trial(
     11,
     "recurrent networks over all samples so far; minutes",
@@ -55,7 +57,7 @@ TRIAL = Trial(
     samples=300,
 )
 
-State = tuple[Tensor, ...]
+State = tuple[Tensor, ...]  # hidden state of a network, and whatever else it carries on
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,10 @@ class SequenceSettings(Group):
         least=0.0,
     )
     weight_vx: float = setting(0.2225, "of the squared error of vx in the loss", least=0.0)
-    weight_vy: float = setting(0.5064, "of vy", least=0.0)
-    weight_yaw_rate: float = setting(0.1566, "of the yaw rate", least=0.0)
+    weight_vy: float = setting(0.5064, "of the squared error of vy in the loss", least=0.0)
+    weight_yaw_rate: float = setting(
+        0.1566, "of the squared error of the yaw rate in the loss", least=0.0
+    )
     dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
@@ -123,7 +127,7 @@ class SequenceSettings(Group):
 
     @property
     def settling_steps(self) -> int:
-        """First samples of a validation sequence that do not count."""
+        """Number of first samples of a validation sequence that do not count."""
         return (
             self.dropped_steps
             if self.validation_dropped_steps is None
@@ -215,7 +219,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SequenceSettings
     template = "velocity_recurrent"
-    network: VelocityNetwork
+    network: VelocityNetwork  # the network
     inputs: tuple[str, ...] = setting(
         ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"),
         "measured channels that the network reads",
@@ -294,9 +298,8 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         )
 
     def measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
-        """Outputs as measured, (T, O).
-
-        They are vx, the yaw rate where it is read, and 0 for the lateral velocity.
+        """Velocities from which sequences start, by measured channels, (T, O) [m/s, rad/s]: vx, the
+        yaw rate where it is read, else 0, and 0 for the lateral velocity.
         """
         n = len(channels["vx"])
         columns = [
@@ -306,7 +309,9 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         return np.stack(columns, axis=1)
 
     def first_state(self, sample: FloatArray, initial_state: Mapping[str, float]) -> State:
-        """State of the network that starts from given velocities, else measured ones."""
+        """State of the network before the first sample, from known velocities, else measured
+        ones.
+        """
         measured = self.measured_velocities(
             {
                 name: np.array([value])
@@ -321,7 +326,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
-        """Velocities [m/s, rad/s].
+        """Estimate the velocities ``outputs`` [m/s, rad/s] at each sample.
 
         Parameters
         ----------
@@ -341,7 +346,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         return dict(zip(self.outputs, np.concatenate(pieces, dtype=float).T, strict=True)), state
 
     def c_values(self) -> dict[str, Any]:
-        """Weights, sizes, and what estimates start from."""
+        """Weights, sizes and start values for the C template."""
         s = self.settings
         weights = {name: array.astype(np.float64) for name, array in self.weights().items()}
         return {
@@ -364,8 +369,8 @@ class SequenceBatch(NamedTuple):
     starts: Tensor  # velocities to start from, (B, O)
     inputs: Tensor  # measurements, (B, T, C)
     targets: Tensor  # references, (B, T, O)
-    mask: Tensor | None = None  # of dropout, (B, T, H)
-    # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
+    mask: Tensor | None = None  # factors of dropout, (B, T, H)
+    # weight 0 or 1 of each sample in the loss, (B, T); None: all but the first, dropped ones count
     counted: Tensor | None = None
     # whether the batch continues the one before, whose hidden state it starts from
     goes_on: bool = False
@@ -379,7 +384,9 @@ class SequenceBatch(NamedTuple):
         )
 
     def scaled(self, input_factors: Tensor, output_factors: Tensor) -> SequenceBatch:
-        """The batch with channels times factors, (B, C), and outputs times factors, (B, O)."""
+        """The batch with inputs times factors, (B, C), and starts and targets times factors, (B,
+        O), such as the signs of a mirrored drive.
+        """
         return self._replace(
             inputs=self.inputs * input_factors.unsqueeze(1),
             targets=self.targets * output_factors.unsqueeze(1),
@@ -425,18 +432,19 @@ class DriveTensors:
         mask: Tensor | None = None,
         counted: Tensor | None = None,
     ) -> SequenceBatch:
-        """Sequences of the samples at ``places``, (T,) or (B, T), after rows ``firsts`` (B,)."""
+        """Sequences of the samples at offsets ``places``, (T,) or (B, T), from the rows ``firsts``,
+        (B,).
+        """
         rows = firsts.unsqueeze(1) + places
         return SequenceBatch(
             self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted
         )
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
-        """All drives, cut whole at random places into pieces of ``steps`` samples and less.
+        """Cut all drives completely, at random places, into pieces of ``steps`` samples and less.
 
-        First row and length of each, (N, 2).
-
-        The first piece of a drive may be shorter than ``steps``, and so may the last.
+        Returns first row and length of each piece, (N, 2). The first piece of a drive may be
+        shorter than ``steps``, and so may the last.
         """
         spans = []
         offset = 0
@@ -459,9 +467,8 @@ class DriveTensors:
         return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
 
     def for_validation(self, training: SequenceSettings) -> list[SequenceBatch]:
-        """Sequences without overlap from the start of each recording.
-
-        Of one that is too short, all of it.
+        """Batches of validation sequences, without overlap from the start of each recording; a
+        recording that is too short is one sequence.
         """
         batches = []
         offset = 0
@@ -487,7 +494,8 @@ def sequence_phase(
     train: DriveTensors,
     validation: DriveTensors,
 ) -> Phase:
-    """Weighted squared errors over sequences at random places of the drives.
+    """The training phase of a recurrent network: weighted squared errors over sequences at random
+    places of the drives.
 
     The loss of a batch is the mean, over its counted samples, of Σ_o w_o ρ(v̂_o - v_o), with the
     weights of the settings and `robust_squares` ρ. Dropout masks, mirroring and places are drawn

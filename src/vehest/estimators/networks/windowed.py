@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-TARGET = "vy_ref"
+TARGET = "vy_ref"  # channel that networks are trained to predict
 
 
 class WindowedEstimator(Network):
@@ -56,9 +56,8 @@ class WindowedEstimator(Network):
     window: int = setting(30, "samples that it reads", least=1, most=MAX_WIDTH)
 
     def network_for(self, train: list[Recording]) -> nn.Module:
-        """A network with the ranges of the training recordings.
-
-        Means and deviations if it is a `StandardisedNetwork`.
+        """An untrained network with scales from the training recordings: means and standard
+        deviations if it is a `StandardisedNetwork`.
         """
         from vehest.estimators.networks.standardised import StandardisedNetwork
 
@@ -69,7 +68,7 @@ class WindowedEstimator(Network):
 
     @property
     def warm_up_steps(self) -> int:
-        """Until the window is full."""
+        """Number of samples until the window is full."""
         return self.window - 1
 
     @classmethod
@@ -131,7 +130,7 @@ class WindowedEstimator(Network):
         return network
 
     def weights_of_model(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-        """Weights and ranges of a model of the same family and settings, for fine-tuning."""
+        """Weights and scales of a stored model of the same family and settings, for fine-tuning."""
         start_model = load_model(folder)
         if (start_model.name, start_model.settings) != (self.name, self.settings):
             raise ConfigurationError(

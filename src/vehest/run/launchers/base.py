@@ -18,29 +18,27 @@ if TYPE_CHECKING:
     from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher
     from vehest.run.launchers.local import LocalLauncher
 
-    Launcher = LocalLauncher | RayLauncher | SlurmLauncher
+    Launcher = LocalLauncher | RayLauncher | SlurmLauncher  # any of the launchers
 
-LAUNCHERS = ("local", "ray", "slurm")
+LAUNCHERS = ("local", "ray", "slurm")  # names of the launchers
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a command that runs stages: as `vehest run --help` describes them.
+    """Options of a command that runs stages, as `vehest run --help` describes them."""
 
-    No ``jobs`` is one a core, ``track`` logs runs.
-    """
-
-    force: bool = False
-    dry_run: bool = False
-    quiet: bool = False
-    jobs: int | None = None
-    track: bool = False
-    minutes: float | None = None
-    retrain: bool = False
-    train_missing: bool | None = None  # none: unless the study is published without some trainings
-    publish_weights: bool = False
+    force: bool = False  # run stages although their artefacts exist
+    dry_run: bool = False  # whether what would be done is only printed
+    quiet: bool = False  # print warnings alone
+    jobs: int | None = None  # processes; None: one for each core
+    track: bool = False  # log runs to MLflow
+    minutes: float | None = None  # time limit of trainings [min]; None: none
+    retrain: bool = False  # train although weights are published
+    # train what is missing; None: unless the study is published without some trainings
+    train_missing: bool | None = None
+    publish_weights: bool = False  # add trained models to the published weights of the study
     launcher: str = "local"  # one of `LAUNCHERS`
-    address: str | None = None  # of a cluster
+    address: str | None = None  # address of a Ray cluster
     slurm: Sequence[str] = ()  # resources of SLURM jobs, NAME=VALUE
 
 

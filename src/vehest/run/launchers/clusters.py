@@ -38,15 +38,16 @@ from vehest.run.launchers.local import POLL_SECONDS, Done, Files, Reporter, defa
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
-MAX_ATTEMPTS = 3  # that a group is tried, if its tasks end without a report
+MAX_ATTEMPTS = 3  # attempts at a group whose tasks end without a report
+# environment variables of Ray -> values that hold unless the user sets others
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_worker_niceness": "0",  # by default 15
     "RAY_task_oom_retries": str(MAX_ATTEMPTS - 1),  # by default without end
 }
-"""Of Ray, unless it is set otherwise."""
-QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
+"""Environment variables of Ray, unless they are set otherwise."""
+QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}  # cluster -> s between two polls of the jobs
 STOP = "stop"  # file that asks all SLURM jobs to end
 PARAMETERS = {
     "account": "slurm_account",
@@ -60,22 +61,23 @@ PARAMETERS = {
 
 
 class NotShared(Exception):
-    """A machine, by its name, does not share the output root, and got no copies."""
+    """Raised on a machine, named in the message, that does not share the output root and received
+    no copies.
+    """
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A group with the driver's paths, relative ones by ``folder``.
-
-    A machine that sees ``mark`` shares the output root.
+    """A group as it is sent to a machine of a cluster, with the driver's paths; relative ones refer
+    to ``folder``.
     """
 
-    position: int
-    group: Group
-    folder: Path
-    mark: Path
-    versions: Mapping[str, str]
-    limits: Limits
+    position: int  # index of the group among those that are launched
+    group: Group  # group of tasks to run
+    folder: Path  # folder to which the driver's relative paths refer
+    mark: Path  # folder in the driver's output root; a machine that finds it shares the root
+    versions: Mapping[str, str]  # versions of the driver, which the machine must have too
+    limits: Limits  # limits of input sizes
 
 
 def new_mark(output: Path) -> Path:
@@ -86,7 +88,7 @@ def new_mark(output: Path) -> Path:
 
 
 def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
-    """What a machine is sent of a group.
+    """Make the task for a group.
 
     Parameters
     ----------
@@ -162,7 +164,9 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
 
 
 def versions_here() -> dict[str, str]:
-    """What must be the same everywhere for results to be those of one machine."""
+    """Versions that must be equal on all machines, so that results are those of one: name ->
+    version.
+    """
     return {
         "vehest": f"{__version__} {commit()}".strip(),
         "python": platform.python_version(),
@@ -171,9 +175,8 @@ def versions_here() -> dict[str, str]:
 
 
 def inputs_of(group: Group) -> set[Path]:
-    """Folders of artefacts that a group reads, or of which it has some already.
-
-    Recordings, references, models that trainings start from, and artefacts that exist already.
+    """Folders of the artefacts that a group reads: recordings, references, models that trainings
+    start from, and its own artefacts that exist already.
     """
     data = [job.data for job in group.jobs]
     if group.evaluation is not None:
@@ -192,7 +195,7 @@ def folders_of(members: Sequence[Member]) -> set[Path]:
 
 
 def pack(folders: set[Path]) -> Files:
-    """The files of artefacts, their manifests included."""
+    """Read the files of artefacts, their manifests included: folder -> files."""
     return {
         folder: {
             file.relative_to(folder).as_posix(): file.read_bytes()
@@ -204,7 +207,7 @@ def pack(folders: set[Path]) -> Files:
 
 
 def unpack(packed: Files) -> None:
-    """Put artefacts in their places, each whole or not at all, unless they are there.
+    """Write artefacts into their folders, each completely or not at all, unless they exist.
 
     Raises
     ------
@@ -224,7 +227,8 @@ def unpack(packed: Files) -> None:
 
 
 class RayLauncher:
-    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's.
+    """Runs groups on the Ray cluster at an address (``auto``: this machine's; None: that of
+    ``RAY_ADDRESS``, else a local Ray that is started).
 
     By default ``RAY_ADDRESS``, else a Ray of its own.
     """
@@ -279,7 +283,7 @@ class RayLauncher:
                         waiting.append(position)
 
     def close(self) -> None:
-        """Leave the cluster, or end the Ray of one's own."""
+        """Disconnect from the cluster, or end a local Ray that was started."""
         if self._ray is not None:
             self._mark.rmdir()
             self._ray.shutdown()
@@ -336,7 +340,7 @@ class RayLauncher:
         return self._task.options(name=group.name).remote(spec, *copies)
 
     def _done(self, position: int, task: Any) -> Done | None:
-        """The outcome of a task; none if it was called off before it began, or needs copies."""
+        """The outcome of a task; None if it was cancelled before it began, or needs copies."""
         errors = self._ray.exceptions
         try:
             done: Done = self._ray.get(task)
@@ -364,7 +368,7 @@ class RayLauncher:
 
 
 def _run(spec: TaskSpec, *copies: Files) -> Done:
-    """The task that Ray runs, and cancels by SIGINT."""
+    """The function that Ray runs as a task, and cancels by SIGINT."""
     cancelled = threading.Event()
     handler = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
     try:
@@ -379,7 +383,7 @@ def _line(error: BaseException) -> str:
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """What jobs ask the queue for.
+    """Resources that jobs request from the queue, as parameters of submitit.
 
     Parameters
     ----------
@@ -423,9 +427,9 @@ def _positive(name: str, text: str) -> float:
 
 
 class SlurmTask:
-    """A job.
+    """Callable that a SLURM job runs.
 
-    Submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again.
+    Submitit calls `checkpoint` when its time is nearly up, and submits the returned task again.
     """
 
     def __call__(self, spec: TaskSpec) -> Done:
@@ -433,15 +437,15 @@ class SlurmTask:
         return run_task(spec, None, (spec.mark / STOP).exists)
 
     def checkpoint(self, spec: TaskSpec) -> Any:
-        """The same task again."""
+        """The same task, to be submitted again."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, spec)
 
 
 class SlurmLauncher:
-    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of
-    this machine.
+    """Runs groups as SLURM jobs, all in the queue at once, or, with ``cluster`` ``local``, as
+    processes of this machine.
     """
 
     def __init__(
@@ -508,7 +512,7 @@ class SlurmLauncher:
                         waiting.append(position)
 
     def close(self) -> None:
-        """Call off what is left; logs of jobs that were lost stay."""
+        """Cancel the remaining jobs; logs of jobs that were lost are kept."""
         if self._executor is not None:
             self._call_off()
             if not self._lost:
@@ -529,14 +533,14 @@ class SlurmLauncher:
             ) from error
 
     def _call_off(self) -> None:
-        """Ask jobs to end after their batch, and take back those that have not begun."""
+        """Ask running jobs to end after their batch, and cancel those that have not begun."""
         (self._executor.folder / STOP).touch()
         for job in [job for job in self._running if job.state in ("PENDING", "UNKNOWN")]:
             job.cancel(check=False)
             del self._running[job]
 
     def _done(self, position: int, job: Any, name: str) -> Done | None:
-        """The outcome of a job; none if it ended without one."""
+        """The outcome of a job; None if it ended without one."""
         log = f"its log: {job.paths.stderr}"
         try:
             return job.result()  # type: ignore[no-any-return]

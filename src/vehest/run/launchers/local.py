@@ -33,30 +33,31 @@ if TYPE_CHECKING:
 Task = Callable[
     [Callable[[], bool], Callable[[Progress | Waiting], None]], Any
 ]  # a function of (should_stop, on_progress), picklable
+# takes the index of a task and its progress, what it waits for, or None when it begins
 Reporter = Callable[[int, Progress | Waiting | None], None]
-POLL_SECONDS = 0.2  # s that workers are waited for at a time, and between two reports of progress
-READY = "ready"  # kinds of messages of a worker: it waits for its first task,
-PROGRESS = "progress"  # a task goes on,
-ENDED = "ended"  # a task returned or failed
+# s for which workers are waited for at a time, and between two reports of progress
+POLL_SECONDS = 0.2
+READY = "ready"  # kind of a worker's message: it waits for its first task
+PROGRESS = "progress"  # kind of a worker's message: progress of its task
+ENDED = "ended"  # kind of a worker's message: its task returned or failed
 Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> its files
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a task returned, or why it failed, and what it made that is not in the output root
-    yet.
-    """
+    """Outcome of a task, and the artefacts that it made which are not in the output root yet."""
 
-    position: int
-    outcome: Any
+    position: int  # index of the task
+    outcome: Any  # result of the task, or a `Failure`
+    # folder of an artefact -> its files, where machines do not share the output root
     made: Files = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class LocalLauncher:
-    """Runs groups in so many processes of this machine; one runs everything in this one."""
+    """Runs groups in processes of this machine."""
 
-    cores: int = 1
+    cores: int = 1  # number of processes; 1: everything runs in this process
 
     def launch(
         self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter
@@ -86,7 +87,7 @@ class LocalLauncher:
         return launch([group.run for group in groups], self.cores, stop, report)
 
     def close(self) -> None:
-        """Nothing is kept."""
+        """Do nothing, since no resources are kept."""
 
 
 def launch(
@@ -136,7 +137,7 @@ def default_jobs() -> int:
 def guarded(
     task: Task, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]
 ) -> Any:
-    """Run a task; what it raises is returned as a `Failure`."""
+    """Run a task, and return its result, or a `Failure` for what it raises."""
     try:
         return task(should_stop, on_progress)
     except Exception as error:
@@ -205,8 +206,7 @@ class _Worker:
             self.connection.send(task)
 
     def receive(self) -> Done | Progress | Waiting | None:
-        """The next message: None when a task begins, its progress, its end.
-
+        """Receive the next message of a worker: None when a task begins, its progress, or its end.
         A dead worker fails the task that it had.
         """
         try:
@@ -226,9 +226,8 @@ class _Worker:
         return progress if kind == PROGRESS else Done(self.position, value)
 
     def stop(self) -> bool:
-        """Ask the task to end soon.
-
-        False where it had not begun, and the process was ended instead.
+        """Ask the task to end soon; returns False where it had not begun, and the process was ended
+        instead.
         """
         if self._task is not None:
             self.kill()
@@ -240,9 +239,8 @@ class _Worker:
         return True
 
     def end(self) -> None:
-        """Let a worker without a task go.
-
-        Told so, as one that was forked has the other end of the pipe as well.
+        """End a worker without a task, by a message, since one that was forked has the other end of
+        the pipe as well.
         """
         with suppress(OSError):  # it was killed
             self.connection.send(None)
@@ -256,7 +254,7 @@ class _Worker:
 
 
 def _describe_exit(code: int | None) -> str:
-    """Why a worker ended, in one line."""
+    """One line on why a worker process ended, by its exit code."""
     if code is None or code >= 0:
         return f"a worker process ended unexpectedly with exit code {code}"
     name = signal.Signals(-code).name
@@ -265,9 +263,11 @@ def _describe_exit(code: int | None) -> str:
 
 
 def _serve(connection: Connection, limits: Limits) -> None:
-    """Run the tasks that come; leave signals to the parent, and end with it.
+    """Main loop of a worker: run the tasks that arrive, leave signals to the parent, and end with
+    it.
 
-    What comes while a task runs, be it a message or the end of the pipe, asks it to stop.
+    Whatever arrives while a task runs, be it a message or the end of the pipe, asks the task to
+    stop.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -288,7 +288,7 @@ def _serve(connection: Connection, limits: Limits) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, also by a kill."""
+    """End this process when its parent has ended, even if the parent was killed."""
     parent = parent_process()
     assert parent is not None
     parent.join()

@@ -48,18 +48,23 @@ POLICIES = {
     "vbo": ("strict", "interpolate"),
     **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform")),
 }
-"""Source -> clocks of its data sets, the strictest first; other sources make their own."""
+"""Source -> settings ``clock`` that its data sets may have, the strictest first; other sources make
+their own clock.
+"""
 BAG_HZ = 100.0  # Hz, highest rate that is proposed for the recordings of a bag
 MIN_GAP_SECONDS = 0.05  # s, smallest max_gap of a topic; the widest gap makes it larger
+# reason that a log without times cannot have gaps, for messages
 GAPS = (
     "it has missing samples, which are interpolated, or cut out beyond one second, only in a log "
     "with times"
 )
 CRAWL_SPEED = 1.0  # m/s; a car that is slower crawls
-CRAWL_SHARE = 0.05  # of the top speed, likewise of a model car
+CRAWL_SHARE = 0.05  # share of the top speed below which a car crawls, for model cars
 MAX_CRAWL_SIDESLIP = 1.0  # rad, beyond which an angle at crawl is noise
 POSE_SECONDS = 0.15  # s, window of the filter that differentiates poses
-CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
+# names of the checks whose findings contradict a proposal
+CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")
+# names of the checks whose findings are listed as remarks
 REMARKS = (
     *CONTRADICTIONS,
     "dropout",
@@ -72,8 +77,10 @@ REMARKS = (
     "spike",
     "full_turn",
 )
-MAX_RATIO_UNCERTAINTY = 0.1  # standard uncertainty of an estimated steering ratio, as a share of it
-# factor between the gains of two files, of which each half is beyond the other file's
+# largest standard uncertainty of an estimated steering ratio over the ratio, for it to be used
+MAX_RATIO_UNCERTAINTY = 0.1
+# smallest factor between the gains of two files for a remark, where each half of one is beyond the
+# other file's
 MIN_GAIN_FACTOR = 1.15
 MIN_TURN_YAW_RATE = 0.05  # rad/s, above which a car turns
 # s of turning in each half of a file; with less, its gain is not compared
@@ -85,12 +92,12 @@ TURN_MEAN_SECONDS = 0.5  # s over which the yaw rate is averaged, so that its no
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A data set with what its recordings, of ``durations`` [s], show."""
+    """A drafted data set, with the results of reading it once."""
 
     examined: Examined  # the logs, delays among their proposals
-    dataset: Mapping[str, Any]  # for conf/dataset
+    dataset: Mapping[str, Any]  # content of its file in conf/dataset
     late: Mapping[str, Late]  # channel -> its delay in the longest recording
-    contents: list[RecordingSummary]  # of the recordings
+    contents: list[RecordingSummary]  # summaries of the recordings
     remarks: list[str]  # findings of the checks that concern the proposals
     ratio: (
         tuple[float, float] | None
@@ -100,12 +107,12 @@ class Draft:
 
     @property
     def seconds(self) -> float:
-        """Of all recordings."""
+        """Duration of all recordings together [s]."""
         return sum(self.durations.values())
 
     @property
     def lowest_rate_hz(self) -> float:
-        """Of all recordings."""
+        """Lowest sampling rate of the recordings [Hz]."""
         return min(content.rate_hz for content in self.contents)
 
     @property
@@ -235,7 +242,7 @@ def is_certain(ratio: float, uncertainty: float) -> bool:
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
     """The data set with the strictest clock that all files keep and that has a plain rate, as a
-    downsampling needs; its recordings.
+    downsampling needs; and its recordings.
     """
     for policy in POLICIES.get(dataset["source"], ()):
         with suppress(DataError):
@@ -252,16 +259,19 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
 
 
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
+    """Read all recordings of a data set."""
     return list(open_source(dataset).recordings())
 
 
 def _longest(recordings: Sequence[Recording]) -> Recording:
-    """The recording of the longest duration."""
+    """The recording with the longest duration."""
     return max(recordings, key=lambda recording: recording.duration)
 
 
 def _held_with_speed(recording: Recording) -> list[str]:
-    """The speed, and channels that are held at the same rate, where rows repeat its samples."""
+    """Channels that are held at the same rate as the speed, and the speed, where rows repeat its
+    samples; else empty.
+    """
     for rate, names in held_channels(recording, ~standstill(recording)).items():
         if "vx" in names and 0.5 / float(rate) > MIN_REPORTED_DELAY_SECONDS:
             return names
@@ -269,7 +279,7 @@ def _held_with_speed(recording: Recording) -> list[str]:
 
 
 def _coarse(recordings: Sequence[Recording]) -> dict[str, float]:
-    """Coarse channels of any recording, and their steps [SI]."""
+    """Channels of any recording with coarse quantisation -> their steps [SI]."""
     steps: dict[str, float] = {}
     for recording in recordings:
         steps = coarse_steps(recording, ~standstill(recording)) | steps
@@ -290,7 +300,7 @@ def _crawl_speed(recording: Recording) -> float:
 
 
 def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterator[str]:
-    """Notes of files that are cut into several recordings, and why."""
+    """Sentences on files that are cut into several recordings, and why."""
     pause = dataset.get("max_gap")
     causes = [f"pauses of more than {pause:g} s"] if pause else []
     causes += ["times that go back"] if dataset.get("time_restarts") else []
@@ -310,7 +320,9 @@ def _cuts(dataset: Mapping[str, Any], recordings: Sequence[Recording]) -> Iterat
 
 
 def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
-    """Findings of the longest recording, and contradictions in the longest of each other file."""
+    """Texts of the findings in the longest recording, and of contradictions in the longest one of
+    each other file.
+    """
     findings = [
         ("", finding) for finding in checks_of_recording(longest) if finding.check in REMARKS
     ]
@@ -385,6 +397,9 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
+    """Content of the data set's file in conf/dataset: source, files, clock and an entry for each
+    proposed channel.
+    """
     log = examined.log
     name = examined.name
     proposals = examined.proposals
@@ -464,8 +479,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 
 
 def _entry(proposal: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
-    """A channel's entry; with a factor where it is in another unit than by the header, which its
-    source holds against the entry.
+    """A channel's entry in a data set, with a factor where its unit is another one than that in the
+    header, which its source compares with the entry.
     """
     unit = proposal.unit
     factor = proposal.factor
@@ -501,8 +516,8 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
-    """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without
-    any, 0 in a row with one.
+    """Length of the gap that each row lies in [s], (N,): 0 in a row with a sample, infinite in a
+    run without any.
     """
     values = log.by_name[column].values
     seconds = (
@@ -525,7 +540,7 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
 
 
 def _signal_options(examined: Examined) -> dict[str, Any]:
-    """Channels, rate and gaps of a source whose signals have times of their own."""
+    """Options of a data set whose signals have times of their own: channels, rate and gaps."""
     channels = {}
     rates = []
     paused = False
@@ -546,6 +561,7 @@ def _signal_options(examined: Examined) -> dict[str, Any]:
 
 
 def _bag_options(examined: Examined) -> dict[str, Any]:
+    """Options of a data set of ROS bags: topics with their channels and gaps, poses, and rate."""
     topics: dict[str, dict[str, Any]] = {}
     channels: dict[str, dict[str, Any]] = {}
     rates = []
@@ -587,7 +603,7 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """The transform that bridges impossible samples, as far to either side as the slowest signal
-    was interpolated, if there are any.
+    was interpolated; empty if there are none.
     """
     channels = [
         (CHANNELS[name], samples)
@@ -613,10 +629,10 @@ def _transforms(
     ratio: float | None,
     crawl_speed: float,
 ) -> list[dict[str, Any]]:
-    """Transforms that make the channels that estimators want.
+    """Transforms of the data set that derive the channels that estimators need.
 
-    A reference that is late is put on the others' clock; a measured channel is not, since an
-    estimator in the car would get it late, too.
+    A reference that is late is shifted to the others' clock; a measured channel is not, since an
+    estimator in the car would receive it late, too.
     """
     transforms: list[dict[str, Any]] = [
         {"name": "delay_correction", "delay": lateness.delay, "channels": [name]}

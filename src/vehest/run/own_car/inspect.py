@@ -37,7 +37,8 @@ from vehest.sources.unit_spellings import plain_unit
 
 # Hz, highest rate of the samples that proposals rest on; faster ones are averaged
 EVIDENCE_HZ = 50.0
-MIN_COVERED = 0.5  # share of a log that a column covers, for evidence to need it
+# smallest share of a log that a column must cover, so that the evidence is restricted to its time
+MIN_COVERED = 0.5
 MAX_EVIDENCE_SECONDS = 1200.0  # s; of a longer log the busiest parts are used
 END_SECONDS = 1.0  # s at either end of a longer drive that do not count
 # s without a sample that straight lines bridge: as between fixes of a satellite receiver of 1 Hz
@@ -45,11 +46,11 @@ MAX_BRIDGED_SECONDS = 1.1
 MAX_LISTED = 5  # parts of a log that were not read, in a message; further ones are counted
 # rows in the middle of a log, by which a column is found to be the difference of another one
 MAX_COMPARED_ROWS = 4_000
-USUAL_STEP_QUANTILE = 0.99  # of the |steps| of a velocity; rows with larger steps are not compared
+USUAL_STEP_QUANTILE = 0.99  # quantile of a velocity's |steps|, above which rows are not compared
 # |correlation| with these steps, above which a column is their difference
 MIN_DIFFERENCE_CORRELATION = 0.999
-TABLES = ("tabular", "text_log")
-DBC = ".dbc"
+TABLES = ("tabular", "text_log")  # sources of tables of text or Parquet
+DBC = ".dbc"  # suffix of a description of a CAN bus
 LAYOUT = {
     "delimiter": ",",
     "decimal": ".",
@@ -69,21 +70,21 @@ VEHICLE = {
         "overall steering ratio, if known (else estimated from slow corners, with the wheelbase)"
     ),
 }
-"""Values of the car that no log holds, as questions."""
+"""Value of the car that no log contains -> text of its question."""
 IMU_PLACE = "imu_to_rear_axle"
-"""Another one, asked in any case: the distance of the inertial unit from the rear axle, negative
-behind it [m].
+"""Key of a further value, which is always asked for: the distance of the inertial unit from the
+rear axle [m], negative behind it.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """Logs with their proposals."""
+    """Logs with the proposals for their columns, and what is known of the car."""
 
-    name: str  # of the data set
-    files: tuple[Path, ...]  # in the order given
+    name: str  # name of the data set
+    files: tuple[Path, ...]  # files, in the order of the command
     logs: tuple[Log, ...]  # the longest first; its layout is that of all
-    proposals: Proposals  # for all logs
+    proposals: Proposals  # proposals for all logs
     place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
     rate_hz: float | None  # sampling rate of logs without times; else None
     vehicle: Mapping[str, float | None]  # values of `VEHICLE` and `IMU_PLACE`, None where unknown
@@ -91,18 +92,18 @@ class Examined:
 
     @property
     def log(self) -> Log:
-        """The longest one."""
+        """The longest log."""
         return self.logs[0]
 
     @property
     def pose_columns(self) -> dict[str, dict[str, str]]:
-        """Part of the poses -> its column and unit, as a data set declares them."""
+        """Component of the poses -> its column and unit, as a data set declares them."""
         return {
             part: {"column": column, "unit": unit} for part, column, unit in self.proposals.pose
         }
 
     def in_words(self) -> list[str]:
-        """Files and proposals for a terminal, a line each."""
+        """Lines for a terminal on the files and the proposals."""
         proposals = self.proposals
         lines = [f"read {file}" for file in self.files]
         lines += [
@@ -256,7 +257,9 @@ def _way_to_join(log: Log, other: Log) -> str:
 
 
 def _divided(files: Sequence[Path]) -> tuple[list[Path], Path | None]:
-    """Logs, and the DBC among the files, if any; relative to the working folder if in it."""
+    """Separate the logs from the DBC among the files; its path is relative to the working folder if
+    it lies in it, None without one.
+    """
     logs = [file for file in files if file.suffix.lower() != DBC]
     dbcs = [file for file in files if file.suffix.lower() == DBC]
     if not dbcs:
@@ -278,12 +281,16 @@ def _divided(files: Sequence[Path]) -> tuple[list[Path], Path | None]:
 
 
 def unread(log: Log) -> str:
-    """What of a log was not read, as the end of a sentence."""
+    """Clause on the parts of a log that were not read, to end a sentence; empty if there are
+    none.
+    """
     return f"; not read: {'; '.join(log.skipped[:MAX_LISTED])}" if log.skipped else ""
 
 
 def paths_of(name: str) -> tuple[Path, Path, Path]:
-    """Data set, split and pipeline of that name, in ./conf and ./pipelines."""
+    """Paths of the files of data set, split and pipeline with that name, in ./conf and
+    ./pipelines.
+    """
     return (
         Path("conf") / "dataset" / f"{name}.yaml",
         Path("conf") / "split" / f"{name}.yaml",
@@ -292,13 +299,13 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
 
 
 def rate_of(stamps: FloatArray) -> float:
-    """Rate of time stamps [Hz]."""
+    """Sampling rate of time stamps [s], (N,), by their typical step [Hz]."""
     return 1.0 / max(typical_step(stamps), 1e-6)
 
 
 def _at_stated_rate(log: Log) -> Log:
-    """With the unit of time by which rows have the rate that the file states; the same log where
-    the header has the unit, or no unit makes that rate.
+    """The log with the unit of time by which its rows have the rate that the file states; unchanged
+    where the header has the unit, or no unit gives that rate.
     """
     if log.rate_hz is None or log.clock is None or log.seconds is None or log.clock.is_stated:
         return log
@@ -310,7 +317,7 @@ def _at_stated_rate(log: Log) -> Log:
 
 
 def _with_signs(log: Log) -> Log:
-    """With signed values in place of magnitudes beside which a column of 0 and 1 holds the sign;
+    """The log with signed values in place of magnitudes whose sign is in another column of 0 and 1,
     without these columns.
     """
     columns = log.by_name
@@ -341,8 +348,8 @@ def _with_signs(log: Log) -> Log:
 
 
 def _with_corrected_clock(log: Log, ratio: float, reason: str) -> Log:
-    """With the unit of time by which the rate is a ratio of that of the guessed one, which is
-    asked; the same log where no unit is.
+    """The log with another unit of time, by which the rate is ``ratio`` times that of the guessed
+    unit, and with a question on it; unchanged where no unit is.
     """
     clock = log.clock
     if clock is None or log.seconds is None:
@@ -358,6 +365,9 @@ def _with_corrected_clock(log: Log, ratio: float, reason: str) -> Log:
 
 
 def _longest(logs: Sequence[Log]) -> Log:
+    """The longest log, with options that suit all of them; raises an error where formats or layouts
+    differ.
+    """
     formats = {
         "text"
         if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq")
@@ -405,6 +415,7 @@ def _longest(logs: Sequence[Log]) -> Log:
 
 
 def _layout(log: Log) -> dict[str, Any]:
+    """Layout of a log, with its time column and unit, by which logs are compared."""
     times = None if log.clock is None else f"{log.clock.column} in {log.clock.unit}"
     return {key: log.options.get(key, default) for key, default in LAYOUT.items()} | {
         "times": times
@@ -412,7 +423,7 @@ def _layout(log: Log) -> dict[str, Any]:
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
-    """Parts of the files that were not read, and gaps that lines bridge."""
+    """Sentences on parts of the files that were not read, and on gaps that are interpolated."""
     yield from (
         f"'{column.name}' is negative where '{column.place['sign_column']}' is 1"
         for column in longest.columns
@@ -435,7 +446,9 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
 
 
 def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
-    """Folder of the files, pattern that they match, and stems of further files that match."""
+    """Options ``path``, ``files`` and ``exclude`` of a data set: folder of the files, pattern that
+    they match, and stems of further files that match it.
+    """
     folder, *other_folders = sorted({file.resolve().parent for file in files})
     if other_folders:
         listed = ", ".join(map(str, (folder, *other_folders)))
@@ -475,8 +488,8 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
 def _evidence(
     log: Log, differences: Collection[str]
 ) -> tuple[list[tuple[str, str, FloatArray, str]], float | None]:
-    """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz];
-    without times rows as they are.
+    """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, for the proposals,
+    and the rate [Hz]; without times the rows as they are.
 
     Of a long drive the minutes in which columns change most are taken.
     """
@@ -499,8 +512,8 @@ def _evidence(
 
 
 def _differences(log: Log) -> dict[str, str]:
-    """Columns that are the difference of another from row to row -> that one, a velocity by its
-    name; no acceleration was measured.
+    """Column that is the difference of another one from row to row -> that other one, which is a
+    velocity by its name; such a column is no measured acceleration.
     """
     signals = [column for column in log.columns if column.stamps is None]
     if not signals:
@@ -528,10 +541,10 @@ def _differences(log: Log) -> dict[str, str]:
 
 
 def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
-    """Columns on one clock, and its rate [Hz], None where the log has no times.
+    """Columns of a log on one even clock, and its rate [Hz], None where the log has no times.
 
-    Columns with times of their own: over the time that those have in common that cover most of the
-    log.
+    Columns with times of their own are restricted to the time that those which cover most of the
+    log have in common.
     """
     timed = [(column.values, column.stamps) for column in log.columns if column.stamps is not None]
     if timed:
@@ -567,8 +580,9 @@ def _on_even_clock(log: Log) -> tuple[FloatArray, float | None]:
 
 
 def busiest_rows(columns: FloatArray, max_rows: int, minute: int) -> FloatArray:
-    """The rows in which the columns change most, (C, at most ``max_rows``); all where these are
-    less than a minute, as of a clock whose unit is misread.
+    """The contiguous rows in which the columns (C, N) change most, (C, at most ``max_rows``), by
+    the minutes of ``minute`` rows in them; all rows where there are no more, or where ``max_rows``
+    is below a minute, as with a misread clock.
     """
     if columns.shape[1] <= max_rows or max_rows < minute:
         return columns

@@ -26,32 +26,35 @@ from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import STATED_UNITS
 from vehest.sources.unit_spellings import plain_unit
 
-LEAVE_OUT = "-"
-UNKNOWN = "unknown"
+LEAVE_OUT = "-"  # answer by which a column is left out
+UNKNOWN = "unknown"  # answer by which a value stays unknown
 REQUIRED = {
     r"\b(vx|wheel_speed)": "a speed (vx)",
     r"\byaw_rate": "a yaw rate (yaw_rate)",
     r"\bay\b": "a lateral acceleration (ay)",
 }
-"""Channels without which nothing can be estimated: pattern of their names -> in words."""
+"""Pattern of names of channels without which nothing can be estimated -> text of the channel for
+messages.
+"""
+# answer to the question on the origin of logs -> kind of the data set
 KINDS: Mapping[str, Kind] = {"real": "real", "simulated": "simulated"}
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question about logs or their car."""
+    """A question on logs or their car, with a proposed answer."""
 
     # ``left_right``, ``rate``, ``time``, ``radius``, ``imu_to_rear_axle``, ``kind``, a column, or a
     # value of the vehicle
     key: str
-    text: str  # for people
+    text: str  # the question as it is printed
     proposed: str  # answer that Enter takes; empty where nothing is proposed
-    candidates: tuple[str, ...] = ()  # alternatives
-    evidence: tuple[str, ...] = ()  # for the proposal
-    hint: str = "a number"  # form of an answer
+    candidates: tuple[str, ...] = ()  # alternative answers
+    evidence: tuple[str, ...] = ()  # texts of the evidence for the proposal
+    hint: str = "a number"  # text of the form that an answer has
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """The question as plain values, for JSON."""
         return {
             "key": self.key,
             "question": self.text,
@@ -61,6 +64,7 @@ class Question:
         }
 
 
+# question on whether the logs are of a real car
 ORIGIN = Question(
     "kind",
     "do the logs come from a real car or from a simulation?",
@@ -69,6 +73,7 @@ ORIGIN = Question(
     hint="real or simulated",
 )
 
+# question on the place of the inertial unit
 PLACE = Question(
     IMU_PLACE,
     "how far ahead of the rear axle is the inertial unit [m], negative behind it?",
@@ -164,7 +169,7 @@ def ask(
 
 
 def questions_of(examined: Examined) -> Iterator[Question]:
-    """Questions that the logs leave open, those of the vehicle left out."""
+    """Yield the questions that the logs leave open, without those on the car."""
     proposals = examined.proposals
     clock = examined.log.clock
     rate = examined.rate_hz
@@ -233,7 +238,9 @@ def questions_of(examined: Examined) -> Iterator[Question]:
 
 
 def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
-    """The logs after an answer from the terminal; one that makes no sense is asked again."""
+    """Ask a question at the terminal and return the logs with the answer; an answer that makes no
+    sense is asked for again.
+    """
     for line in question.evidence:
         echo(f"    {line}")
     if question.candidates:
@@ -258,6 +265,9 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
+    """The logs with an answer to a question; an empty answer accepts the proposal. Raises
+    `ConfigurationError` for one that makes no sense.
+    """
     key = question.key
     answer = answer.strip() or question.proposed
     proposals = examined.proposals
@@ -293,6 +303,7 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
 
 
 def _with_time_unit(log: Log, unit: str) -> Log:
+    """The log with its times in another unit."""
     if log.clock is None or log.seconds is None:
         return log
     factor = STATED_UNITS[unit] / STATED_UNITS[log.clock.unit]
@@ -302,8 +313,10 @@ def _with_time_unit(log: Log, unit: str) -> Log:
 
 
 def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple[Proposal, ...]:
-    """A column as declared; where another column had its channel, that one gets the former channel
-    of this one if the unit allows.
+    """The proposals with a column as declared by ``answer``.
+
+    Where another column had its channel, that one gets the former channel of this one if the unit
+    allows.
     """
     former = next((proposal for proposal in channels if proposal.column == column), None)
     if former is None:  # another answer has given its channel away
@@ -346,7 +359,7 @@ def _declared_unasked(examined: Examined, column: str, answer: str) -> Examined:
 
 
 def _parsed(answer: str, proposal: Proposal) -> Proposal:
-    """A column as CHANNEL UNIT [SIGN [FACTOR]] declares it."""
+    """The proposal of a column as an answer CHANNEL UNIT [SIGN [FACTOR]] declares it."""
     name, unit, sign, factor = [*answer.split(), *4 * [""]][:4]
     try:
         described = channel(name)
@@ -369,7 +382,7 @@ def _parsed(answer: str, proposal: Proposal) -> Proposal:
 
 
 def _float_in(text: str) -> float:
-    """The number that a text is, with a decimal point or comma; NaN where it is none."""
+    """The number in a text, with a decimal point or comma; NaN where it is none."""
     try:
         return float(text.replace(",", "."))
     except ValueError:
@@ -377,6 +390,9 @@ def _float_in(text: str) -> float:
 
 
 def _number(text: str, quantity: str) -> float:
+    """A positive number in a text; raises `ConfigurationError` otherwise, naming the
+    ``quantity``.
+    """
     value = _float_in(text)
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(f"{quantity} must be a positive number, not '{text}'")
@@ -384,7 +400,9 @@ def _number(text: str, quantity: str) -> float:
 
 
 def _place_of_imu(text: str) -> float:
-    """Distance of the inertial unit from the rear axle [m], within the limits of `CarValues`."""
+    """Distance of the inertial unit from the rear axle in a text [m], within the limits of
+    `CarValues`.
+    """
     value = _float_in(text)
     if math.isnan(value):
         raise ConfigurationError(

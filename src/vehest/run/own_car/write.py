@@ -35,13 +35,13 @@ from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
-TRAINED_SHARE = 0.7  # of all recordings, for training and validation together
+TRAINED_SHARE = 0.7  # share of each recording for training and validation together
 # s, shortest range for validation, a fifth of a recording; shorter recordings are used whole, and
 # not at all below this
 MIN_BLOCK_SECONDS = 4.0
 MIN_SECONDS = 30.0  # s of all recordings together; with less there is no training
-ROLES_OF_THREE = ("train", "validation", "test")
-# of whole recordings, in turn
+ROLES_OF_THREE = ("train", "validation", "test")  # roles of three whole recordings
+# roles of more whole recordings, in turn
 ROLES = (
     "train",
     "test",
@@ -55,19 +55,24 @@ ROLES = (
     "test",
 )
 MIN_RANKING_SECONDS = 120.0  # s of recordings; below, hardly any comparison separates estimators
-FILTER_CHANNELS = ("vx", "yaw_rate", "ay")  # of the self-calibrating filter, which does without ax
+# channels that the self-calibrating filter requires; it does without ax
+FILTER_CHANNELS = ("vx", "yaw_rate", "ay")
 ASSUMED_WHEELBASE = 2.7  # m, where it is not given
 # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
 STIFFNESS = 10.0
-HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
+HEIGHT = 0.2  # height of the centre of gravity over the wheelbase; assumed
+# override of a training that starts from the model that comes with vehest
 PRETRAINED = "training.start_from=pretrained"
 # Hz; slower recordings get no training that starts from the pretrained weights
 PRETRAINED_HZ = 20.0
-EVALUATED_HZ = 20  # Hz, at which estimates are scored, where all recordings are sampled as fast
-RATE = "estimator.rate_hz="
+# Hz, rate at which estimates are scored, where all recordings are sampled as fast
+EVALUATED_HZ = 20
+RATE = "estimator.rate_hz="  # beginning of an override of an estimator's rate
+# entry of the pipeline for estimators that the option ``--with`` adds
 ADDED = Trial(1, "added by --with")
-# minutes of reference, each a part of the pipeline where there are more
+# min, amounts of reference that are each a part of the pipeline, where more was recorded
 MINUTES = (0.5, 1.0, 2.0, 5.0)
+# key of a data set's file -> comment behind it
 DATASET_COMMENTS = {
     "kind": "real | simulated, as which tables and reports list the recordings",
     "vehicle": (
@@ -92,19 +97,23 @@ DATASET_COMMENTS = {
     "imu_point": "likewise for the inertial sensor",
     "accept": "checks whose errors do not stop the ingest",
 }
+# comment at the top of a split that cuts recordings
 SPLIT_HEAD = """of each recording, the first 50 % for training, the next 20 % for validation,
 the last 30 % for testing. Neighbouring samples are nearly equal, so that randomly drawn ones
 would reveal the answer. To test on the last lap, write tests: {test: last lap}. With a few
 minutes only, cross-validate: report: folds in the pipeline, and here, instead of the last three
 keys, folds: {number: 5, of: seconds, gap_seconds: 2}."""
+# comment at the top of a split of whole recordings
 UNDIVIDED_HEAD = """whole recordings, because they are too short to be divided: half of them for
 training, a fifth for validation and three tenths for testing."""
+# comment at the top of a pipeline
 PIPELINE_HEAD = """every family that the channels allow, fast and promising ones first, with
 small budgets. Run it by
   vehest run {name} --minutes 15
 The same command continues where it stopped; finished trainings are not repeated. Lines may be
 deleted, and budgets raised (the papers' comparisons use training.max_epochs=1000). The parts show
 how many minutes of reference are needed."""
+# comment in a pipeline on parameters of the car that are assumed
 ASSUMED = """The car's parameters are derived from wheelbase L and mass m: centre of
 gravity in the middle and at the height 0.2·L, yaw inertia m·(L/2)², cornering stiffness of an
 axle 10/rad times its load. Replace them by yours where known."""
@@ -112,18 +121,18 @@ axle 10/rad times its load. Replace them by yours where known."""
 
 @dataclass(frozen=True)
 class Plan:
-    """Overrides of each sweep of a pipeline with its description, estimators that are tried, and
-    others with what each lacks.
-    """
+    """Trainings of a new pipeline."""
 
+    # overrides of each sweep, and its description
     sweeps: list[tuple[list[str], str]] = field(default_factory=list)
-    estimators: list[str] = field(default_factory=list)
+    estimators: list[str] = field(default_factory=list)  # names of the estimators that are tried
+    # estimator that is not tried -> what it lacks
     lacking: dict[str, str] = field(default_factory=dict)
 
 
 def registered(word: str) -> str:
-    """The name of an estimator that is given by its name or as ``package.module:Class``; raises
-    `ConfigurationError` where it is none.
+    """Name of an estimator, from its name or ``package.module:Class``; raises `ConfigurationError`
+    where there is none.
     """
     name = next(
         (point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word
@@ -143,7 +152,7 @@ def registered(word: str) -> str:
 
 
 def _without_settings_file(name: str) -> str:
-    """What an estimator of another package lacks that has no file in conf/estimator."""
+    """Text on an estimator of another package that has no file in conf/estimator; else empty."""
     return (
         f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a "
         "line a setting"
@@ -235,12 +244,14 @@ def write(
 
 
 def _long_enough(drafted: Draft) -> list[str]:
-    """Recordings that a split uses, divided or whole; shorter ones are left out."""
+    """Names of the recordings that a split uses, cut or whole; shorter ones are left out."""
     return [name for name, duration in drafted.durations.items() if duration >= MIN_BLOCK_SECONDS]
 
 
 def _divisible(drafted: Draft) -> list[str]:
-    """Recordings that are long enough to be cut; none where most of the time is in short ones."""
+    """Names of the recordings that are long enough to be cut; empty where most of the time is in
+    short ones.
+    """
     long = {
         name: duration
         for name, duration in drafted.durations.items()
@@ -250,14 +261,15 @@ def _divisible(drafted: Draft) -> list[str]:
 
 
 def _is_too_short(drafted: Draft) -> bool:
+    """Whether the recordings are too short for training, validation and a test."""
     return drafted.seconds < MIN_SECONDS or (
         not _divisible(drafted) and len(_long_enough(drafted)) < len(ROLES_OF_THREE)
     )
 
 
 def _split_text(drafted: Draft) -> str:
-    """Blocks of each recording, whole recordings where they are short; short ones beside long ones
-    are for training.
+    """Text of the split's file: segments of each recording, or whole recordings where they are
+    short; short ones beside long ones are for training.
     """
     name = drafted.examined.name
     ids = _long_enough(drafted)
@@ -293,6 +305,7 @@ def _split_text(drafted: Draft) -> str:
 
 
 def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
+    """Command lines to run next, for the terminal."""
     name = drafted.examined.name
     file = drafted.examined.files[0]
     longest = max(drafted.contents, key=lambda candidate: drafted.durations[candidate.id])
@@ -316,7 +329,7 @@ def _next_commands(drafted: Draft, plan: Plan) -> list[str]:
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
-    """What the files hold, for JSON."""
+    """Results of the inspection of files, as plain values for JSON."""
     proposals = examined.proposals
     return {
         "name": examined.name,
@@ -332,6 +345,7 @@ def found_in(examined: Examined) -> dict[str, Any]:
 
 
 def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
+    """Outcome of `write` as plain values, for JSON."""
     return found_in(drafted.examined) | {
         "recordings": [content.id for content in drafted.contents],
         "rate_hz": drafted.lowest_rate_hz,
@@ -350,6 +364,9 @@ def _plain(drafted: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, An
 
 
 def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
+    """Outcome of `write` as lines for a terminal: estimated values, delays, remarks, open
+    questions, and estimators that are not compared.
+    """
     lines = []
     if drafted.ratio and is_certain(*drafted.ratio):
         value, spread = drafted.ratio
@@ -376,8 +393,8 @@ def _words(drafted: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 
 
 def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
-    """Sweeps over the families that recordings and known values of the car allow; an empty plan
-    where they allow none.
+    """Plan sweeps over the families that the recordings and the known values of the car allow;
+    empty where they allow none.
     """
     contents = drafted.contents
     vehicle = drafted.examined.vehicle
@@ -435,6 +452,9 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
 
 
 def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
+    """Parameter of the car -> its value as text, from wheelbase and mass, the others assumed
+    (`ASSUMED`).
+    """
     wheelbase = vehicle["wheelbase"] or 0.0
     mass = vehicle["mass"] or 0.0
     half = 0.5 * wheelbase
@@ -460,7 +480,9 @@ def _lack(
     samples: int,
     seconds: float,
 ) -> tuple[str, tuple[str, ...]]:
-    """What an estimator lacks, empty if nothing, and settings with which it lacks no channel."""
+    """Text on what an estimator lacks, empty if nothing, and overrides with which it lacks no
+    channel.
+    """
     if name not in choices("estimator"):
         config: Config = {"estimator": {"name": name}, "training": {}}
         reason = usability(name, config, contents).to_give or _without_settings_file(name)
@@ -474,7 +496,7 @@ def _lack(
         usable = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error), ()
-    missing = [] if usable.settings_suffice else usable.missing.in_words()
+    missing = [] if usable.settings_suffice else usable.missing.describe()
     lacks = [f"requires {', '.join(missing)}"] if missing else []
     min_seconds = samples / (usable.rate_hz or math.inf)
     if min_seconds > seconds:
@@ -487,6 +509,9 @@ def _lack(
 
 
 def _limits(drafted: Draft) -> list[str]:
+    """Sentences on why nothing can be trained or ranked on the recordings, or on how far; empty
+    where they are sufficient.
+    """
     derived = {"vy_ref"} if "sideslip_ref" in drafted.channels else set()  # with vx
     missing = [name for name in SCORED if name not in drafted.channels | derived]
     if "vy_ref" in missing:
@@ -518,7 +543,7 @@ def _limits(drafted: Draft) -> list[str]:
 
 
 def _without_reference(drafted: Draft) -> str:
-    """What estimates without a reference."""
+    """Clause on what can estimate without a reference."""
     missing = [name for name in FILTER_CHANNELS if name not in drafted.channels]
     if missing:
         return (
@@ -539,7 +564,9 @@ def _column_answer(channel: str) -> str:
 
 
 def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
-    """A data set's YAML file; questions ``left`` open, evidence and delays are its comments."""
+    """Text of a data set's file in YAML, with evidence, delays and the questions ``left`` open as
+    comments.
+    """
     examined = drafted.examined
     name = examined.name
     head = [
@@ -573,7 +600,7 @@ def _dataset_text(drafted: Draft, left: Sequence[Question]) -> str:
 
 
 def _pipeline_text(drafted: Draft, plan: Plan) -> str:
-    """A pipeline of study and split: all recordings, then parts with less of the minutes of
+    """Text of a pipeline's file: a part with all recordings, then parts with less of the minutes of
     reference.
     """
     name = drafted.examined.name
@@ -623,7 +650,7 @@ def _pipeline_text(drafted: Draft, plan: Plan) -> str:
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] = {}) -> str:
-    """YAML below a comment, with further comments behind some keys."""
+    """Text of a mapping in YAML below a comment, with further comments behind some keys."""
     lines = yaml.safe_dump(
         dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False
     ).splitlines()

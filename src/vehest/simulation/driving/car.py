@@ -19,9 +19,10 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 
-TEST_SPEED = 25.0  # of the measurement [m/s], or half of the top speed if that is less; assumed
-# share of the largest lateral acceleration that counts as the grip: the last bit takes far more
-# steering; assumed
+# speed of the measurement [m/s], or half of the top speed if that is less; assumed
+TEST_SPEED = 25.0
+# share of the largest lateral acceleration that counts as the grip, since the last bit takes far
+# more steering; assumed
 USEFUL_SHARE = 0.985
 # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins;
 # assumed
@@ -44,21 +45,22 @@ POWER_SHARE = 0.9  # share of the engine's power that a driver uses; assumed
 class Car:
     """A car as its driver knows it, on a dry road."""
 
-    name: str  # of the vehicle
+    name: str  # name of the vehicle
     wheelbase: float  # [m]
-    width: float  # over all [m]
+    width: float  # width over all [m]
     front_share: float  # share of the weight on the front axle
     grip: float  # largest steady lateral acceleration [m/s²]
-    driving_share: float  # share of the grip that serves for accelerating straight ahead
-    power_per_mass: float  # used at most [W/kg]
-    top_speed: float  # driven at most [m/s]
+    driving_share: float  # share of the grip that is available for accelerating straight ahead
+    power_per_mass: float  # largest power that is used per mass [W/kg]
+    top_speed: float  # largest speed that is driven [m/s]
     drag: float  # deceleration by the air per square of the speed [1/m]
     steering_rate: float  # largest steering velocity of the road wheels [rad/s]
-    largest_steer: float  # of the road wheels [rad]
-    lateral_acceleration: tuple[float, ...]  # (M,), from 0 to the grip [m/s²]
-    # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
+    largest_steer: float  # largest angle of the road wheels [rad]
+    # lateral accelerations of the measured points, from 0 to the grip, (M,) [m/s²]
+    lateral_acceleration: tuple[float, ...]
+    # road-wheel angle beyond wheelbase times curvature at these, (M,) [rad]
     excess_steer: tuple[float, ...]
-    # (M,), slip angle of the rear axle there, as a positive angle [rad]
+    # magnitude of the slip angle of the rear axle at these, (M,) [rad]
     rear_slip: tuple[float, ...]
 
     def steer_for(
@@ -177,7 +179,8 @@ def car_of(plant: MultiBodyPlant) -> Car:
     return _CARS[key]
 
 
-_CARS: dict[str, Car] = {}
+_CARS: dict[str, Car] = {}  # cars that were measured in this process, by vehicle and step
+# names of the values that ``driver`` of a vehicle may replace
 _DRIVER_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
 
 
@@ -229,8 +232,8 @@ def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car
 
 
 def _ratio(load: float, torque: float) -> float:
-    """Load share over torque share of an axle: the acceleration, per grip, at which it would slip;
-    infinite for an axle that is not driven.
+    """Load share of an axle over its torque share: the acceleration, over the grip, at which it
+    would slip; infinite for an axle that is not driven.
     """
     return load / torque if torque > 0.0 else math.inf
 
@@ -238,7 +241,9 @@ def _ratio(load: float, torque: float) -> float:
 def _driver_value(
     driver_values: Mapping[str, Any], name: str, default: float, vehicle_name: str
 ) -> float:
-    """One of the driver's values, or its default; refuses what is not finite and positive."""
+    """One of the driver's values, or its default; raises an error where it is not finite and
+    positive.
+    """
     value = float(driver_values.get(name, default))
     if not (math.isfinite(value) and value > 0.0):
         raise ConfigurationError(
@@ -250,8 +255,8 @@ def _driver_value(
 def _measure(
     plant: MultiBodyPlant, speed: float
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one; excess
-    steer and rear slip [rad] there.
+    """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one, and excess
+    steer and rear slip [rad] at each.
     """
     ramp = ramp_steer(plant, speed)
     steady = ramp.vx * ramp.yaw_rate

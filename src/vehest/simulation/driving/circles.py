@@ -26,6 +26,7 @@ from vehest.simulation.driving.manoeuvre import (
 from vehest.simulation.road.lines import circle
 from vehest.simulation.road.surface import Surface
 
+# parameter -> lowest and highest value, of manoeuvres on a circle
 CIRCLE_LIMITS = {"radius": (15.0, 500.0), "severity": (0.1, 1.3)}
 
 
@@ -36,12 +37,12 @@ class SteadyCircle(Manoeuvre):
     """
 
     name: ClassVar[str] = "skidpad"
-    radius: Range = (35.0, 60.0)  # [m]; the standard requires at least 30 m
-    severity: Range = (0.7, 0.95)  # share of the grip at which it ends
-    # by which the lateral acceleration grows [m/s³]; the standard's slow increase
+    radius: Range = (35.0, 60.0)  # radius of the circle [m]; the standard requires at least 30 m
+    severity: Range = (0.7, 0.95)  # share of the grip at which the drive ends
+    # rate at which the lateral acceleration grows [m/s³]; the standard's slow increase
     ay_rate: float = 0.25
-    start_ay: float = 2.0  # at which the circle is entered [m/s²]
-    hold_time: float = 2.0  # at the final speed [s]
+    start_ay: float = 2.0  # lateral acceleration at which the circle is entered [m/s²]
+    hold_time: float = 2.0  # time at the final speed [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
     half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]
 
@@ -53,7 +54,7 @@ class SteadyCircle(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """The time in which two times 9.81 m/s² are reached."""
+        """Time in which two times 9.81 m/s² are reached [s]."""
         return 30.0 + self.hold_time + 2.0 * 9.81 / self.ay_rate
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -114,17 +115,17 @@ class BrakingInTurn(Manoeuvre):
     """Braking on a circle with the steering held (ISO 7975, open loop)."""
 
     name: ClassVar[str] = "braking_in_turn"
-    radius: Range = (60.0, 100.0)  # of the circle [m]; 100 m in the standard
+    radius: Range = (60.0, 100.0)  # radius of the circle [m]; 100 m in the standard
     # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
     severity: Range = (
         0.4,
         0.7,
     )
-    deceleration: Range = (2.0, 5.0)  # [m/s²]
-    turn_time: Range = (3.0, 5.0)  # on the circle before the brakes [s]
+    deceleration: Range = (2.0, 5.0)  # deceleration of the braking [m/s²]
+    turn_time: Range = (3.0, 5.0)  # time on the circle before the brakes [s]
     # ``held`` or, for a driver who keeps to the circle, ``path``
     steering: Literal["held", "path"] = "held"
-    until_speed: float = 0.0  # at which the recording ends [m/s]; 0 is the stand
+    until_speed: float = 0.0  # speed at which the recording ends [m/s]; 0 is the stand
     side: Side = "either"  # ``left``, ``right`` or ``either``
     # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once
     # it brakes
@@ -138,7 +139,7 @@ class BrakingInTurn(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """More than any of it takes."""
+        """An upper bound of the time that it takes [s]."""
         return 60.0 + as_range(self.turn_time)[1]
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -194,7 +195,7 @@ class TurnBraker(LineDriver):
         self._until_speed = manoeuvre.until_speed
 
     def command(self, time: float, observation: Observation) -> Command:
-        """Around the circle, then braking, with the steering held or not.
+        """Follow the circle, then brake, with the steering held or not.
 
         The deceleration builds up linearly within BRAKE_BUILD_UP. With the steering held there is
         no line to be off: the lateral error is NaN from then on.

@@ -26,12 +26,13 @@ from vehest.simulation.driving.manoeuvre import (
 from vehest.simulation.road.lines import Gate, Line, line_through
 from vehest.simulation.road.surface import Surface
 
+# parameter -> lowest and highest value, of manoeuvres between cones
 CONE_LIMITS = {"severity": (0.05, 1.3), "speed": (3.0, 70.0)}
 
 
 @dataclass(frozen=True)
 class DoubleLaneChange(Manoeuvre):
-    """To the neighbouring lane and back between cones, at a constant speed.
+    """Change to the neighbouring lane and back between cones, at a constant speed.
 
     Lengths and widths of the gates are those of ISO 3888-1 and ISO 3888-2; the offset of part 1 is
     taken between the lanes' middles.
@@ -45,15 +46,15 @@ class DoubleLaneChange(Manoeuvre):
         0.5,
         0.9,
     )
-    speed: Range | None = None  # [m/s], instead of the severity
-    side: Side = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
+    speed: Range | None = None  # speed [m/s], instead of the severity
+    side: Side = "either"  # side of the neighbouring lane: ``left``, ``right`` or ``either``
     half_width: float = 1.5  # distance from the line beyond which the car has left the road [m]
 
     limits: ClassVar = CONE_LIMITS
 
     @property
     def longest(self) -> float:
-        """More than any speed takes."""
+        """An upper bound of the time that it takes [s]."""
         return 60.0
 
     def gates(self, width: float) -> tuple[Gate, ...]:
@@ -101,25 +102,26 @@ class DoubleLaneChange(Manoeuvre):
 
 @dataclass(frozen=True)
 class Slalom(Manoeuvre):
-    """Around cones in a row, at a constant speed."""
+    """Drive around cones in a row, at a constant speed."""
 
     name: ClassVar[str] = "slalom"
-    spacing: float = 18.0  # of the cones [m]; 18 m and 30 m are customary
-    cones: int = 8  # how many
+    spacing: float = 18.0  # distance between the cones [m]; 18 m and 30 m are customary
+    cones: int = 8  # number of cones
     # share of the grip that the sharpest bend of the line takes; decides the speed
     severity: Range = (
         0.5,
         0.9,
     )
-    speed: Range | None = None  # [m/s], instead of the severity
-    side: Side = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
+    speed: Range | None = None  # speed [m/s], instead of the severity
+    # side on which the first cone is passed: ``left``, ``right`` or ``either``
+    side: Side = "either"
     half_width: float = 2.0  # distance from the line beyond which the car has left the road [m]
 
     limits: ClassVar = CONE_LIMITS | {"spacing": (8.0, 100.0), "cones": (1.0, 30.0)}
 
     @property
     def longest(self) -> float:
-        """More than any speed takes."""
+        """An upper bound of the time that it takes [s]."""
         return 30.0 + self.cones * self.spacing / 2.0
 
     def gates(self, width: float) -> tuple[Gate, ...]:

@@ -28,29 +28,30 @@ DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 LOWEST_CORRECTION = 0.5  # Hz, lowest frequency at which a driver corrects; assumed
 HIGHEST_CORRECTION = 2.0  # Hz, highest one; assumed
 
+# wavelengths of the variations along a drive [m]; assumed, none divides a lap
 WAVELENGTHS = (
     310.0,
     470.0,
     1130.0,
-)  # of the variations along a drive [m]; assumed, and none divides a lap
+)
 
 
 @dataclass(frozen=True)
 class Driver:
-    """How a person drives; all values are assumed, chosen so that the shipped cars follow the
-    shipped courses.
+    """Parameters of a person's driving; all values are assumed, chosen so that the shipped cars
+    follow the shipped courses.
     """
 
-    preview_time: float = 0.7  # how far ahead the driver looks for lateral errors [s]
+    preview_time: float = 0.7  # time ahead at which the driver looks for lateral errors [s]
     steering_lag: float = 0.1  # time constant from the wanted to the actual steering angle [s]
-    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far
-    # ahead as this lag and the one of steering.
+    # additional delay of the car's answer per speed [s²/m]; the driver takes the road's curvature
+    # as far ahead as this delay and the steering lag
     response: float = 3.5e-3
-    yaw_damping: float = 0.16  # steering angle per error of the yaw rate [s]
-    countersteer: float = 0.7  # steering angle per sideslip beyond that of the turn
-    # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    yaw_damping: float = 0.16  # steering angle over error of the yaw rate [s]
+    countersteer: float = 0.7  # steering angle over the sideslip angle beyond that of the turn
+    # sideslip angle beyond that of the turn from which on the driver countersteers and lifts [rad]
     slide: float = 0.035
-    speed_gain: float = 1.5  # wanted acceleration per speed error [1/s]
+    speed_gain: float = 1.5  # wanted acceleration over speed error [1/s]
     braking_share: float = 0.75  # share of the grip that is used for braking straight ahead
     # share of the grip up to which the driver asks for more lateral acceleration when off the line
     saturation: float = 1.1
@@ -69,9 +70,9 @@ class DrivingStyle:
     """
 
     grip_fraction: float  # mean share of the grip that the speed profile uses, 0 … 1
-    grip_ripple: float  # amplitude of its variation
+    grip_ripple: float  # amplitude by which the share of the grip varies
     line_offset: float  # amplitude of the lateral offset of the line [m]
-    wavelengths: tuple[float, ...]  # of the sines [m]
+    wavelengths: tuple[float, ...]  # wavelengths of the sines [m]
     grip_phases: tuple[float, ...]  # phase of each sine of the grip [rad]
     line_phases: tuple[float, ...]  # phase of each sine of the line [rad]
 
@@ -91,19 +92,19 @@ class Plan(Line):
     (N,).
     """
 
-    speed: FloatArray  # [m/s]
+    speed: FloatArray  # speed [m/s]
     friction: FloatArray  # scale of the tyres' friction
-    bank: FloatArray  # positive with the left side higher [rad]
-    grade: FloatArray  # positive downhill [rad]
+    bank: FloatArray  # bank of the road, positive with the left side higher [rad]
+    grade: FloatArray  # grade of the road, positive downhill [rad]
 
     @cached_property
     def acceleration(self) -> FloatArray:
-        """Along the line [m/s²], shape (N,)."""
+        """Acceleration along the line [m/s²], shape (N,)."""
         return self.speed * np.gradient(self.speed, self.distance)
 
     @property
     def length(self) -> float:
-        """From the start to the end [m]."""
+        """Distance from the start to the end [m]."""
         return float(self.distance[-1])
 
 
@@ -112,22 +113,22 @@ class Observation(NamedTuple):
     [rad/s], steering angle [rad].
     """
 
-    x: float
-    y: float
-    yaw: float
-    vx: float
-    vy: float
-    yaw_rate: float
-    steer: float
+    x: float  # position [m]
+    y: float  # position [m]
+    yaw: float  # heading [rad]
+    vx: float  # forward velocity [m/s]
+    vy: float  # lateral velocity, positive to the left [m/s]
+    yaw_rate: float  # yaw rate, positive to the left [rad/s]
+    steer: float  # road-wheel angle, positive to the left [rad]
 
     @property
     def speed(self) -> float:
-        """Of the car over the ground [m/s]."""
+        """Speed of the car over the ground [m/s]."""
         return math.hypot(self.vx, self.vy)
 
     @property
     def sideslip(self) -> float:
-        """atan2(vy, vx), zero below 1 m/s [rad]."""
+        """Sideslip angle, atan2(vy, vx), zero below 1 m/s [rad]."""
         return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
 
 
@@ -135,16 +136,16 @@ class Observation(NamedTuple):
 class Command:
     """The driver's command, and the road at the car."""
 
-    steering_velocity: float  # of the road wheels [rad/s]
-    acceleration: float  # requested [m/s²]
+    steering_velocity: float  # steering velocity of the road wheels [rad/s]
+    acceleration: float  # requested longitudinal acceleration [m/s²]
     progress: float = 0.0  # distance along the way [m]
-    # the car's place left of its line [m]; NaN where there is no line
+    # distance of the car from its line, positive left of it [m]; NaN where there is no line
     lateral_error: float = math.nan
     friction: float = 1.0  # scale of the tyres' friction at the car
-    bank: float = 0.0  # of the road, positive with its left side higher [rad]
-    grade: float = 0.0  # of the road, positive downhill [rad]
-    heading: float = 0.0  # of the road, along which bank and grade are meant [rad]
-    finished: bool = False  # the manoeuvre is over
+    bank: float = 0.0  # bank of the road, positive with its left side higher [rad]
+    grade: float = 0.0  # grade of the road, positive downhill [rad]
+    heading: float = 0.0  # heading of the road, along which bank and grade are measured [rad]
+    finished: bool = False  # whether the manoeuvre is over
 
 
 def draw_style(
@@ -341,8 +342,7 @@ class Hands:
         )
 
     def at(self, time: float, load: float) -> float:
-        """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip
-        [m/s²].
+        """Lateral acceleration that the corrections ask for at a time [m/s²].
 
         Parameters
         ----------
@@ -410,7 +410,7 @@ class Follower:
 
     @property
     def start(self) -> tuple[float, float, float, float]:
-        """Place [m], heading [rad] and speed [m/s] at which the car starts.
+        """Place x, y [m], heading [rad] and speed [m/s] at which the car starts.
 
         Returns
         -------
@@ -511,7 +511,9 @@ class Follower:
         )
 
     def _per_curvature(self, speed: float, friction: float) -> float:
-        """Steering angle per curvature [rad m] at half of the grip."""
+        """Steering angle over curvature of the path [rad m] at a speed [m/s], with understeer as at
+        half of the grip.
+        """
         car = self.car
         moderate = 0.5 * self.car.grip * friction
         return car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
@@ -538,8 +540,8 @@ class Follower:
         )
 
     def _cell(self, distance: float) -> tuple[int, float]:
-        """Sample before a distance and the share of the way to the next one, held at the plan's
-        ends.
+        """Index of the sample before a distance [m], and the share of the way to the next one, held
+        at the plan's ends.
         """
         position = distance * self._per_metre
         before = min(max(int(position), 0), self._last_cell)
@@ -576,7 +578,9 @@ def _between(values: list[float], before: int, share: float) -> float:
 
 
 def _repeat(values: FloatArray, n_laps: int, per_lap: float = 0.0) -> FloatArray:
-    """Values along a lap laid end to end ``n_laps`` times, going on by ``per_lap``."""
+    """Values along a lap, repeated ``n_laps`` times; each lap is ``per_lap`` higher than the one
+    before.
+    """
     laps = [values[:-1] + lap * per_lap for lap in range(n_laps)]
     return np.concatenate([*laps, values[-1:] + (n_laps - 1) * per_lap])
 
@@ -587,7 +591,9 @@ def _sines(
     phases: tuple[float, ...],
     amplitude: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean of sines of the given amplitude with its first and second derivative, each (N,)."""
+    """Mean of sines of the given amplitude over distance [m], with its first and second derivative,
+    each (N,).
+    """
     wave_numbers = 2.0 * math.pi / np.array(wavelengths)
     angles = distance[:, None] * wave_numbers + np.array(phases)
     value = amplitude * np.mean(np.sin(angles), axis=1)

@@ -21,7 +21,7 @@ SPEED_MARGIN = 1.0  # speed over the wanted one at which the driver brakes [m/s]
 MAX_CALM_SIDESLIP = (
     0.12  # sideslip angle below which the driver brakes, and has caught a slide [rad]
 )
-COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle in a slide that is caught
+COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle while a slide is caught
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,12 @@ class Freestyle(Manoeuvre):
     """
 
     name: ClassVar[str] = "freestyle"
-    duration: Range = (20.0, 40.0)  # of the recording [s]
+    duration: Range = (20.0, 40.0)  # length of the recording [s]
     speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest target speed [m/s]
-    current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
-    # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
+    # lowest and highest motor current of a burst of gas [A]
+    current: tuple[float, float] = (10.0, 45.0)
+    # lowest and highest sideslip angle beyond which the driver lifts and countersteers, drawn anew
+    # for each slide [rad]
     sideslip: tuple[float, float] = (
         0.15,
         0.35,
@@ -66,7 +68,7 @@ class Freestyle(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """The longest that a recording may be drawn to be [s]."""
+        """Longest length that a recording may be drawn to have [s]."""
         return as_range(self.duration)[1]
 
     def controller(  # type: ignore[override]
@@ -138,7 +140,9 @@ class FreestyleDriver:
         return Inputs(steer, gas, self._area.friction_at(self._progress))
 
     def _next_steer(self, time: float) -> float:
-        """At a stop mostly, to one side and then to the other."""
+        """Next wanted road-wheel angle [rad]: at a stop mostly, to one side and then to the
+        other.
+        """
         if time >= self._steer_until:
             generator = self._generator
             kind = self._generator.uniform()
@@ -154,8 +158,8 @@ class FreestyleDriver:
         return self._steer
 
     def _next_gas(self, time: float, observation: Observation) -> float:
-        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast, and
-        at random.
+        """Next wanted motor current [A]: bursts up to the wanted speed, none above it, braking
+        where it is much too fast, and at random.
         """
         generator = self._generator
         style = self._style

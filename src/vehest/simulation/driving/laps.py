@@ -34,10 +34,10 @@ from vehest.simulation.driving.manoeuvre import (
 from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
 
-# of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the
-# fleet's
+# random stream of the traffic in a drive's seed; 0 to 4 are the style's, the sensors', the
+# surface's, the manoeuvre's and the fleet's
 _TRAFFIC_STREAM = 5
-TRAFFIC_LENGTH = (50.0, 400.0)  # of a stretch behind a slower car [m]; assumed
+TRAFFIC_LENGTH = (50.0, 400.0)  # shortest and longest segment behind a slower car [m]; assumed
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,19 @@ class Laps(Manoeuvre):
 
     name: ClassVar[str] = "laps"
     course: str = "handling"  # name of the course
-    duration: float | None = None  # of the recording [s]; none where ``laps`` is given
-    laps: int | None = None  # whole laps to record
+    duration: float | None = None  # length of the recording [s], where ``laps`` is not given
+    laps: int | None = None  # number of whole laps to record
     severity: Range = (0.65, 0.9)  # mean share of the grip
-    ripple: float = 0.05  # by which the share varies along the way
-    line_offset: float = 0.5  # by which the line varies about the road's middle [m]
-    top_speed: float | None = None  # that the driver does not exceed [m/s]; by default the car's
-    flat: bool = False  # leaves out the course's bank and grade
-    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
-    corrections: Range = 0.0  # of the driver's hands, see `Hands` [m/s²]
-    traffic: float = 0.0  # segments per lap, on average, behind a slower car
-    traffic_speed: tuple[float, float] = (8.0, 30.0)  # of those, drawn for each [m/s]
+    ripple: float = 0.05  # amplitude by which the share of the grip varies along the way
+    line_offset: float = 0.5  # amplitude by which the line varies about the road's middle [m]
+    # speed that the driver does not exceed [m/s]; by default the car's
+    top_speed: float | None = None
+    flat: bool = False  # whether the course's bank and grade are left out
+    half_width: float = 5.0  # half width of the road, beyond which the car has left it [m]
+    corrections: Range = 0.0  # size of the corrections of the driver's hands, see `Hands` [m/s²]
+    traffic: float = 0.0  # mean number of segments per lap behind a slower car
+    # lowest and highest speed of the slower cars, drawn for each [m/s]
+    traffic_speed: tuple[float, float] = (8.0, 30.0)
 
     limits: ClassVar = {
         **{"severity": (0.05, 1.0), "ripple": (0.0, 0.5), "corrections": (0.0, 5.0)},
@@ -74,11 +76,11 @@ class Laps(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """The duration, or long enough for the laps."""
+        """The duration, or a time that is long enough for the laps [s]."""
         return self.duration if self.duration is not None else 1000.0 * (self.laps or 1)
 
     def description(self) -> dict[str, Any]:
-        """Name and parameters; of corrections and traffic only where there are any."""
+        """Name and parameters, those of corrections and traffic only where there are any."""
         words = super().description()
         if self.corrections == 0.0:
             del words["corrections"]
@@ -137,7 +139,7 @@ class Laps(Manoeuvre):
         )
 
     def _traffic_speeds(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
-        """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are
+        """Highest speeds along the way [m/s]: those of slower cars ahead, on segments that are
         drawn lap by lap.
         """
         cells = len(course.arc_length) - 1
@@ -163,17 +165,18 @@ class SpeedLaps(Manoeuvre):
 
     name: ClassVar[str] = "speed_laps"
     course: str = "vairano_like"  # name of the course
+    # speeds of the laps, in order [m/s]; 30, 40 and 45 km/h in the paper
     speeds: tuple[float, ...] = (
         30.0 / 3.6,
         40.0 / 3.6,
         45.0 / 3.6,
-    )  # of the laps, in order [m/s]; 30, 40 and 45 km/h in the paper
-    stop_time: float = 5.0  # from the last lap's speed to the stand [s]; 5 s in the paper
-    severity: Range = 0.7  # share of the grip that corners get at most
-    change_rate: float = 0.4  # acceleration by which the speed changes from lap to lap [m/s²]
-    line_offset: float = 0.3  # by which the line varies about the road's middle [m]
-    flat: bool = False  # leaves out the course's bank and grade
-    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
+    )
+    stop_time: float = 5.0  # time from the last lap's speed to the stand [s]; 5 s in the paper
+    severity: Range = 0.7  # largest share of the grip that corners take
+    change_rate: float = 0.4  # acceleration with which the speed changes from lap to lap [m/s²]
+    line_offset: float = 0.3  # amplitude by which the line varies about the road's middle [m]
+    flat: bool = False  # whether the course's bank and grade are left out
+    half_width: float = 5.0  # half width of the road, beyond which the car has left it [m]
 
     limits: ClassVar = {
         "severity": (0.05, 0.95),
@@ -192,7 +195,7 @@ class SpeedLaps(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """Twice as long as the laps take at their speeds, and the stop."""
+        """Twice the time that the laps take at their speeds, and the stop [s]."""
         length = course_by_name(self.course).length
         return 2.0 * sum(length / speed for speed in self.speeds) + self.stop_time
 
@@ -233,10 +236,11 @@ class FastLap(Manoeuvre):
     course: str = "vairano_like"  # name of the course
     # length of the course over the time of the lap [m/s]; 76 km/h in the paper
     mean_speed: float = 76.0 / 3.6
-    top_speed: float = 115.0 / 3.6  # that the driver does not exceed [m/s]; 115 km/h in the paper
-    line_offset: float = 0.3  # by which the line varies about the road's middle [m]
-    flat: bool = False  # leaves out the course's bank and grade
-    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
+    # speed that the driver does not exceed [m/s]; 115 km/h in the paper
+    top_speed: float = 115.0 / 3.6
+    line_offset: float = 0.3  # amplitude by which the line varies about the road's middle [m]
+    flat: bool = False  # whether the course's bank and grade are left out
+    half_width: float = 5.0  # half width of the road, beyond which the car has left it [m]
 
     limits: ClassVar = {"mean_speed": (2.0, 60.0)}
 
@@ -247,7 +251,7 @@ class FastLap(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """Twice as long as the lap should take."""
+        """Twice the time that the lap should take [s]."""
         return 2.0 * course_by_name(self.course).length / self.mean_speed
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -291,7 +295,7 @@ class FastLap(Manoeuvre):
         )
 
 
-FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
+FASTEST_SEVERITY = 0.95  # largest share of the grip that a fast lap may take
 
 
 class LapDriver(LineDriver):
@@ -346,7 +350,7 @@ class LapDriver(LineDriver):
         self._stop: tuple[float, float] | None = None  # when it began, and at which speed
 
     def command(self, time: float, observation: Observation) -> Command:
-        """As planned, and braking evenly once the end is reached."""
+        """Command as planned; even braking once the end is reached."""
         decision = super().command(time, observation)
         if self._stop_time is None or decision.progress < self._end:
             return decision
@@ -367,14 +371,14 @@ def _course(name: str, flat: bool) -> Course:
 
 
 def _lap_time(plan: Plan, length: float) -> float:
-    """Of the plan's second lap [s]."""
+    """Time of the plan's second lap [s]; ``length`` of a lap [m]."""
     lap = (plan.distance >= length) & (plan.distance < 2.0 * length)
     return float(np.sum(plan.distance[1] / plan.speed[lap]))
 
 
 def _eased(speed: FloatArray, course: Course, rate: float) -> FloatArray:
-    """Speeds [m/s] along the way without steps: they change by a constant acceleration around each
-    step.
+    """Speeds along the way [m/s] without steps: from each step on they change by a constant
+    acceleration ``rate`` [m/s²].
     """
     spacing = float(course.arc_length[1])
     eased = speed.copy()

@@ -16,14 +16,18 @@ from vehest.simulation.driving.driver import Command, Driver, Follower, Observat
 from vehest.simulation.road.lines import Line
 from vehest.simulation.road.surface import Surface
 
+# a number, or the lowest and highest value from which every drive draws one
 Range = float | tuple[float, float]
-Side = Literal["left", "right", "either"]
+Side = Literal["left", "right", "either"]  # side to which a manoeuvre goes first; ``either``: drawn
 
+# parameter -> lowest and highest value, of all manoeuvres
 COMMON_LIMITS = {"half_width": (0.5, 50.0), "line_offset": (0.0, 3.0)}
-SETTLING_TIME = 2.0  # driven before the first sample [s]
-OPEN_AREA_LAP = 2000.0  # distance after which an open area's patches of friction come again [m]
+SETTLING_TIME = 2.0  # time that is driven before the first sample [s]
+OPEN_AREA_LAP = 2000.0  # distance after which an open area's patches of friction repeat [m]
 
-_STREAM = 3  # of a drive's seed; 0 is the style's, 1 the sensors', 2 the surface's
+# random stream of the manoeuvre in a drive's seed; 0 is the style's, 1 the sensors', 2 the
+# surface's
+_STREAM = 3
 
 
 class Controller(Protocol):
@@ -48,7 +52,7 @@ class Controller(Protocol):
 class Manoeuvre(ABC):
     """Base of all manoeuvres; raises `ConfigurationError`: a parameter is outside its limits."""
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # name in a configuration
     # parameter -> lowest and highest value, beside `COMMON_LIMITS`
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
@@ -92,7 +96,7 @@ class Manoeuvre(ABC):
         return {"name": self.name, **asdict(self)}
 
 
-FASTEST_SHARE = 0.9  # share of the top speed that a manoeuvre on an open area is driven at, at most
+FASTEST_SHARE = 0.9  # largest share of the top speed at which a manoeuvre on an open area is driven
 
 
 class LineDriver(Follower):
@@ -117,14 +121,14 @@ class LineDriver(Follower):
         self._end_time = end_time
 
     def command(self, time: float, observation: Observation) -> Command:
-        """As planned, until the end."""
+        """Command as planned, until the end."""
         decision = super().command(time, observation)
         is_over = decision.progress >= self._end or time >= self._end_time
         return replace(decision, finished=is_over)
 
 
 class OpenArea:
-    """Friction along the way on an open area; ``seed``: of the drive, for patches."""
+    """Friction along the way on an open area, with patches drawn by the seed of the drive."""
 
     def __init__(self, surface: Surface, seed: int) -> None:
         self._friction = surface.along(np.arange(0.0, OPEN_AREA_LAP), seed, OPEN_AREA_LAP).tolist()
@@ -139,8 +143,8 @@ SIDES = {1.0: "left", -1.0: "right"}  # names of the values of Draws.side
 
 
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
-    """Refuse parameters outside their limits, both ends of a range included, by a
-    `ConfigurationError`; None is within.
+    """Raise `ConfigurationError` for parameters outside their limits, both ends of a range
+    included; None is within.
 
     Parameters
     ----------
@@ -166,7 +170,7 @@ def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
 
 
 def as_range(value: Range) -> tuple[float, float]:
-    """Lowest and highest value.
+    """Lowest and highest value of a range.
 
     Returns
     -------
@@ -178,7 +182,7 @@ def as_range(value: Range) -> tuple[float, float]:
 
 
 class Draws:
-    """What the seed of a drive draws for its manoeuvre; their order is fixed."""
+    """Values that the seed of a drive draws for its manoeuvre, in a fixed order."""
 
     def __init__(self, seed: int) -> None:
         self.generator = np.random.default_rng(
@@ -192,7 +196,7 @@ class Draws:
         return float(self.generator.uniform(*as_range(value)))
 
     def side(self, side: Side) -> float:
-        """1 for the left, -1 for the right.
+        """The side as a sign: 1 for the left, -1 for the right.
 
         Also a fixed side takes one draw, so that later draws stay as they are.
         """
@@ -231,7 +235,7 @@ def draw_driver(seed: int) -> Driver:
 
 
 def plan_along(line: Line, speed: float, surface: Surface, seed: int) -> Plan:
-    """A plan for a level open area: along a line at a constant speed [m/s].
+    """A plan along a line on a level open area, at a constant speed.
 
     Parameters
     ----------

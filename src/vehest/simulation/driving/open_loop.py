@@ -34,19 +34,19 @@ class StepSteer(Manoeuvre):
     """
 
     name: ClassVar[str] = "j_turn"
-    speed: Range = (15.0, 28.0)  # [m/s]; the driver holds it as far as grip and power allow
+    speed: Range = (15.0, 28.0)  # speed [m/s]; the driver holds it as far as grip and power allow
     # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its
     # square
     severity: Range = (
         0.4,
         1.0,
     )
-    # in which the angle is reached, unless the steering is slower [s]
+    # time in which the angle is reached, unless the steering is slower [s]
     steer_time: Range = (
         0.15,
         0.6,
     )
-    turn_time: Range = (5.0, 8.0)  # after the step [s]
+    turn_time: Range = (5.0, 8.0)  # time after the step [s]
     side: Side = "either"  # ``left``, ``right`` or ``either``
 
     limits: ClassVar = {
@@ -58,7 +58,7 @@ class StepSteer(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """Run-in and turn."""
+        """Time of run-in, step and turn [s]."""
         return 5.0 + as_range(self.steer_time)[1] + as_range(self.turn_time)[1]
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -101,17 +101,17 @@ class Spiral(Manoeuvre):
     """
 
     name: ClassVar[str] = "spiral"
-    speed: Range = (14.0, 25.0)  # [m/s]; the driver holds it as far as grip and power allow
+    speed: Range = (14.0, 25.0)  # speed [m/s]; the driver holds it as far as grip and power allow
     # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its
     # square
     severity: Range = (
         0.7,
         1.0,
     )
-    ramp_time: Range = (6.0, 12.0)  # in which the angle is reached [s]
-    hold_time: Range = (1.0, 2.0)  # at the angle [s]
-    turns: Literal[1, 2] = 2  # 1, or 2 for a second turn to the other side
-    side: Side = "either"  # of the first turn: ``left``, ``right`` or ``either``
+    ramp_time: Range = (6.0, 12.0)  # time in which the angle is reached [s]
+    hold_time: Range = (1.0, 2.0)  # time at the angle [s]
+    turns: Literal[1, 2] = 2  # number of turns: 1, or 2 for a second turn to the other side
+    side: Side = "either"  # side of the first turn: ``left``, ``right`` or ``either``
 
     limits: ClassVar = {
         "speed": (3.0, 70.0),
@@ -122,7 +122,7 @@ class Spiral(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """Run-in, ramps and holds."""
+        """Time of run-in, ramps and holds, at most [s]."""
         return 10.0 + 2.0 * (1.5 * as_range(self.ramp_time)[1] + as_range(self.hold_time)[1])
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -172,7 +172,7 @@ class RandomSteer(Manoeuvre):
     """
 
     name: ClassVar[str] = "random_steer"
-    speed: Range = (14.0, 30.0)  # [m/s]; the driver holds it as far as grip and power allow
+    speed: Range = (14.0, 30.0)  # speed [m/s]; the driver holds it as far as grip and power allow
     # share of the grip that three standard deviations of the steering angle would take in a steady
     # turn
     severity: Range = (
@@ -180,7 +180,7 @@ class RandomSteer(Manoeuvre):
         1.0,
     )
     band: tuple[float, float] = (0.1, 1.2)  # lowest and highest frequency [Hz]
-    duration: float = 30.0  # of the recording [s]
+    duration: float = 30.0  # length of the recording [s]
 
     limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "duration": (1.0, 3600.0)}
 
@@ -194,7 +194,7 @@ class RandomSteer(Manoeuvre):
 
     @property
     def longest(self) -> float:
-        """The duration."""
+        """The duration [s]."""
         return self.duration
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
@@ -230,12 +230,11 @@ class RandomSteer(Manoeuvre):
         return OpenLoop(car, area, speed, steer_at, self.duration, drawn)
 
 
-N_SINES = 24  # of which random steering is made, evenly spread over the band
+N_SINES = 24  # number of sines of which random steering is made, evenly spread over the band
 
 
 class OpenLoop:
-    """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the
-    speed [m/s], until ``end_time`` [s].
+    """Steers by time on an open area, and holds the speed, until ``end_time``.
 
     Parameters
     ----------
@@ -273,7 +272,9 @@ class OpenLoop:
         self._before = -SETTLING_TIME
 
     def command(self, time: float, observation: Observation) -> Command:
-        """Steering by the clock; throttle or brakes as the speed wants them and the grip allows."""
+        """Steering velocity towards the angle of this time, and throttle or brakes by the speed as
+        the grip allows.
+        """
         car = self._car
         speed = observation.speed
         self._progress += speed * (time - self._before)
@@ -296,7 +297,9 @@ class OpenLoop:
 
 
 def _steer_at(car: Car, severity: float, speed: float, friction: float) -> float:
-    """Road-wheel angle [rad] of a steady turn that takes a share of the grip."""
+    """Road-wheel angle [rad] of a steady turn at a speed [m/s] that takes a share of the grip,
+    ``severity``.
+    """
     lateral = min(severity, 1.0) * car.grip * friction
     return min(
         car.steer_for(lateral / speed**2, lateral, friction) * max(severity, 1.0) ** 2,

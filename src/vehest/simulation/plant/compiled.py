@@ -61,7 +61,7 @@ from vehest.simulation.plant.regimes import (
 if numba.config.DISABLE_JIT:
 
     def to_fixed_tuple(values, length):
-        """As numba's, which runs compiled only."""
+        """The first values as a tuple, in place of numba's function, which runs compiled only."""
         return tuple(values[:length])
 
 
@@ -70,9 +70,12 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-N_STATES = 29  # numbers of a state in the library
-N_INPUTS = 5  # steering velocity, longitudinal acceleration, yaw moment, gravity along and across
-N_FORCES = 12  # of four wheels: along and across the level body's axes, then vertical
+N_STATES = 29  # length of a state of the library
+# number of inputs: steering velocity, longitudinal acceleration, yaw moment, gravity along and
+# across
+N_INPUTS = 5
+# number of tyre forces of four wheels: along and across the level body's axes, then vertical
+N_FORCES = 12
 
 # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
 ROLLED_OVER = 0.6
@@ -95,14 +98,14 @@ _kernel = numba.njit(
 )
 
 
-# Places of the groups in a parameter vector.
-_N_STEERING = len(STEERING_NAMES)
-_N_LONGITUDINAL = len(LONGITUDINAL_NAMES)
-_N_TYRE = len(TYRE_NAMES)
-_STEERING = len(BODY_NAMES)
-_LONGITUDINAL = _STEERING + _N_STEERING
-_FRONT = _LONGITUDINAL + _N_LONGITUDINAL
-_REAR = _FRONT + _N_TYRE
+_N_STEERING = len(STEERING_NAMES)  # number of parameters of the steering
+_N_LONGITUDINAL = len(LONGITUDINAL_NAMES)  # number of parameters of the longitudinal dynamics
+_N_TYRE = len(TYRE_NAMES)  # number of parameters of a tyre
+_STEERING = len(BODY_NAMES)  # index of the first parameter of the steering in a parameter vector
+_LONGITUDINAL = _STEERING + _N_STEERING  # index of the first parameter of the longitudinal dynamics
+_FRONT = _LONGITUDINAL + _N_LONGITUDINAL  # index of the first parameter of the front tyres
+_REAR = _FRONT + _N_TYRE  # index of the first parameter of the rear tyres
+# indices of the friction coefficients of both tyres
 _FRICTIONS = tuple(
     tyre + TYRE_NAMES.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1")
 )
@@ -136,7 +139,7 @@ def _sliding_friction(tyre):
 
 @_kernel
 def _right_hand_side(x, contact, p, derivatives):
-    """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order
+    """Fill the derivatives (29,) of the state; return the twelve tyre forces in the library's order
     and the wheels' axes.
     """
     regime = contact[0]
@@ -179,8 +182,8 @@ def _right_hand_side(x, contact, p, derivatives):
 
 @_kernel
 def _engine_limit(x, acceleration, p):
-    """Wanted acceleration, within power at the speed of the driven wheels; the library's limit
-    takes the car's speed.
+    """Wanted longitudinal acceleration [m/s²], limited by power at the speed of the driven wheels;
+    the library's limit takes the car's speed.
     """
     front = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1]
     rear = x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
@@ -201,7 +204,7 @@ def _brake_arm(p):
 
 @_kernel
 def _yaw_moment(moment, forces, p):
-    """The wanted moment, within the friction of the braked side's loads."""
+    """Wanted yaw moment [N m], limited by the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
     right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
     # A positive moment, to the left of ISO 8855, brakes the wheels that the library calls right.
@@ -210,7 +213,7 @@ def _yaw_moment(moment, forces, p):
 
 @_kernel
 def _n_substeps(regime, x, p, step):
-    """Parts of a step in which the slip of the slowest wheel is stable."""
+    """Number of parts of a step in which the slip of the slowest wheel is stable."""
     if regime != ROLLING:
         return 1
     heavier = max(p.m_s * p.b / (p.a + p.b) + p.m_uf, p.m_s * p.a / (p.a + p.b) + p.m_ur)
@@ -380,8 +383,8 @@ class CachedFunction:
 
 @contextmanager
 def _locked(lock: Path | None) -> Iterator[None]:
-    """Waits for other processes that hold the lock. Where there are no locks, as on Windows, every
-    process compiles.
+    """Context that holds a lock, after waiting for other processes that hold it; where there are no
+    locks, as on Windows, every process compiles.
     """
     with ExitStack() as stack:
         if lock is not None and fcntl is not None:

@@ -51,11 +51,12 @@ SMALLEST_WHEEL_VELOCITY = 0.5
 stays finite.
 """
 
-SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
+# smallest load of a wheel, also in the air [N]: tyre formulas divide by the load
+SMALLEST_LOAD = 1.0
 
-HEAVE_RATE = 12  # places in the state vector, beside those of `regimes`
-JOINT_FRONT = 27
-JOINT_REAR = 28
+HEAVE_RATE = 12  # index of the heave rate in the state vector, besides those of `regimes`
+JOINT_FRONT = 27  # index of the lateral play of the front axle's joint
+JOINT_REAR = 28  # index of the lateral play of the rear axle's joint
 
 # Places of an axle's lateral velocity and of the lateral play of its joint among the states, and
 # its parameters. Roll, roll rate, lateral
@@ -68,6 +69,7 @@ _Axle = namedtuple(
 # Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the
 # wheels.
 _Suspension = namedtuple("_Suspension", "left right joint joint_rate camber_left camber_right")
+# forces of an axle's wheels along and across, and their loads [N]
 _Wheels = namedtuple(
     "_Wheels", "along_left along_right across_left across_right load_left load_right"
 )
@@ -133,7 +135,7 @@ def lateral_force(angle, camber, load, tyre):
 
 @_kernel
 def _weighted(force, shape, stiffness, curvature, shift, slip):
-    """A force of pure slip, reduced by slip in the other direction."""
+    """A force of pure slip [N], reduced by slip in the other direction."""
     at_none = math.cos(shape * _bent(stiffness, curvature, shift)) if shift != 0.0 else 1.0
     return force / at_none * math.cos(shape * _bent(stiffness, curvature, slip + shift))
 
@@ -159,6 +161,7 @@ def _tyre_forces(slip, angle, camber, load, tyre):
 
 @_kernel
 def _axles(p):
+    """Parameters of the front and of the rear axle, as `_Axle`."""
     twice_wheelbase = 2.0 * (p.a + p.b)
     return (
         _Axle(
@@ -239,7 +242,7 @@ def _suspension(x, axle, height, radius, joint_spring, joint_damper):
 @_kernel
 def _slip(velocity, turning):
     """Longitudinal slip of a wheel from its velocity and that of its rim [m/s]; a wheel that moves
-    backwards counts as standing.
+    backwards counts as standing still.
     """
     forward = 0.0 if velocity < 0.0 else velocity
     if forward > SMALLEST_WHEEL_VELOCITY:

@@ -10,8 +10,8 @@ from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 
 RATE_HZ = 50.0  # Hz, rate of commands and of the motion
-AY_RATE = 0.5  # m/s³, by which the lateral acceleration of a neutral car would grow
-MAX_SECONDS = 60.0  # s; a ramp ends here at the latest
+AY_RATE = 0.5  # rate at which the lateral acceleration of a neutral car would grow, m/s³
+MAX_SECONDS = 60.0  # s, longest ramp
 
 
 def ramp_steer(

@@ -8,12 +8,14 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
+# wheels in the order of the columns of (T, 4) arrays: front left, front right, rear left, rear
+# right
 WHEELS = (
     "fl",
     "fr",
     "rl",
     "rr",
-)  # order of the columns of (T, 4) arrays: front left, front right, rear left, rear right
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,33 +33,35 @@ class Motion:
     yaw: FloatArray  # heading, counter-clockwise from the x axis, not wrapped [rad]
     vx: FloatArray  # forward velocity [m/s]
     vy: FloatArray  # lateral velocity [m/s]
-    yaw_rate: FloatArray  # [rad/s]
+    yaw_rate: FloatArray  # yaw rate, positive to the left [rad/s]
     ax: FloatArray  # acceleration dvx/dt - vy·yaw_rate [m/s²]
     ay: FloatArray  # acceleration dvy/dt + vx·yaw_rate [m/s²]
     steer: FloatArray  # road-wheel angle of the front axle [rad]
-    # of the body against the road, positive with the left side up, as in a left turn [rad]
+    # roll angle of the body against the road [rad], positive with the left side up, as in a left
+    # turn
     roll: FloatArray
-    # of the body against its place at rest, positive with the nose down, as when braking [rad]
+    # pitch angle of the body against its place at rest [rad], positive with the nose down, as when
+    # braking
     pitch: FloatArray
     roll_rate: FloatArray  # derivative of the roll [rad/s]
     pitch_rate: FloatArray  # derivative of the pitch [rad/s]
     wheel_speed: FloatArray  # rotational speeds (T, 4) [rad/s]
     tyre_fx: FloatArray  # forces of the road on the tyres, along the body, not the wheel (T, 4) [N]
-    tyre_fy: FloatArray  # the same across the body (T, 4) [N]
+    tyre_fy: FloatArray  # forces of the road on the tyres across the body (T, 4) [N]
     tyre_fz: FloatArray  # wheel loads, positive (T, 4) [N]
     # scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road
     friction: FloatArray
-    bank: FloatArray  # of the road, positive with its left side higher [rad]
-    grade: FloatArray  # of the road, positive downhill [rad]
-    # of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such
-    # motor
+    bank: FloatArray  # bank of the road, positive with its left side higher [rad]
+    grade: FloatArray  # grade of the road, positive downhill [rad]
+    # speed of an electric drive motor, referred to the wheels [rad/s]; None where the car has no
+    # such motor
     motor_speed: FloatArray | None = None
-    motor_current: FloatArray | None = None  # its torque-producing current [A]; likewise
+    motor_current: FloatArray | None = None  # torque-producing current of this motor [A]; likewise
 
     def __len__(self) -> int:
         return len(self.x)
 
     @property
     def sideslip(self) -> FloatArray:
-        """atan2(vy, vx) [rad], shape (T,)."""
+        """Sideslip angle, atan2(vy, vx) [rad], shape (T,)."""
         return np.arctan2(self.vy, self.vx)

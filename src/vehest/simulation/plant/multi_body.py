@@ -61,17 +61,18 @@ The rest goes into the drag of the steered front wheels, its yaw moment, and the
 against it takes.
 """
 
-HEAVE_FRONT = 16  # places of the axles' heave in the state vector
-HEAVE_REAR = 21
+HEAVE_FRONT = 16  # index of the front axle's heave in the state vector
+HEAVE_REAR = 21  # index of the rear axle's heave in the state vector
+# indices of the library's wheels (left front, right front, left rear, right rear) in the order of
+# `motion.WHEELS`
 MIRRORED = (
     1,
     0,
     3,
     2,
-    # the library's left front, right front, left rear and right rear wheel in the order of
-    # motion.WHEELS
 )
 
+# quantity -> its index in the state vector
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
 
@@ -84,11 +85,11 @@ def _state(place: int, meaning: str) -> Any:
 class PlantState:
     """State of the car."""
 
-    values: FloatArray  # the library's states, (29,)
-    regime: Regime  # which equations hold
+    values: FloatArray  # states of the library, (29,)
+    regime: Regime  # regime whose equations hold
     spun: bool = False  # whether the car has been in a spin since its start
-    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars
-    # whose forces lag
+    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; used for
+    # cars whose forces lag
     lateral_ratio: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     x = _state(X, "Position on the ground [m].")
@@ -101,7 +102,7 @@ class PlantState:
 
     @property
     def is_standing(self) -> bool:
-        """Whether the car is at rest, but for the last of its suspension's swing."""
+        """Whether the car is at rest, except for the end of its suspension's oscillation."""
         return bool(self.regime == Regime.SLOW and self.vx == 0.0)
 
 
@@ -140,7 +141,7 @@ class MultiBodyPlant:
 
     @property
     def grip(self) -> float:
-        """About the largest steady lateral acceleration [m/s²], from the lateral friction of the
+        """Approximate largest steady lateral acceleration [m/s²], from the lateral friction of the
         weaker axle.
         """
         return float(

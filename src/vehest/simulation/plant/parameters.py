@@ -27,8 +27,8 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
 
 _published = cache(setup_vehicle_parameters)  # reads the library's files, which takes 20 ms
-LIBRARY = "commonroad-vehicle-models"
-LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
+LIBRARY = "commonroad-vehicle-models"  # name of the package whose parameter files are read
+LIBRARY_VERSION = metadata.version(LIBRARY)  # installed version of this package
 
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType(
     {1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"}
@@ -37,14 +37,16 @@ PUBLISHED_SETS: Mapping[int, str] = MappingProxyType(
 
 
 def _field_names(library_class: type) -> list[str]:
+    """Names of the fields of a dataclass of the library, in their order."""
     return [entry.name for entry in fields(library_class)]
 
 
-REAR_TYRE = "tire_rear"
+REAR_TYRE = "tire_rear"  # name of the group of the rear tyre's parameters
 
-STEERING_NAMES = _field_names(SteeringParameters)
+STEERING_NAMES = _field_names(SteeringParameters)  # names of the parameters of the steering
+# names of the parameters of the longitudinal dynamics
 LONGITUDINAL_NAMES = _field_names(LongitudinalParameters)
-TYRE_NAMES = _field_names(TireParameters)
+TYRE_NAMES = _field_names(TireParameters)  # names of the parameters of a tyre
 GROUPS = ("steering", "longitudinal", "tire", REAR_TYRE)
 """Fields of `MultiBodyValues` that are named tuples themselves."""
 BODY_NAMES = [name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")]
@@ -76,7 +78,7 @@ POSITIVE = (
     "K_sr",
     "w",
 )
-"""Parameters without which a car does not exist."""
+"""Parameters that must be positive."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +90,13 @@ class Vehicle:
     `ConfigurationError` for an unknown set or parameter, or what is no finite number.
     """
 
-    name: str  # in recordings
-    parameter_set: int  # number of the published set it starts from
+    name: str  # name of the vehicle in recordings
+    parameter_set: int  # number of the published set whose values apply where none is overridden
+    # name of a parameter or group -> value that replaces the published one
     overrides: Mapping[str, Any] = field(default_factory=dict)
     # values of this car for its driver (car.py); the plant does not read them
     driver: Mapping[str, float] = field(default_factory=dict)
-    # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
+    # way over which lateral forces of the tyres follow their slip, front and rear [m]; 0: at once
     relaxation: tuple[float, float] = (
         0.0,
         0.0,
@@ -196,7 +199,7 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
 
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
-    """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh
+    """Parameter object of the library with the overrides in place, except the rear tyre's; a new
     one at every call.
 
     Raises
@@ -231,7 +234,9 @@ def rear_tyre(vehicle: Vehicle) -> TireParameters:
 
 
 def compiled_parameters(vehicle: Vehicle) -> Any:
-    """The same values as nested named tuples of floats (MultiBodyValues); absent ones are NaN."""
+    """Parameters of a vehicle as nested named tuples of floats (MultiBodyValues); absent ones are
+    NaN.
+    """
     parameters = library_parameters(vehicle)
     return MultiBodyValues(  # type: ignore[call-arg]
         *_values_of(parameters, BODY_NAMES),
@@ -287,6 +292,7 @@ def is_number(value: Any) -> bool:
 
 
 def _require_number(label: str, value: Any) -> None:
+    """Raise `ConfigurationError` for a value that is no finite number."""
     if not is_number(value):
         raise ConfigurationError(f"{label} must be a finite number, not {value!r}")
 

@@ -52,7 +52,8 @@ LOAD_AX = 18  # longitudinal acceleration, low-passed, that shifts loads [m/s²]
 LOAD_AY = 19  # lateral acceleration, likewise [m/s²]
 STEER = 20  # steering angle [rad]
 CURRENT = 21  # motor current [A]
-N_STATES = 22
+N_STATES = 22  # length of the state vector
+# quantity -> its index in the state vector
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
 PlanarValues = namedtuple("PlanarValues", PARAMETERS)  # type: ignore[misc]
@@ -61,7 +62,7 @@ PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
 
 @numba.njit(cache=True, error_model="numpy")
 def _per_slip(slip, stiffness, shape):
-    """sin(C atan(B s))/s."""
+    """Force over peak force and slip, sin(C atan(B s))/s."""
     return (
         math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
     )
@@ -196,7 +197,7 @@ def _advance(state, target_steer, target_current, scale, p, step, n_steps):
 
 
 class Inputs(NamedTuple):
-    """Inputs of the car."""
+    """Inputs of the planar plant."""
 
     steer: float = 0.0  # wanted road-wheel angle [rad]
     current: float = 0.0  # wanted motor current [A]

@@ -11,9 +11,9 @@ from pydantic import Field
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
 
-Positive = Annotated[float, Field(gt=0.0)]
-ZeroOrPositive = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]  # number above 0
+ZeroOrPositive = Annotated[float, Field(ge=0.0)]  # number of 0 or above
+Share = Annotated[float, Field(ge=0.0, le=1.0)]  # number from 0 to 1
 
 PLANAR = "planar"
 """Value of ``plant`` in a vehicle's configuration that selects this plant; without it the vehicle
@@ -25,46 +25,48 @@ is the multi-body plant's.
 class PlanarCar:
     """A car that the planar plant can drive; a parameter of zero takes its effect away."""
 
-    name: str  # in recordings
-    mass: Positive  # [kg]
+    name: str  # name of the vehicle in recordings
+    mass: Positive  # mass [kg]
     yaw_inertia: Positive  # about the vertical axis through the centre of gravity [kg m²]
     cg_to_front_axle: Positive  # distance from the centre of gravity [m]
     cg_to_rear_axle: Positive  # distance from the centre of gravity [m]
-    track: Positive  # distance of left and right wheels, of both axles [m]
-    cg_height: ZeroOrPositive  # [m]
-    wheel_radius: Positive  # [m]
-    wheel_inertia: Positive  # of one wheel with its shafts [kg m²]
-    motor_inertia: Positive  # of the motor and the gears, referred to the wheels [kg m²]
+    track: Positive  # distance between left and right wheels, of both axles [m]
+    cg_height: ZeroOrPositive  # height of the centre of gravity [m]
+    wheel_radius: Positive  # radius of the wheels [m]
+    wheel_inertia: Positive  # inertia of one wheel with its shafts [kg m²]
+    motor_inertia: Positive  # inertia of the motor and the gears, referred to the wheels [kg m²]
     torque_constant: Positive  # torque at the wheels, all four together, per motor current [N m/A]
     coulomb_torque: ZeroOrPositive  # friction of motor and gears, referred to the wheels [N m]
-    viscous_torque: ZeroOrPositive  # the same, proportional to the speed of the wheels [N m s/rad]
-    # of the front and of the rear differential: torque per difference of a wheel's speed to its
-    # axle's mean [N m s/rad]
+    # friction of motor and gears that is proportional to the speed of the wheels [N m s/rad]
+    viscous_torque: ZeroOrPositive
+    # lock of the front and of the rear differential: torque per difference of a wheel's speed to
+    # its axle's mean [N m s/rad]
     axle_lock: ZeroOrPositive
-    # of the centre differential: torque on a wheel per difference of its axle's mean speed to that
-    # of all [N m s/rad]
+    # lock of the centre differential: torque on a wheel per difference of its axle's mean speed to
+    # that of all [N m s/rad]
     centre_lock: ZeroOrPositive
-    air_drag: ZeroOrPositive  # force per square of the speed [N s²/m²]
+    air_drag: ZeroOrPositive  # drag force over the square of the speed [N s²/m²]
     friction: Positive  # peak friction of the tyres at a quarter of the weight [1]
     # relative loss of friction per relative gain of load [1]
     load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]
-    # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    # front axle: B of the magic formula sin(C atan(B s)), s the combined slip [1]
     stiffness_factor_front: Positive
-    # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    # rear axle: B of the magic formula sin(C atan(B s)), s the combined slip [1]
     stiffness_factor_rear: Positive
-    shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]  # its C [1]
-    relaxation_length: Positive  # of the tyres [m]
+    shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]  # C of the magic formula [1]
+    relaxation_length: Positive  # relaxation length of the tyres at small slip [m]
     carcass_damping: Share  # share of the slip that acts at once, without relaxation [1]
     roll_share_front: Share  # share of the lateral load transfer that the front axle takes [1]
     # time constant with which load transfer, roll and pitch follow the accelerations [s]
     load_time: Positive
-    roll_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
-    pitch_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
+    roll_gradient: ZeroOrPositive  # roll angle of the body over lateral acceleration [rad s²/m]
+    # pitch angle of the body over longitudinal acceleration [rad s²/m]
+    pitch_gradient: ZeroOrPositive
     largest_steer: Positive  # road-wheel angle at the stop [rad]
-    steering_rate: Positive  # of the servo, largest [rad/s]
+    steering_rate: Positive  # largest steering velocity of the servo [rad/s]
     steering_time: Positive  # time constant of the servo [s]
     current_time: Positive  # time constant of the motor's current [s]
-    largest_current: Positive  # either sign [A]
+    largest_current: Positive  # largest magnitude of the motor current [A]
 
     @property
     def wheelbase(self) -> float:
@@ -73,7 +75,7 @@ class PlanarCar:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """All values but the name."""
+        """All values except the name, by their names."""
         return {name: float(getattr(self, name)) for name in PARAMETERS}
 
 
@@ -84,11 +86,11 @@ PARAMETERS = tuple(
 
 @dataclass(frozen=True)
 class PlanarVehicle:
-    """A vehicle's configuration."""
+    """Content of a vehicle's configuration for the planar plant."""
 
-    name: str
-    plant: str
-    parameters: Annotated[dict[str, Any], "a mapping"]
+    name: str  # name of the vehicle
+    plant: str  # `PLANAR`
+    parameters: Annotated[dict[str, Any], "a mapping"]  # parameter of `PlanarCar` -> value
 
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:

@@ -26,11 +26,11 @@ from vehest.constants import GRAVITY
 
 
 class Regime(IntEnum):
-    """Which equations of planar motion hold."""
+    """Regime of the plant, by which equations of planar motion are chosen."""
 
-    ROLLING = 0
-    SLOW = 1
-    SLIDING = 2
+    ROLLING = 0  # multi-body equations with tyre formulas
+    SLOW = 1  # wheels roll without slip
+    SLIDING = 2  # locked wheels slide
 
 
 ROLLING, SLOW, SLIDING = (int(regime) for regime in Regime)
@@ -41,8 +41,8 @@ SLOW_BELOW = 1.0
 # forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime
 # does not flutter
 ROLLING_ABOVE = 1.2
-# how far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to
-# follow; assumed
+# largest deviation of lateral velocity [m/s] and yaw rate [rad/s] from rolling without slip at
+# which SLOW follows; assumed
 SLOW_TOLERANCE = 0.5
 SPUN_SIDESLIP = math.radians(60.0)
 """Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to
@@ -56,11 +56,12 @@ WHEEL_RELAXATION = 0.02  # time constant of wheels that start to roll freely, or
 SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes use of; assumed
 
 
+# indices in the library's state vector
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
-# places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear,
-# right rear by its names
-VY_FRONT = 15
-VY_REAR = 20
+VY_FRONT = 15  # index of the front axle's lateral velocity in the library's state vector
+VY_REAR = 20  # index of the rear axle's lateral velocity in it
+# index of the first wheel's speed; left front, right front, left rear, right rear by the library's
+# names
 FIRST_WHEEL = 23
 
 _kernel = numba.njit(
@@ -222,5 +223,8 @@ def _forces_needed(x, u, inputs, p):
 
 @_kernel
 def _coulomb(limit, vx, vy):
+    """Force of sliding friction (along, across) against a velocity, of magnitude ``limit`` [N]
+    beyond SLIDING_SMOOTHING.
+    """
     scale = -limit / math.sqrt(vx**2 + vy**2 + SLIDING_SMOOTHING**2)
     return scale * vx, scale * vy

@@ -18,29 +18,29 @@ from vehest.simulation.plant.multi_body import MultiBodyPlant
 
 @dataclass(frozen=True)
 class StabilityState:
-    """State of the control."""
+    """State of the stability control."""
 
-    reference: float = 0.0  # yaw rate that it follows [rad/s]
-    active: bool = False  # whether it intervenes
+    reference: float = 0.0  # yaw rate that the car is to follow [rad/s]
+    active: bool = False  # whether the control intervenes
     # yaw moment that it asks for, positive to the left [N m]; the plant's third input
     moment: float = 0.0
 
 
 @dataclass(frozen=True)
 class StabilityControl:
-    """A control fitted to a car; stability_control() makes one."""
+    """Stability control that is fitted to a car; `stability_control` makes one."""
 
-    wheelbase: float  # [m]
-    understeer_gradient: float  # of the linear single track [rad s²/m]
-    yaw_inertia: float  # [kg m²]
+    wheelbase: float  # distance between the axles [m]
+    understeer_gradient: float  # understeer gradient of the linear single track [rad s²/m]
+    yaw_inertia: float  # yaw inertia of the car [kg m²]
     grip: float  # lateral acceleration that friction allows on a dry road [m/s²]
-    largest_moment: float  # that braking one side may give on a dry road [N m]
+    largest_moment: float  # largest yaw moment of braking one side on a dry road [N m]
     # moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms,
     # and cars get all of the moment at about 7 degrees a second. With half of it, a car whose rear
     # slides is lost before the brakes are fully on.
     gain: float = 20.0
     on_above: float = 0.07  # error of the yaw rate at which it intervenes [rad/s]; assumed
-    off_below: float = 0.03  # error at which it lets go again [rad/s]; assumed
+    off_below: float = 0.03  # error below which it stops intervening [rad/s]; assumed
     lag: float = 0.1  # time constant of the reference [s]; assumed
     slowest: float = 5.0  # speed below which it does nothing [m/s]; assumed
 

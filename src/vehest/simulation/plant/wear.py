@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat
 
-Share = Annotated[float, Field(ge=0.0, le=0.5)]
+Share = Annotated[float, Field(ge=0.0, le=0.5)]  # number from 0 to 0.5
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,11 @@ class Stint:
     cold: Share = 0.0  # share that cold tyres lack at the first sample
     warm_time: PositiveFloat = 120.0  # time constant of warming up [s]
     wear: Share = 0.0  # share that is lost over ``wear_time``
-    wear_time: PositiveFloat = 1200.0  # [s]
+    wear_time: PositiveFloat = 1200.0  # time over which ``wear`` is lost [s]
 
     def friction_at(self, time: float) -> float:
-        """The factor at a time after the first sample [s]; before it, that of the first.
+        """Factor of the tyres' friction at a time after the first sample [s]; before it, that of
+        the first.
 
         Returns
         -------

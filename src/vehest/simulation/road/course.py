@@ -15,7 +15,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.road.segments import Compound, Corner, Segment, Straight
 from vehest.simulation.road.tracks import LAYOUTS, Layout
 
-SPACING = 1.0  # of the samples of a course at most [m]
+SPACING = 1.0  # largest distance between the samples of a course [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,19 +24,19 @@ class Course:
     the same place.
     """
 
-    name: str  # in recordings
-    arc_length: FloatArray  # (N,) [m], uniform
-    x: FloatArray  # (N,) [m]
-    y: FloatArray  # (N,) [m]
-    heading: FloatArray  # (N,), not wrapped [rad]
-    curvature: FloatArray  # (N,), positive to the left [1/m]
-    bank: FloatArray  # (N,), positive with the left side higher [rad]
-    grade: FloatArray  # (N,), positive downhill [rad]
+    name: str  # name of the course in recordings
+    arc_length: FloatArray  # distance along the line, (N,) [m], uniform
+    x: FloatArray  # position, (N,) [m]
+    y: FloatArray  # position, (N,) [m]
+    heading: FloatArray  # heading, (N,), not wrapped [rad]
+    curvature: FloatArray  # curvature, (N,), positive to the left [1/m]
+    bank: FloatArray  # bank of the road, (N,), positive with the left side higher [rad]
+    grade: FloatArray  # grade of the road, (N,), positive downhill [rad]
     friction: FloatArray  # (N,), scale of the tyres' friction on the dry road
 
     @property
     def length(self) -> float:
-        """Once around [m]."""
+        """Length of a lap [m]."""
         return float(self.arc_length[-1])
 
     @property
@@ -175,6 +175,7 @@ class _HeadingProfile:
         self._headings = np.concatenate([[0.0], np.cumsum(areas)])
 
     def __call__(self, arc_length: FloatArray) -> FloatArray:
+        """Heading at these arc lengths [m], likewise an array [rad]."""
         before = np.clip(
             np.searchsorted(self._nodes, arc_length, side="right") - 1, 0, len(self._nodes) - 2
         )

@@ -12,7 +12,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vehest.constants import FloatArray
 
-SPACING = 0.5  # of the samples of a line [m]
+SPACING = 0.5  # distance between the samples of a line [m]
 CLEARANCE = 0.15  # room between the car and a cone [m]; assumed
 _KNOTS = 1.5  # spacing of the points that are sought for the smoothest line [m]
 # length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth
@@ -22,23 +22,23 @@ _SMOOTH = 6.0
 
 @dataclass(frozen=True)
 class Gate:
-    """A stretch along the x axis between two rows of cones."""
+    """A segment along the x axis between two rows of cones."""
 
-    begin: float  # of the stretch [m]
-    end: float  # of the stretch [m]
-    right: float = -math.inf  # lateral place of the row [m]; infinite where there is none
-    left: float = math.inf  # lateral place of the row [m]; infinite where there is none
+    begin: float  # start of the segment [m]
+    end: float  # end of the segment [m]
+    right: float = -math.inf  # lateral position of the right row [m]; infinite where there is none
+    left: float = math.inf  # lateral position of the left row [m]; infinite where there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
     """A path for a car, sampled every ``SPACING`` metres along itself; arrays of shape (N,)."""
 
-    distance: FloatArray  # [m]
-    x: FloatArray  # [m]
-    y: FloatArray  # [m]
-    heading: FloatArray  # not wrapped [rad]
-    curvature: FloatArray  # positive to the left [1/m]
+    distance: FloatArray  # distance along the line [m]
+    x: FloatArray  # position [m]
+    y: FloatArray  # position [m]
+    heading: FloatArray  # heading, not wrapped [rad]
+    curvature: FloatArray  # curvature, positive to the left [1/m]
 
 
 @lru_cache(maxsize=64)
@@ -138,12 +138,14 @@ def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) ->
 
 
 _PENALTY = 0.03  # penalty of the alternating direction method; the solution does not depend on it
-_TOLERANCE = 1e-4  # of constraint and change, in the unit of y
-_MAX_ITERATIONS = 3000  # after these the iteration ends without an error
+_TOLERANCE = 1e-4  # tolerance of constraint and change, in the unit of y
+_MAX_ITERATIONS = 3000  # largest number of iterations; then the iteration ends without an error
 
 
 def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) -> Line:
-    """A line at equal distances along itself, straight outside ``places``."""
+    """The line through lateral positions at ``places`` [m], sampled at equal distances along
+    itself, straight outside them.
+    """
     offset = CubicSpline(places, lateral, bc_type="clamped")
     x = np.arange(begin, end, 0.1)
     inside = np.clip(x, places[0], places[-1])

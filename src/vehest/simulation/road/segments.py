@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-Piece = tuple[
-    float, float, float
-    # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are
-    # linear
-]
+# length [m] of a segment along which curvature and bank are linear, then curvature [1/m] and bank
+# [rad] at its end
+Piece = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Straight:
     """A straight; its length [m] is nominal, see build_course."""
 
-    length: float
+    length: float  # nominal length [m]
 
     @property
     def angle(self) -> float:
@@ -32,20 +30,20 @@ class Straight:
 class Corner:
     """A corner: clothoid, circular arc, clothoid."""
 
-    radius: float  # of the arc [m]
+    radius: float  # radius of the arc [m]
     angle: float  # change of heading, positive to the left [rad]
     transition: float  # length of each clothoid [m]
-    # of the arc, growing along the clothoids; positive with the inner side lower [rad]
+    # bank of the arc, growing along the clothoids; positive with the inner side lower [rad]
     banking: float = 0.0
 
     @property
     def bank(self) -> float:
-        """Of the arc, positive with the left side higher [rad]."""
+        """Bank of the arc, positive with the left side higher [rad]."""
         return -math.copysign(self.banking, self.angle)
 
     @property
     def curvature(self) -> float:
-        """Of the arc, positive to the left [1/m]."""
+        """Curvature of the arc, positive to the left [1/m]."""
         return math.copysign(1.0 / self.radius, self.angle)
 
     @property
@@ -98,7 +96,7 @@ class Compound:
         ].pieces()[2:]
 
 
-Segment = Straight | Corner | Compound
+Segment = Straight | Corner | Compound  # segment of a course
 
 
 def left(radius: float, degrees: float, transition: float, banking: float = 0.0) -> Corner:

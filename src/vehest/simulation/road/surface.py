@@ -14,7 +14,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
 
-_STREAM = 2  # of a drive's seed; 0 is the driver's, 1 the sensors'
+_STREAM = 2  # random stream of the surface in a drive's seed; 0 is the driver's, 1 the sensors'
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class Surface:
         A scale is outside 0.05 … 1.5 or a length makes no sense.
     """
 
-    name: str = "dry"  # in recordings
+    name: str = "dry"  # name of the surface in recordings
     # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
     friction: float = 1.0
-    patches: float | None = None  # lowest scale of a patch
+    patches: float | None = None  # lowest scale of a patch; None: no patches
     patch_length: tuple[float, float] = (20.0, 80.0)  # shortest and longest patch [m]
-    # of the patches; by default the drive's
+    # seed of the patches; None: that of the drive
     seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None
 
     def __post_init__(self) -> None:

@@ -12,12 +12,13 @@ from vehest.simulation.road.segments import Compound, Segment, Straight, left, r
 class Layout:
     """Layout of a course."""
 
-    segments: tuple[Segment, ...]  # in the order they are driven
+    segments: tuple[Segment, ...]  # segments in the order in which they are driven
     # bank of the road all along, positive with the left side higher [rad]; corners add their own
     crossfall: float = 0.0
-    # (share of the lap, height [m]), in ascending order; none is a level course
+    # (share of the lap, height [m]), in ascending order; empty: a level course
     heights: tuple[tuple[float, float], ...] = ()
-    # (share of the lap where it begins, where it ends, scale of the tyres' friction); 1 elsewhere
+    # (share of the lap at its start, at its end, scale of the tyres' friction) of each patch; 1
+    # elsewhere
     friction: tuple[tuple[float, float, float], ...] = ()
 
 
@@ -163,4 +164,4 @@ LAYOUTS: dict[str, Layout] = {
     "fast_circuit": FAST_CIRCUIT,
     "hill_circuit": HILL_CIRCUIT,
 }
-"""Layouts by name."""
+"""Name of a course -> its layout."""

@@ -19,7 +19,7 @@ from vehest.simulation.sensors.levels import (
     without_errors,
 )
 
-OFF = "off"  # switches errors off; YAML reads False, a command line the text
+OFF = "off"  # word that switches errors off; YAML reads False, a command line the text
 
 
 def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:

@@ -70,7 +70,7 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def delayed(samples: FloatArray, delay: float) -> FloatArray:
-    """Samples (T,) as they were ``delay`` samples ago, held before the first one.
+    """Samples (T,) delayed by ``delay`` sampling intervals, held before the first one.
 
     Between samples by the cubic through the four nearest (Lagrange): half way between two, a sine
     of a tenth of the sampling rate loses 0.4 % of its amplitude and nothing of its phase.

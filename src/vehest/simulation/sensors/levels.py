@@ -15,7 +15,7 @@ class Errors:
     `ConfigurationError` otherwise.
     """
 
-    signed: ClassVar[tuple[str, ...]] = ()
+    signed: ClassVar[tuple[str, ...]] = ()  # names of the fields that may be negative
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -44,13 +44,13 @@ class SensorLevel(Errors):
         As `Errors` does, or the correlation time is zero.
     """
 
-    signed: ClassVar[tuple[str, ...]] = ("gain", "bias")
+    signed: ClassVar[tuple[str, ...]] = ("gain", "bias")  # names of the fields that may be negative
     noise: float = 0.0  # density of the white noise [unit/√Hz]
     offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
     # standard deviation of a first-order Gauss-Markov process that is stationary from the first
     # sample on [unit]
     drift: float = 0.0
-    drift_time: float = 300.0  # its correlation time [s]
+    drift_time: float = 300.0  # correlation time of the drift [s]
     quantisation: float = 0.0  # step of the values shown [unit]
     delay: float = 0.0  # age of what is shown; the first value is held before the start [s]
     scale: float = 0.0  # standard deviation of a relative error that is drawn for each drive [1]
@@ -65,46 +65,48 @@ class SensorLevel(Errors):
 
 @dataclass(frozen=True)
 class Mounting(Errors):
-    """Where the inertial unit sits and how it is turned against the body."""
+    """Place and orientation of the inertial unit in the body."""
 
+    # names of the fields that may be negative
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z", "roll", "pitch", "yaw")
-    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
-    lever_y: float = 0.0  # its place left of the centre of gravity [m]
-    lever_z: float = 0.0  # its place above the centre of gravity [m]
-    roll: float = 0.0  # of its axes against the body's, right-handed [rad]
-    pitch: float = 0.0  # of its axes against the body's, right-handed [rad]
-    yaw: float = 0.0  # of its axes against the body's, right-handed [rad]
+    lever_x: float = 0.0  # position of the unit forward of the centre of gravity [m]
+    lever_y: float = 0.0  # position of the unit left of the centre of gravity [m]
+    lever_z: float = 0.0  # position of the unit above the centre of gravity [m]
+    roll: float = 0.0  # roll of the unit's axes against the body's, right-handed [rad]
+    pitch: float = 0.0  # pitch of the unit's axes against the body's, right-handed [rad]
+    yaw: float = 0.0  # yaw of the unit's axes against the body's, right-handed [rad]
     # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
     misalignment: float = 0.0
 
 
 @dataclass(frozen=True)
 class Tilt(Errors):
-    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others
-    are zero.
+    """Angles that tilt the inertial unit, so that gravity leaks into the accelerometers; others are
+    zero.
     """
 
-    signed: ClassVar[tuple[str, ...]] = ("roll_share",)
-    # of the body against the road; also makes the gyros measure about the body's axes instead of
-    # the road's
+    signed: ClassVar[tuple[str, ...]] = ("roll_share",)  # names of the fields that may be negative
+    # whether the body's roll counts; it also makes the gyros measure about the body's axes instead
+    # of the road's
     roll: bool = True
-    pitch: bool = True  # likewise
-    bank: bool = True  # of the road
-    grade: bool = True  # of the road
-    # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one
-    # that corrects too much a negative share
+    pitch: bool = True  # whether the body's pitch counts; likewise
+    bank: bool = True  # whether the road's bank counts
+    grade: bool = True  # whether the road's grade counts
+    # share of the body's roll that leaks; an installation that corrects for roll leaves less than
+    # 1, one that corrects too much a negative share
     roll_share: float = 1.0
 
 
 @dataclass(frozen=True)
 class Vibration(Errors):
-    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean
-    speed.
+    """Vibration of the inertial unit by turning wheels: white noise whose standard deviation grows
+    with their mean speed.
     """
 
-    yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
-    ax: float = 0.0  # the same [m/s² per rad/s]
-    ay: float = 0.0  # the same [m/s² per rad/s]
+    # standard deviation of a sample of the yaw rate over the speed of the wheels [1]
+    yaw_rate: float = 0.0
+    ax: float = 0.0  # the same of the longitudinal acceleration [m/s² per rad/s]
+    ay: float = 0.0  # the same of the lateral acceleration [m/s² per rad/s]
 
 
 @dataclass(frozen=True)
@@ -122,18 +124,18 @@ class Reference(Errors):
         As `Errors` does, or heading has errors without a meaning.
     """
 
+    # names of the fields that may be negative
     signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
-    # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
-    kind: str = "ideal"
+    kind: str = "ideal"  # kind of sensor: ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
     vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
-    vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
+    vy: SensorLevel = SensorLevel()  # errors of the velocity along its y axis [m/s]
     yaw_rate: SensorLevel = SensorLevel()  # errors of its gyro [rad/s]
     # errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning
     # here
     heading: SensorLevel = SensorLevel()
-    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
-    lever_y: float = 0.0  # its place left of the centre of gravity [m]
-    lever_z: float = 0.0  # its place above the centre of gravity [m]
+    lever_x: float = 0.0  # position of the sensor forward of the centre of gravity [m]
+    lever_y: float = 0.0  # position of the sensor left of the centre of gravity [m]
+    lever_z: float = 0.0  # position of the sensor above the centre of gravity [m]
     # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
     lever_error: float = 0.0
 
@@ -187,17 +189,21 @@ MOTION_CAPTURE = Reference(
 )
 """Cameras around a small test area: markers' poses, differentiated."""
 
+# kind -> reference
 REFERENCES: dict[str, Reference] = {
     reference.kind: reference for reference in (OPTICAL, GNSS, MOTION_CAPTURE, Reference())
 }
 
 
+# errors of a gyro of a production car
 _GYRO = SensorLevel(
     noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01
 )
+# errors of an accelerometer of a production car
 _ACCELEROMETER = SensorLevel(
     noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01
 )
+# errors of a wheel force sensor
 _WHEEL_FORCE = SensorLevel(
     noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005
 )
@@ -278,10 +284,11 @@ class SensorLevels:
     speed_of_wheels: bool = False
 
 
+# names of fields that are no errors and stay when the others are switched off
 NO_ERRORS = (
     "kind",
     "drift_time",
-)  # fields that are no errors and stay when the others are switched off
+)
 
 
 def without_errors(level: Any) -> Any:
@@ -307,7 +314,7 @@ def without_errors(level: Any) -> Any:
 
 
 def _gyros(level: SensorLevel) -> dict[str, Any]:
-    """The level of the yaw rate's gyro for all three, assumed for the other two."""
+    """Levels of the three gyros by name: that of the yaw rate's, assumed for the other two."""
     return {"yaw_rate": level, "roll_rate": level, "pitch_rate": level}
 
 
@@ -372,6 +379,7 @@ SMALL_CAR = SensorLevels(
 """A model race car of 5 kg: little noise at rest, an inertial unit that shakes with the wheels."""
 
 
+# name of a preset -> levels
 PRESETS: dict[str, SensorLevels] = {
     "default": SensorLevels(),
     "race": RACE,

@@ -17,7 +17,7 @@ from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.sensors.errors import sensor_signal, stream
 from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
 
-OF_MOTOR = ("motor_speed", "motor_current")
+OF_MOTOR = ("motor_speed", "motor_current")  # channels of an electric motor
 
 
 def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
@@ -96,7 +96,7 @@ _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, 
 
 
 def _without_idle(value: Any) -> Any:
-    """A mapping, and those inside it, without entries that have the value of _IDLE."""
+    """A mapping, and those inside it, without entries that have a value of `_IDLE`."""
     if not isinstance(value, dict):
         return value
     return {

@@ -24,7 +24,7 @@ from vehest.sources.clocks import require_clock
 from vehest.sources.columns import ColumnName
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
-EXTENDED = 1 << 31  # of an identifier's number in a DBC
+EXTENDED = 1 << 31  # bit of an extended identifier in the number that a DBC writes
 GROUP_OF_J1939 = 0x03FFFF00  # bits of an identifier without priority and source address
 
 
@@ -32,8 +32,9 @@ GROUP_OF_J1939 = 0x03FFFF00  # bits of an identifier without priority and source
 class CanOptions(SignalOptions):
     """Options of the source, by type; None leaves an option open."""
 
-    files: str = "*.asc"
-    dbc: str | None = None
+    files: str = "*.asc"  # pattern of the logs in ``path``
+    dbc: str | None = None  # file that describes the messages
+    # number or name of the bus whose frames are read; None: all
     bus: Annotated[int | str | None, "number or name of a bus, as the log counts them"] = None
 
 
@@ -41,6 +42,7 @@ class CanOptions(SignalOptions):
 class CanChannel(SignalChannel):
     """A channel's signal, with raw values that mean that nothing was measured."""
 
+    # raw values that mean that nothing was measured
     invalid: Annotated[int | tuple[int, ...], "raw values that mean 'not measured'"] = ()
     sign_column: ColumnName | None = None  # signal of the message, 1 where values are negative
 
@@ -49,13 +51,14 @@ class CanChannel(SignalChannel):
 class ChannelSignal:
     """The signal that becomes a channel."""
 
-    message: Message  # that carries it
-    signal: str
-    invalid: frozenset[float] = (
-        frozenset()
-    )  # values that mean that nothing was measured, in the unit of the DBC
-    reserved: tuple[float, float] = (math.nan, math.nan)  # range of further ones, likewise
-    sign_signal: str | None = None  # of the same message: 1 where the value is negative
+    message: Message  # message that carries the signal
+    signal: str  # name of the signal
+    # values that mean that nothing was measured, in the unit of the DBC
+    invalid: frozenset[float] = frozenset()
+    # lowest and highest value of a range that means the same, in the unit of the DBC
+    reserved: tuple[float, float] = (math.nan, math.nan)
+    # signal of the same message that is 1 where the value is negative
+    sign_signal: str | None = None
 
     @property
     def signals(self) -> set[str]:
@@ -157,6 +160,7 @@ class CanSource(SignalSource):
         return database, by_channel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
+        """The signal of each channel, and an entry for the provenance, as of `SignalSource`."""
         database, by_channel = self.signals_of_channels()
         bus = self.options.bus
         stamps, values = ({name: array("d") for name in by_channel} for _ in range(2))
@@ -301,7 +305,7 @@ def is_on(frame: Any, bus: int | str | None) -> bool:
 def never_occurs(
     file: Path, channel: str, signal: ChannelSignal, count: int, bus: int | str | None
 ) -> str:
-    """Error text for a signal that a log does not hold.
+    """Text of the error for a signal that a log does not hold.
 
     Parameters
     ----------
@@ -328,8 +332,8 @@ def never_occurs(
 
 
 def other_sources(frames: Frames, messages: Sequence[Any]) -> str:
-    """Further error text where frames of a J1939 message of the DBC, as cantools describes it, come
-    from other source addresses than the DBC says.
+    """Further text of this error where frames of a J1939 message of the DBC, as cantools describes
+    it, come from other source addresses than the DBC says.
     """
     arrays = frames.arrays
     identifiers = np.unique(arrays["identifier"][arrays["extended"] == 1])

@@ -20,10 +20,11 @@ from vehest.data.text_files import first_line
 from vehest.sources.limited import require_package
 from vehest.sources.not_measured import marks_not_measured
 
-COMPARED = 10_000  # names that a misspelt one is compared with
-RESERVED_BYTE = 0xFB  # of J1939-71: from here on a value in the highest byte is none
-RESERVED_LENGTHS = (8, 12, 16, 24, 32)  # bits
-UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
+COMPARED = 10_000  # largest number of names with which a misspelt one is compared
+RESERVED_BYTE = 0xFB  # smallest highest byte of a value that J1939-71 reserves
+RESERVED_LENGTHS = (8, 12, 16, 24, 32)  # bits, lengths of signals that have reserved values
+UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"  # name of the message of signals that no message sends
+# matches messages and signals of a DBC that are too long for cantools' lists
 _TOO_LONG = re.compile(
     r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})"
 )
@@ -33,15 +34,15 @@ _TOO_LONG = re.compile(
 class Message:
     """A message of which signals are wanted."""
 
-    described: Any  # by cantools
+    described: Any  # message as cantools describes it
     units: Mapping[str, str]  # wanted signal -> its unit as the DBC writes it
-    coders: Sequence[
-        Any
-    ]  # of cantools: one for all signals that every frame carries, one for each that is multiplexed
+    # coders of cantools: one for all signals that every frame carries, and one for each that is
+    # multiplexed
+    coders: Sequence[Any]
 
     @property
     def name(self) -> str:
-        """Its name in the DBC."""
+        """Name of the message in the DBC."""
         return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
@@ -126,14 +127,14 @@ def _is_outside(described: Any, value: float) -> bool:
 class Database:
     """Messages of a DBC that hold wanted signals."""
 
-    file: Path
-    messages: Mapping[tuple[int, bool], Message]  # by identifier and whether it is extended
+    file: Path  # the DBC
+    messages: Mapping[tuple[int, bool], Message]  # (identifier, whether it is extended) -> message
     places: Mapping[str, tuple[Message, str]]  # wanted name -> its message and signal
     identifiers: frozenset[tuple[int, bool]]  # identifiers of all messages in the file
 
 
 def read_dbc(file: Path) -> list[Any]:
-    """All messages of a DBC, as cantools holds them.
+    """Messages of a DBC, as cantools holds them.
 
     The text is UTF-8, or else Windows-1252. Signals that no message sends are left out.
 
@@ -176,7 +177,7 @@ def read_dbc(file: Path) -> list[Any]:
 
 
 def read_database(file: Path, selected: Sequence[str]) -> Database:
-    """What a DBC says of wanted signals.
+    """Messages of a DBC that carry wanted signals.
 
     Parameters
     ----------

@@ -15,8 +15,10 @@ from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.limited import Arrays, read_limited, require_package
 
-FRAMES_AT_A_TIME = 1 << 14  # as Python's numbers, which take ten times what they take in an array
-SUFFIXES = (".asc", ".blf", ".log", ".trc")
+# frames that are converted to Python's numbers at a time, which take ten times the memory of an
+# array
+FRAMES_AT_A_TIME = 1 << 14
+SUFFIXES = (".asc", ".blf", ".log", ".trc")  # endings of logs
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,10 @@ class Frames:
     Iterated over as messages of python-can.
     """
 
-    file: Path
-    arrays: Arrays  # as `vehest.sources.readers.can_logs.read_frames` returns them
-    buses: list[Any]  # names or numbers
-    cut_line: str = ""  # the last line of a text, which has no end and was left out
+    file: Path  # the log
+    arrays: Arrays  # frames as `vehest.sources.readers.can_logs.read_frames` returns them
+    buses: list[Any]  # names or numbers of the buses
+    cut_line: str = ""  # last line of a text, which is incomplete and was left out
 
     def __iter__(self) -> Iterator[Any]:
         """Messages of python-can, made `FRAMES_AT_A_TIME` at a time."""
@@ -56,7 +58,7 @@ class Frames:
 
     @property
     def cut_end(self) -> str:
-        """What of the log was not read, as text; empty where all was."""
+        """Text on the part of the log that was not read; empty where all was."""
         return f"last line '{self.cut_line}', which has no end" if self.cut_line else ""
 
     @property

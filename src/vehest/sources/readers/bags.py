@@ -34,9 +34,9 @@ apsw.connection_hooks.append(
     lambda connection: connection.pragma("temp_store", "memory")
 )  # SQLite may write no file
 
-TEXTS = frozenset({"string", "wstring", "byte", "char"})
-ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
-LATEST = 2**62  # ns of unix time: 146 years
+TEXTS = frozenset({"string", "wstring", "byte", "char"})  # types of fields that are no numbers
+ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)  # types of nodes of arrays
+LATEST = 2**62  # latest time, ns of unix time: 146 years
 
 Topic = Sequence[Any]  # name, message type, paths of fields
 
@@ -44,7 +44,7 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 def read_topics(
     bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All messages of topics, in the order in which the bag received them.
+    """Messages of topics, in the order in which the bag received them.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def read_topics(
 def survey_topics(
     bag: Path, ignored: Sequence[str], most_fields: int
 ) -> tuple[Arrays, dict[str, Any]]:
-    """All topics whose messages are of ROS's own types, with their plain numbers.
+    """Topics whose messages are of ROS's own types, with their plain numbers.
 
     Parameters
     ----------
@@ -146,6 +146,7 @@ class _UriPath(type(Path())):  # type: ignore[misc]
     """A path that rosbags can write into the URI of a SQLite database."""
 
     def __format__(self, _: str) -> str:
+        """The path, percent-encoded."""
         return quote(os.fsencode(self), safe="/:\\")
 
 
@@ -283,7 +284,9 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
 
 
 def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
-    """What the bag holds of a topic; its type and layout are those that are declared."""
+    """Connections of a bag for a topic, whose type and layout are checked against the declared
+    ones.
+    """
     connections = [connection for connection in reader.connections if connection.topic == name]
     if not any(connection.msgcount for connection in connections):
         topics = printable(

@@ -21,17 +21,20 @@ from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
-LATEST = 1e11  # s
-FRAME = re.compile(r"\s*(\(|\d)")  # begins as a line that holds one
-DATE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{6}")
+LATEST = 1e11  # latest time stamp [s]
+FRAME = re.compile(r"\s*(\(|\d)")  # matches the start of a line that holds a frame
+DATE = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{6}")  # matches a date and time
+# matches the stamp at the start of a line of an .asc [s]
 EVENT = re.compile(r"\s*(\d+\.\d+)(?=\s)")
-# stamp at the head of a line of candump [s]
-DELTA = re.compile(r"\s*\((\d+\.\d+)\)")
-# share of stamps that are smaller than the one before, above which they count from the last frame
+DELTA = re.compile(r"\s*\((\d+\.\d+)\)")  # matches the stamp at the start of a line of candump [s]
+# share of stamps that are smaller than the one before, above which stamps count from the last frame
 MIN_DECREASE_SHARE = 0.1
-N_JUDGED_STAMPS = 2000  # first stamps of a log that decide this
-REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")  # to send, sent as Tx later
+N_JUDGED_STAMPS = 2000  # number of first stamps of a log by which this is decided
+# matches a frame that is to be sent, which is logged as Tx when it is sent
+REQUEST = re.compile(r"\s*\d+\.\d+\s+(CANFD\s+)?\d+\s+(\S+\s+)?TxRq\s")
+# matches a frame with a name in place of its identifier
 NAMED = re.compile(r"\s*\d+\.\d+\s+\d+\s+(?![0-9A-Fa-f]+x?\s)(\w+)\s+[RT]x\s")
+# matches a line that candump writes on the screen
 ON_SCREEN = re.compile(
     r"\s*\((?P<time>[\d.: -]+)\)\s+(?P<bus>\S+)\s+([RT]X\s+\S\s*\S\s+)?"
     r"(?P<identifier>[\dA-F]{3,8})\s+"
@@ -143,6 +146,7 @@ class _LogText(TextIOWrapper):
         self.cut_line = ""  # the last one, where it has no end and is left out
 
     def __next__(self) -> str:  # type: ignore[override]
+        """The next line that python-can understands."""
         line = super().__next__()
         if line.endswith("\n"):
             return line
@@ -163,6 +167,7 @@ class _VectorText(_LogText):
         self.elapsed = 0.0
 
     def __next__(self) -> str:  # type: ignore[override]
+        """The next line, its stamp counted from the start of the measurement."""
         line = super().__next__()
         if self.is_relative and (event := EVENT.match(line)):
             self.elapsed += float(event[1])
@@ -206,6 +211,7 @@ class _CandumpText(_LogText):
         self.elapsed = 0.0
 
     def __next__(self) -> str:  # type: ignore[override]
+        """The next line as candump's log has it."""
         line = super().__next__()
         if self.is_relative and (stamp := DELTA.match(line)):
             self.elapsed += float(stamp[1])

@@ -36,8 +36,8 @@ EVALUATED = {
     },
     v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_ALG},
 }
-"""Conversions that refuse a file: formulas, and those of version 3 that readers compute in
-contradicting ways.
+"""Types of conversion for which a file is refused: formulas, and those of version 3 that readers
+compute in contradicting ways.
 """
 RANGES = {
     v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_TABX, v3.CONVERSION_TYPE_RTABX},
@@ -47,10 +47,13 @@ RANGES = {
         v4.CONVERSION_TYPE_RTABX,
     },
 }
-"""Conversions for which whole numbers differ from real ones: they belong to both ends of a range.
+"""Types of conversion by ranges, for which whole numbers differ from real ones: whole numbers
+belong to both ends of a range.
 """
-OPTIONS: Any = {"process_bus_logging": False}  # which would read databases that are attached
-COMPARED = 10_000  # names that a misspelt one is compared with
+# options with which asammdf opens a file: databases that are attached are not read
+OPTIONS: Any = {"process_bus_logging": False}
+COMPARED = 10_000  # largest number of names with which a misspelt one is compared
+# names of channels that hold raw frames of a bus
 BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 
 
@@ -233,6 +236,7 @@ def _refuse_formulas(measurement: Any, file: Path) -> None:
 
 
 def _conversions(conversion: Any) -> Iterator[Any]:
+    """A conversion and those inside it."""
     waiting = [conversion]
     visited = set()
     while waiting:
@@ -445,7 +449,7 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, location: str) -> 
 
 
 def _measured(value: Any) -> Any:
-    """A value of a conversion; NaN for a text that says that nothing was measured."""
+    """Result of a conversion; NaN for a text that says that nothing was measured."""
     text = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
     return math.nan if isinstance(text, str) and marks_not_measured(text) else value
 

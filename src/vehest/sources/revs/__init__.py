@@ -25,23 +25,26 @@ from vehest.sources.revs.csv_layout import read_csv, read_vehicle_parameters
 from vehest.sources.tables import TextLayout, read_columns
 from vehest.sources.unit_spellings import require_unit
 
-SUFFIXES = {"csv": ".csv", "text": ""}
+SUFFIXES = {"csv": ".csv", "text": ""}  # layout -> ending of a recording's file
 
 
 @dataclass(frozen=True)
 class RevsOptions:
     """Options of the source; docs/sources/revs.md describes them."""
 
-    layout: Literal["csv", "text"]
-    path: str | None = None
+    layout: Literal["csv", "text"]  # layout of the files
+    path: str | None = None  # folder of the recordings
+    # names of the recordings; None: those whose files match ``files``
     recordings: tuple[str, ...] | None = None
-    files: str | None = None
-    vehicle_parameters: str | None = None
-    time: dict[str, Any] | None = None
-    channels: ChannelMap | None = None
-    clock: ClockPolicy = "strict"
-    gappy: ChannelNames | None = None
+    files: str | None = None  # pattern of the files
+    vehicle_parameters: str | None = None  # name of the table of vehicle parameters
+    time: dict[str, Any] | None = None  # declaration of the column of times
+    channels: ChannelMap | None = None  # channel -> its column and unit
+    clock: ClockPolicy = "strict"  # treatment of uneven time stamps
+    gappy: ChannelNames | None = None  # channels that may have gaps
+    # number of lines about the drive above the names
     preamble_lines: Annotated[int, Field(ge=0, le=100)] = 10
+    # whether the units of the file are compared with the declared ones
     units_row: Literal["check", "ignore"] = "check"
 
 
@@ -177,6 +180,7 @@ class RevsSource(FileSource):
         return values
 
     def _folder(self) -> Path:
+        """Folder of the recordings; raises an error where it is not there."""
         return existing_folder(self.dataset.get("path"), self.name)
 
     def _path(self, recording_id: str) -> Path:

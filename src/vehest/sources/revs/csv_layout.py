@@ -22,7 +22,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.sources.tables import TextLayout, listed, read_columns, read_head, require_columns
 
-LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but broken
+# largest share of rows before a column begins; one that begins later is not slow but broken
+LONGEST_HEAD = 0.5
 
 
 def read_csv(
@@ -180,7 +181,7 @@ def _decoded(content: bytes) -> str:
 
 
 def _number(text: str) -> float | None:
-    """A finite number; None for any other text."""
+    """A finite number from text; None for any other text."""
     try:
         value = float(text)
     except ValueError:

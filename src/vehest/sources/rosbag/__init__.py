@@ -36,22 +36,23 @@ from vehest.sources.pose import ground_plane
 from vehest.sources.rosbag.declarations import Pose, RosbagOptions, Topic
 from vehest.sources.rosbag.topics import STORAGES, bag_files, read_bag
 
-# fields of a pose: position [m], then the quaternion
+# paths of a pose's fields: position [m], then the quaternion
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(
     f"orientation.{axis}" for axis in "xyzw"
 )
-MOST_WANDERING = 0.4  # of the grid's interval, that uniform stamps may be away from an even clock
+# largest deviation of uniform stamps from an even clock, over the interval of the recording
+MOST_WANDERING = 0.4
 
 
 @dataclass(frozen=True)
 class Series:
     """A topic's samples with their times."""
 
-    topic: Topic
-    times: FloatArray  # less the declared delay [s], shape (T,)
-    rate_hz: float | None  # of an even clock [Hz]; None where the stamps are the times
+    topic: Topic  # declaration of the topic
+    times: FloatArray  # times of the samples, less the declared delay [s], shape (T,)
+    rate_hz: float | None  # rate of an even clock [Hz]; None where the stamps are the times
     fields: Mapping[str, FloatArray]  # path -> values, shape (T,)
-    about: Mapping[str, Any]  # what was made of the stamps, for the provenance
+    about: Mapping[str, Any]  # provenance: what was made of the stamps
 
 
 class RosbagSource(FileSource):
@@ -160,6 +161,7 @@ class RosbagSource(FileSource):
         return bags
 
     def _id_of(self, file: Path) -> str:
+        """Name of a bag's recording: that of the folder, or the stem of the file."""
         return file.name if file.is_dir() else file.stem
 
     def _series(self, topic: Topic, fields: Iterable[str], reading: Reading, path: Path) -> Series:

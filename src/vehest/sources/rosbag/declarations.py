@@ -15,23 +15,21 @@ from vehest.sources.pose import PoseOptions, UpAxis
 
 @dataclass(frozen=True)
 class Topic:
-    """How a topic's samples come by their times."""
+    """Declaration of a topic, and of how its samples get their times."""
 
-    topic: str  # its name in the bag
-    type: str  # of its messages
-    stamps: Literal["header", "received"] = "header"  # of the message or of the bag
-    clock: Literal["stamps", "uniform"] = (
-        "stamps"  # the stamps themselves, or the even clock behind them
-    )
+    topic: str  # name of the topic in the bag
+    type: str  # type of its messages
+    # whose time stamps are used: those of the messages' headers, or those of the bag
+    stamps: Literal["header", "received"] = "header"
+    # whether the stamps are the times, or the even clock behind them
+    clock: Literal["stamps", "uniform"] = "stamps"
     rate_hz: Positive | None = None  # nominal rate of a uniform clock [Hz]
     max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
-    delay: float = 0.0  # how much later than the sample its time says [s]
-    interpolation: Literal["linear", "hold"] = (
-        "linear"  # hold: for commands that stand until the next one
-    )
-    average: Annotated[float, Field(ge=0.0, le=10.0)] = (
-        0.0  # width of a centred moving average before interpolation [s]; 0 for none
-    )
+    delay: float = 0.0  # time by which the stamps are later than the samples [s]
+    # whether samples are interpolated, or hold until the next one, as commands do
+    interpolation: Literal["linear", "hold"] = "linear"
+    # width of a centred moving average before interpolation [s]; 0: none
+    average: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:
@@ -44,40 +42,43 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagChannel:
-    """Where a channel comes from: sign · factor · (field - offset), in ``unit``."""
+    """Declaration of a channel: sign · factor · (field - offset), in ``unit``."""
 
-    topic: str  # its name in the data set
-    field: str  # path in the message
-    unit: str
-    sign: Literal[1, -1] = 1
-    factor: float = 1.0
-    offset: float = 0.0
+    topic: str  # name of the topic in the data set
+    field: str  # path of the field in the message
+    unit: str  # unit of the product
+    sign: Literal[1, -1] = 1  # 1, or -1 where the field counts the other way round than ISO 8855
+    factor: float = 1.0  # factor that brings the field to ``unit``
+    offset: float = 0.0  # value of the field at zero
 
 
 @dataclass(frozen=True)
 class Pose(PoseOptions):
-    """Where poses stand."""
+    """Declaration of poses."""
 
-    topic: str  # its name in the data set
+    topic: str  # name of the topic in the data set
     field: str = "pose"  # path of a geometry_msgs/Pose in the message
     up: UpAxis = "z"  # upward axis of the world and of the rigid body
-    yaw: float = 0.0  # from the rigid body's x axis to the car's forward axis [rad]
+    # angle from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
+    yaw: float = 0.0
 
 
 @dataclass(frozen=True)
 class RosbagOptions:
     """Options of the source; see docs/sources/rosbag.md."""
 
-    path: str | None = None
-    files: str | tuple[str, ...] = "*.zip"
-    rate_hz: Positive = 100.0
+    path: str | None = None  # folder of the bags
+    files: str | tuple[str, ...] = "*.zip"  # pattern of the bags, or their names
+    rate_hz: Positive = 100.0  # rate of the recordings [Hz]
+    # start of the range that is read, after the first message of the bag [s]
     start: float | None = None
-    stop: float | None = None
+    stop: float | None = None  # end of this range, after the first message of the bag [s]
+    # type of messages -> its definition, where ROS 2 Humble does not ship it
     messages: dict[str, str] | None = None
-    topics: dict[str, Topic] | None = None
-    channels: dict[str, BagChannel] | None = None
-    pose: Pose | None = None
-    unpacked_limit: Positive = 8.0
+    topics: dict[str, Topic] | None = None  # name of a topic in the data set -> its declaration
+    channels: dict[str, BagChannel] | None = None  # channel -> its declaration
+    pose: Pose | None = None  # poses from which reference channels are made
+    unpacked_limit: Positive = 8.0  # largest size to which an archive may unpack [GB]
 
     def __post_init__(self) -> None:
         topics = self.topics or {}

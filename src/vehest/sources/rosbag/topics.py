@@ -17,9 +17,9 @@ from vehest.data.text_files import first_line, read_text
 from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked, unpacked_limit
 from vehest.sources.limited import Reading, read_limited, require_package
 
-METADATA = "metadata.yaml"
-STORAGES = (".db3", ".mcap")
-PACKED = ".zstd"  # a file that ROS has compressed as a whole
+METADATA = "metadata.yaml"  # name of the file that describes a bag
+STORAGES = (".db3", ".mcap")  # endings of the files of messages
+PACKED = ".zstd"  # ending of a file that ROS has compressed as a whole
 
 
 def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request: Any) -> Reading:

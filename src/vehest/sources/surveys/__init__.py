@@ -31,15 +31,18 @@ from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
-MDF = (".mf4", ".mdf", ".dat")
-BAGS = (".db3", ".mcap", ".zip")
-ARROW = (".feather", ".arrow", ".ipc")
-CAN = (".blf", ".asc", ".trc")
-DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
-IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
-MOST_FIELDS = 60  # of a message
-MAX_LATENESS = 5.0  # s, from a header's stamp to the message's reception
-UNITS = {  # of ROS's own types, REP 103
+MDF = (".mf4", ".mdf", ".dat")  # endings of measurements of ASAM MDF
+BAGS = (".db3", ".mcap", ".zip")  # endings of bags
+ARROW = (".feather", ".arrow", ".ipc")  # endings of Arrow files
+CAN = (".blf", ".asc", ".trc")  # endings of logs of a CAN bus
+# column of a VBOX -> its unit, which the file does not state: a compass's, clockwise from north
+DEGREES = {"heading": "deg"}
+# last parts of the names of topics that are left out
+IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")
+MOST_FIELDS = 60  # largest number of numbers in a message
+MAX_LATENESS = 5.0  # s, longest time from a header's stamp to the message's reception
+# type of message -> field -> unit, of ROS's own types by REP 103
+UNITS = {
     "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
     "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
     "geometry_msgs/msg/TwistStamped": {"twist.linear": "m/s", "twist.angular": "rad/s"},
@@ -96,7 +99,7 @@ def survey(path: Path, dbc: Path | None = None) -> Log:
 
 
 def _without_codes(log: Log) -> Log:
-    """A log of which numbers that stand for a missing sample, such as -9999, are NaN."""
+    """The log with NaN for numbers that stand for a missing sample, such as -9999."""
     if log.source == "rosbag":
         return log
     columns = []
@@ -198,7 +201,7 @@ def _survey_bag(path: Path) -> Log:
 def _clocks_of_topics(
     arrays: Arrays, topics: Sequence[str]
 ) -> dict[str, Literal["header", "received"]]:
-    """Whose stamps are the times of each topic's messages.
+    """Name of a topic -> whose stamps are the times of its messages.
 
     Those of headers, where they are a clock and within `MAX_LATENESS` of the reception, or where
     all topics' are away from it by the same time, as of a simulation.

@@ -22,17 +22,20 @@ from vehest.sources.clocks import (
 from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs, unwrapped
 
+# matches names of columns of time
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|"
     r"epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
+# matches names of columns that count runs
 COUNTER = re.compile(
     r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( "
     r"?(id|nr|no|number|index))?$"
 )
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}
-# the last where a header says so
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "d": 86_400.0}  # unit of time -> seconds
+# unit of time -> seconds, also those that are used only where a header states them
 STATED_UNITS = {**UNITS, "0.1*ms": 1e-4, "0.1*us": 1e-7, "cs": 0.01, "min": 60.0, "h": 3600.0}
+# unit of time -> its spellings
 SPELLINGS_OF = {
     "s": "s sec secs second seconds sekunden с сек 秒 초",
     "ms": "ms msec millis milliseconds ミリ秒",
@@ -45,10 +48,12 @@ SPELLINGS_OF = {
     "min": "min mins minute minutes 分",
     "h": "h hr hrs hour hours stunden",
 }
+# spelling -> unit of time
 SPELLINGS = {
     spelling: unit for unit, spellings in SPELLINGS_OF.items() for spelling in spellings.split()
 }
-PARTS_OF_SECONDS = {  # names of columns that hold them, beside columns of whole seconds
+# name of a column of parts of seconds, beside one of whole seconds -> their unit
+PARTS_OF_SECONDS = {
     name: unit
     for unit, names in {
         "ms": "ms msec millis millisec millisecond milliseconds millisekunden",
@@ -57,32 +62,40 @@ PARTS_OF_SECONDS = {  # names of columns that hold them, beside columns of whole
     }.items()
     for name in names.split()
 }
-RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
-MIN_RATE_HZ = 0.5  # of a slow logger, in the header's unit or where another makes the log too short
+# Hz, lowest and highest rate that loggers write; the units' ranges do not meet
+RATES = (4.0, 2500.0)
+# lowest rate of a slow logger, in the header's unit or where another makes the log too short
+MIN_RATE_HZ = 0.5
 MIN_LOG_SECONDS = 5.0  # s; where a unit makes a log shorter, a larger one is taken and asked for
-LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
-MAX_GAP = 1.0  # s without a row, and FEWEST_STEPS, beyond which a run ends even so
-FEWEST_STEPS = 5.0  # typical steps that such a gap has
-FARTHEST_ROW = 100  # rows by which one may stand out of order, to be sorted
-TIME_FACTORS = (1, 1e3, 1e6, 1e9)
-PERIODS = {  # of a minute … a GPS week
+LONG_GAP = 20.0  # steps, gap after which a run ends where a column counts on, too
+MAX_GAP = 1.0  # s, gap after which a run ends in any case, if it has `FEWEST_STEPS`
+FEWEST_STEPS = 5.0  # smallest length of such a gap, in typical steps
+FARTHEST_ROW = 100  # largest number of rows by which one may be out of order, to be sorted
+TIME_FACTORS = (1, 1e3, 1e6, 1e9)  # units per second of times
+# possible periods of times that begin anew: of a minute … a GPS week
+PERIODS = {
     period * factor for period in (60.0, 3600.0, 86_400.0, 604_800.0) for factor in TIME_FACTORS
 }
-MODULI = (  # of counters, also as fractions of a second; of a second, a minute … a GPS week
+# counts at which counters may wrap, also as fractions of a second; of a second, a minute … a GPS
+# week
+MODULI = (
     *(2.0**bits * factor for bits in (*range(8, 17), 24, 31, 32) for factor in (1.0, 1e-3, 1e-6)),
     *TIME_FACTORS,
     *sorted(PERIODS),
 )
-MAX_WRAP_STEPS = 3.0  # steps that a counter that wraps may go ahead there
-REGULAR = 0.8  # share of steps within half a typical step, for a column without a name of time
-# share of steps that grow, for a column that is named as time; stamps of a coarser resolution are
-# no clock
+MAX_WRAP_STEPS = 3.0  # largest step of a counter where it wraps, in steps
+# smallest share of steps within half a typical step, for a column without a name of time
+REGULAR = 0.8
+# smallest share of steps that grow, for a column that is named as time; stamps of a coarser
+# resolution are no clock
 GROWING = 0.9
-MOST_RESTARTS = 0.01  # share of the rows at which times may go back, pause or begin anew
-MAX_APART = 1.0  # s between two columns of times in one row; beyond, they are different clocks
-MIN_TIMES = 10  # rows; a column with fewer times is not compared, and has no rate
-MIN_COARSE_TIMES = 100  # times that repeat in most rows, for a mean rate within a per cent
-MAX_END_SHARE = 0.05  # of the longer span, by which times that end alike may differ
+MOST_RESTARTS = 0.01  # largest share of the rows at which times may go back, pause or begin anew
+# s, largest difference between two columns of times in one row; beyond, they are different clocks
+MAX_APART = 1.0
+MIN_TIMES = 10  # smallest number of times of a column that is compared, or has a rate
+# smallest number of times that repeat in most rows, for a mean rate within a per cent
+MIN_COARSE_TIMES = 100
+MAX_END_SHARE = 0.05  # largest difference between times that end alike, over the longer span
 
 
 def find_clock(
@@ -332,8 +345,8 @@ def plain_name(name: str) -> str:
 
 
 def _step(values: FloatArray, *, named: bool) -> float | None:
-    """Median step of a column that grows evenly, or that is named as time and repeats seldom, but
-    for restarts; None of another.
+    """Median step of a column that grows evenly, or that is named as time and repeats seldom,
+    except for restarts; None for any other column.
     """
     if len(values) < 10 or not np.isfinite(values).all():
         return None

@@ -19,8 +19,8 @@ from vehest.sources.can.logs import Frames, read_frames
 from vehest.sources.clocks import clock_fault
 from vehest.sources.surveys.log import Log, RawColumn
 
-MIN_BITS = 6  # of a signal that may be a channel; one of a single bit may be a sign
-Rows = NDArray[np.uint8]
+MIN_BITS = 6  # smallest length of a signal that may be a channel; one of a single bit may be a sign
+Rows = NDArray[np.uint8]  # bytes of frames, one frame a row
 
 
 def survey_frames(file: Path, dbc: Path) -> Log:

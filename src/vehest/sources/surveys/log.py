@@ -13,17 +13,15 @@ from vehest.constants import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class RawColumn:
-    """A column, signal or field of numbers."""
+    """A column, signal or field of numbers that a survey has found."""
 
-    name: str  # for people; unique within its log
-    unit: str  # as the file writes it, empty where it does not
-    values: FloatArray  # in that unit, NaN where there is none, (N,)
-    place: Mapping[
-        str, Any
-    ]  # how a data set's entry of a channel names it, such as ``{"column": "Gyro"}``
-    stamps: FloatArray | None = (
-        None  # its own times [s], (N,); None where the log has one clock for all
-    )
+    name: str  # name for people; unique within its log
+    unit: str  # unit as the file writes it; empty where it does not
+    values: FloatArray  # values in that unit, NaN where there is none, (N,)
+    # entry by which a data set names it, such as ``{"column": "Gyro"}``
+    place: Mapping[str, Any]
+    # times of its samples [s], (N,); None where the log has one clock for all
+    stamps: FloatArray | None = None
     # whether the file says that the car measured it, on its bus, or the reference did; empty where
     # it does not
     device: Literal["", "car", "reference"] = ""
@@ -31,7 +29,7 @@ class RawColumn:
     scaling: tuple[float, float] | None = None
 
     def written(self, value: float) -> float:
-        """A value as a data set declares it: as it stands in the file, whole where it is raw."""
+        """A value as a data set declares it: as in the file, whole where it is raw."""
         if self.scaling is None:
             return value
         scale, offset = self.scaling
@@ -40,30 +38,27 @@ class RawColumn:
 
 @dataclass(frozen=True)
 class Stamps:
-    """A column that looks like a clock."""
+    """A column that looks like a clock, and its unit."""
 
-    column: str  # its name
-    unit: str  # of time, such as ``s``, ``ms``, ``us`` or ``ns``
-    evidence: str  # reasons for it, for people
-    asked: bool = False  # whether the unit is ambiguous
-    is_stated: bool = False  # whether the header has a unit of time
+    column: str  # name of the column
+    unit: str  # unit of time, such as ``s``, ``ms``, ``us`` or ``ns``
+    evidence: str  # reasons to take it as the clock, for people
+    asked: bool = False  # whether the unit is ambiguous, so that the user is asked
+    is_stated: bool = False  # whether the header states a unit of time
     repair: Mapping[str, Any] = field(default_factory=dict)  # options that put times in order
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Columns of a file."""
+    """Columns of a file, its clock and its runs."""
 
     file: Path  # the file, or a bag's folder
-    source: str  # that reads it
-    columns: tuple[RawColumn, ...]  # without its clock
-    options: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # of the source, such as delimiter and decimal mark
-    clock: Stamps | None = (
-        # column of its times; None where there is none, or where the format has times of its own
-        None
-    )
+    source: str  # name of the source that reads it
+    columns: tuple[RawColumn, ...]  # columns without the clock
+    # options of the source, such as delimiter and decimal mark
+    options: Mapping[str, Any] = field(default_factory=dict)
+    # column of times; None where there is none, or where the format has times of its own
+    clock: Stamps | None = None
     seconds: FloatArray | None = (
         # times of the rows [s], (N,), from the clock; None where columns have their own or there is
         # no clock
@@ -74,9 +69,11 @@ class Log:
         # rows of each uninterrupted run, the longest first; one of all where times never restart
     ] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
-    repeated_names: tuple[int, ...] = ()  # rows of texts, from 1, which are in no column
-    rate_hz: float | None = None  # of the rows, where the file states it beside their times
-    rate_source: str = ""  # that states it, for people
+    # rows of texts, from 1, such as repeated names; they are in no column
+    repeated_names: tuple[int, ...] = ()
+    # rate of the rows [Hz], where the file states it beside their times
+    rate_hz: float | None = None
+    rate_source: str = ""  # place where it is stated, for people
 
     @cached_property
     def by_name(self) -> dict[str, RawColumn]:

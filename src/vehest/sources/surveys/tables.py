@@ -69,17 +69,20 @@ from vehest.sources.tables import (
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
-HEAD = 1 << 18  # bytes of a file that are looked at
+HEAD = 1 << 18  # bytes at the start of a file by which its layout is found
+# characters of a line that are looked at, as many as csv allows in a cell
 LONGEST_LINE = csv.field_size_limit()
 MAX_ODD_CELLS = 3  # different texts in a column of numbers that count as missing samples
 MAX_ODD_SHARE = 0.01  # such cells over the numbers of a column; with more it is a column of texts
 MIN_REPEATED_ROWS = 0.1  # share of rows that repeat the one before, above which a table is refused
-MIN_SHARE_OF_KIND = 0.1  # of the texts of a column, above which an error names their kind
-MIN_UNITS_ABOVE = 0.7  # share of cells that are units, for a row of units above the names
-MAX_HEADER_LINES = 4  # lines of names, units, sources and the like, right above the numbers
-MOST_LINES = 600  # lines of a file that are looked at, those before the names included
-DELIMITERS = (";", "\t", ",", "|", " ")
-LEAST_NUMBERS = 0.5  # share of cells that are numbers or empty, from which on a row is one of data
+MIN_SHARE_OF_KIND = 0.1  # share of the texts of a column above which an error names their kind
+MIN_UNITS_ABOVE = 0.7  # smallest share of cells that are units, for a row of units above the names
+# largest number of lines of names, units, sources and the like, right above the numbers
+MAX_HEADER_LINES = 4
+# largest number of lines by which the layout is found, those before the names included
+MOST_LINES = 600
+DELIMITERS = (";", "\t", ",", "|", " ")  # delimiters that are tried
+LEAST_NUMBERS = 0.5  # smallest share of cells that are numbers or empty in a row of data
 # encoding -> bytes that texts in Windows-1252 hardly have, its letters, and their least share of
 # all letters beyond ASCII: Chinese that is read as Korean has few other ones
 ENCODINGS = {
@@ -88,9 +91,12 @@ ENCODINGS = {
     "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
     "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
 }
+# control characters that texts do not have
 CONTROLS = bytes([*range(0x09), 0x0B, *range(0x0E, 0x20)])
-MOST_CONTROLS = 0.01  # of the first bytes of a file; with more it is no text
+MOST_CONTROLS = 0.01  # largest share of these in the first bytes of a text
+# matches a number with a decimal point
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
+# matches a name with a unit in brackets
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 STATED_RATE = re.compile(
     r"((sampl\w{,6}|updat\w{,6}|logging|log|output|abtast|mess)[ _-]?(rate|freq\w{,8})|^\W*f_?s\b|"
@@ -100,14 +106,17 @@ STATED_RATE = re.compile(
     r"(\W*(?P<before>[mnuµ]?s))?\W+(?P<step>[\d.,]+)\W*((?P<behind>[mnuµ]?s(ec(onds?)?)?)\b|$)",
     re.IGNORECASE,
 )
-"""What a line above the names says of the rate of the rows."""
+"""Matches what a line above the names states on the rate of the rows."""
+# matches the places and directions in a name
 PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
 VELOCITY = re.compile(
     rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE
 )
-"""Names that end in ms for metres a second, as those of delays and ages do not."""
+"""Matches names of velocities that end in ms for metres a second, as those of delays and ages do
+not.
+"""
 ACCELERATION = re.compile(rf"(.*[_\s])?(a[xyz]|\w*(acc|beschl)[a-z]*){PLACE}[_\s]g", re.IGNORECASE)
-"""Names that end in g for that of gravity."""
+"""Matches names of accelerations that end in g."""
 DISGUISED = {
     "a unit": r"^\s*[+-]?\d+([.,]\d+)?\s*[A-Za-zµ°%][\wµ°%/·²^-]*\s*$",
     "another minus sign": r"^\s*[−–]\d+([.,]\d+)?\s*$",
@@ -121,8 +130,10 @@ DISGUISED = {
     ),
     "the other decimal mark": r"^\s*[+-]?\d+[.,]\d+\s*$",
 }
-"""Kinds of texts that are numbers for people: the pattern of each."""
+"""Kind of texts that are numbers for people -> pattern that matches them."""
+# matches the message on a column of times that cannot be read
 UNREAD_TIMES = re.compile(r"column '(t|time|zeit|timestamp)\b[^']*' holds numbers", re.IGNORECASE)
+# abbreviation of a unit in a name -> unit
 ABBREVIATED = {
     "radps": "rad/s",
     "degps": "deg/s",
@@ -138,20 +149,20 @@ ABBREVIATED = {
 class Shape:
     """A table of text as one delimiter and decimal mark explain it."""
 
-    layout: TextLayout
-    names: tuple[str, ...] = ()  # of the columns; empty where no line above the numbers has them
-    units: Mapping[str, str] = field(
-        default_factory=dict
-    )  # name -> unit in the row below the names, if there is one
-    # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no
-    # such row
+    layout: TextLayout  # delimiter, decimal mark, encoding and rows above the numbers
+    # names of the columns; empty where no line above the numbers has them
+    names: tuple[str, ...] = ()
+    # name of a column -> unit in the row below the names, if there is one
+    units: Mapping[str, str] = field(default_factory=dict)
+    # share of cells of numbers in rows of one length, and a hundredth for each column; 0 where
+    # there is no such row
     score: float = 0.0
-    rate_hz: float | None = None  # that a line above the names states
-    fault: str = ""  # what to do where there are no names
+    rate_hz: float | None = None  # rate that a line above the names states [Hz]
+    fault: str = ""  # text on what to do where there are no names
 
 
 def survey_table(file: Path) -> Log:
-    """What a table of text, or of Parquet, holds.
+    """Columns, clock and layout of a table of text, or of Parquet.
 
     The source is ``text_log`` where ``tabular`` cannot read it: with rows below the names, marks of
     missing samples, or clock times.
@@ -285,7 +296,7 @@ def survey_table(file: Path) -> Log:
 
 
 def _unread_column(field: pa.Field) -> str:
-    """What a column of Parquet that is not read holds, and the way out where it is nested."""
+    """Text on a column of Parquet that is not read, and the way out where it is nested."""
     text = f"column '{printable(field.name)}' holds {str(field.type)[:60]}"
     if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
         return f"{text}; if these are numbers, write them as such (in pandas: .astype(float))"
@@ -315,7 +326,7 @@ def _require_rows_once(
 
 
 def _fault(name: str, times: FloatArray) -> str:
-    """Why no clock can be made of a column of times, or of one that is named so."""
+    """Text on why no clock can be made of a column of times, or of one that is named so."""
     steps = np.diff(times)
     back = (steps < 0).sum()
     n_repeats = (steps == 0).sum()
@@ -455,7 +466,9 @@ def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding
 
 
 def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
-    """Line of the names among those above the numbers: of most names, over the units if any."""
+    """Index of the line of the names among those above the numbers: of most names, over the units
+    if any.
+    """
     block = [k for k in above if k > above[-1] - MAX_HEADER_LINES]
     units_at = next((k for k in block[1:] if _are_units(rows[k])), None)
     block = [k for k in block if units_at is None or k < units_at]
@@ -468,7 +481,7 @@ def _names_at(rows: Mapping[int, list[str]], above: Sequence[int]) -> int:
 
 
 def _share(row: Sequence[str], decimal: str) -> float:
-    """Share of cells that are numbers, empty ones left out; 0 where there is none."""
+    """Share of cells that are numbers, without empty ones; 0 where there is none."""
     filled = [cell for cell in row if cell.strip()]
     others = [cell for cell in filled if not _is_number(cell, decimal)]
     n_marks = sum(map(marks_not_measured, others))
@@ -694,7 +707,7 @@ def _shows_a_clock(numbers: FloatArray) -> bool:
 
 
 def _kind_of_text(column: pa.ChunkedArray) -> str:
-    """What the texts of a column are, and the way out where they are numbers in disguise."""
+    """Text on the cells of a column, and the way out where they are numbers in disguise."""
     texts = column.cast(pa.string(), safe=False).drop_null()
     for kind, pattern in DISGUISED.items():
         example = texts.filter(compute.match_substring_regex(texts, pattern))

@@ -11,27 +11,39 @@ from pathlib import Path
 
 from vehest.data.errors import DataError, printable
 
+# matches a line of candump
 _CANDUMP = re.compile(r"\s*\([\d.: -]+\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[)")
+# matches cells that are aligned by blanks
 _ALIGNED = re.compile(r"[^\s;,]+([ ]+[^\s;,]+)*[ ]{2,}[^\s;,]+([ ]+[^\s;,]+)*")
+# matches names of columns that name a quantity
 _NAMES_SIGNAL = re.compile(
     r"(signal|channel|sensor|(mess)?kanal|parameter|variable|telemetry|quantity|measurement|metric|"
     r"field|topic|tag|key|pid|messgr(ö|oe)(ß|ss)e|bezeichnung)(_?(name|id))?|\w*_name|name",
     re.IGNORECASE,
 )
+# matches names of columns of values
 _NAMES_VALUE = re.compile(r"(\w*_)?(value|val|(mess)?wert|reading|data)", re.IGNORECASE)
+# matches a line of InfluxDB's line protocol
 _LINE_PROTOCOL = re.compile(r"[^\s,]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d{10,19})?")
+# matches a number, or nothing
 _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?\s*|", re.IGNORECASE)
-_JSON = re.compile(r"(\d+(\.\d+)?: *)?(\{\s*(\"|$)|\[\s*(\{|\[|$)).*")
+_JSON = re.compile(r"(\d+(\.\d+)?: *)?(\{\s*(\"|$)|\[\s*(\{|\[|$)).*")  # matches the start of JSON
+# matches a message of a GNSS receiver
 _RECEIVER_MESSAGE = re.compile(r"[#$%][A-Z]\w{3,},.*\*[0-9A-Fa-f]{2,8}")
+# matches names of columns of identifiers of frames
 _NAMES_FRAME = re.compile(
     r"((can|arb(itration)?|frame|msg|message)?[_ ]?id(entifier)?(_?hex)?)", re.IGNORECASE
 )
+# matches names of columns of bytes of frames
 _NAMES_BYTES = re.compile(
     r"data([_ ]?(bytes|hex|field))?|payload|(data|byte|d|b)[_ ]?[07]|dlc", re.IGNORECASE
 )
+# matches bytes in hexadecimal digits
 _BYTES = re.compile(r"(0x)?[0-9A-Fa-f]{2}([ _:-]?[0-9A-Fa-f]{2})*")
-MIN_ROWS_OF_SIGNAL = 5  # of each quantity in long format, on average
-MAX_COLUMNS = 8  # of a table in long format, where its beginning does not show several quantities
+MIN_ROWS_OF_SIGNAL = 5  # smallest mean number of rows of each quantity in long format
+# largest number of columns of a table in long format, where its beginning does not show several
+# quantities
+MAX_COLUMNS = 8
 
 
 def require_columns_of_signals(
@@ -169,7 +181,7 @@ def require_columns_of_numbers(file: Path, numbers: Sequence[str], texts: Sequen
 
 
 def _places_in_long_format(names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Places of columns that may name a quantity, and of those that may hold its value."""
+    """Indices of columns that may name a quantity, and of those that may hold its value."""
     plain = [name.strip(" _") for name in names]
     signals = [k for k, name in enumerate(plain) if _NAMES_SIGNAL.fullmatch(name)]
     return signals, [k for k, name in enumerate(plain) if _NAMES_VALUE.fullmatch(name)]

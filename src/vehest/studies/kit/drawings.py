@@ -25,7 +25,7 @@ from vehest.studies.kit.runs import Name
 
 ZOOM_SECONDS = 20.0  # s, length of the busiest part, which has a figure of its own
 MAX_IN_ZOOM = 4  # estimates in the figure of the busiest seconds
-TEST_COLOUR = "#0b4f9c"
+TEST_COLOUR = "#0b4f9c"  # colour of the test set besides the training ranges in the g-g diagram
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +34,12 @@ class DriveSignals:
     ranges.
     """
 
-    artefacts: PartArtefacts
-    test_set: str
+    artefacts: PartArtefacts  # the comparison
+    test_set: str  # name of the test set
     # (estimator, variant) -> model, title and line, in the order in which they are drawn
     candidates: Mapping[Name, tuple[EvaluatedModel, str, Line]]
-    ranges: Mapping[Name, Sequence[Scored]]  # of each candidate, one a range
-    joined: Mapping[Name, Scored]  # the same end to end
+    ranges: Mapping[Name, Sequence[Scored]]  # signals of each candidate, one for each range
+    joined: Mapping[Name, Scored]  # the ranges of each candidate end to end
 
     @property
     def reference(self) -> Scored:
@@ -77,7 +77,7 @@ def signals_of(
     test_set: str,
     lines: Mapping[Name, Line],
 ) -> DriveSignals:
-    """Signals of the rows of a board, of each the seed chosen on validation.
+    """Read the estimates and references of a test set for the models in the rows of a leaderboard.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def busiest_block(signals: DriveSignals, file: str) -> Figure:
 
 
 def _trace_notes(signals: DriveSignals) -> str:
-    """A sentence for each family whose traces need an explanation, with their titles."""
+    """Sentences of a caption, one for each family whose traces need an explanation."""
     titles: dict[str, list[str]] = {}
     for (name, _), (_, title, _) in signals.candidates.items():
         with suppress(ConfigurationError):  # a family of a package that is not installed here
@@ -292,7 +292,9 @@ def error_over_ay_block(signals: DriveSignals, file: str) -> Figure:
 
 
 def _explorer(signals: DriveSignals) -> str:
-    """What the page draws of the test set, times after the start where they are unix times."""
+    """Content of the page's interactive plot of the test set (`explorer_of`); unix times are
+    counted from the start.
+    """
     start = float(signals.reference.time[0])
     begin, label = (
         (start, "time after the start [s]")
@@ -362,13 +364,13 @@ def _where_drawn(part: Scored, sideslip: FloatArray) -> FloatArray:
 
 
 def _gap_of(parts: Sequence[Scored]) -> int:
-    """Samples between two ranges, enough to be seen."""
+    """Number of NaN samples between two ranges, so that the gap is visible in a figure."""
     return max(sum(len(part.time) for part in parts) // 60, 1)
 
 
 def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[float, float]:
-    """Times between which the mean square of the reference sideslip is largest, within one
-    range.
+    """Start and end [s] of the `ZOOM_SECONDS` with the largest mean square of the reference
+    sideslip, within one range.
     """
     best = -math.inf
     first = 0

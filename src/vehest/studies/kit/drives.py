@@ -31,9 +31,11 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Name, runs_of, values_of
 from vehest.trust.bands import LEVELS
 
+# input of a bound -> its symbol in tables
 SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
-COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
-DRAWN_COVERAGE = "coverage_90"
+COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)  # metrics, one a level
+DRAWN_COVERAGE = "coverage_90"  # coverage whose interval the table shows
+# further metrics of bands in the table
 _FIGURES = (
     "coverage_90_p10",
     "coverage_90_p90",
@@ -46,8 +48,8 @@ _FIGURES = (
 
 
 def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
-    """The reference's spread and noise, then the bounds without and with the car by set of inputs,
-    of those that were measured.
+    """Table of the reference's spread and noise, and of the bounds without and with the car for
+    each set of inputs that was measured.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     test_set : str
         The test set whose recordings are read.
     name : str
-        Of the table.
+        Name of the table.
 
     Returns
     -------
@@ -157,7 +159,7 @@ def regime_table(
         for key, (title, seed) in chosen.items()
     ]
     headers = {
-        regime: f"{_in_words(regime)} ({fixed(100 * float(shares[regime]), 0)} %)"
+        regime: f"{_regime_header(regime)} ({fixed(100 * float(shares[regime]), 0)} %)"
         for regime in regimes
     }
     return Table(
@@ -176,8 +178,8 @@ def regime_table(
     )
 
 
-def _in_words(regime: str) -> str:
-    """A regime as the header of a column; bands of lateral acceleration with their bounds."""
+def _regime_header(regime: str) -> str:
+    """Header of the column of a regime; for a band of lateral acceleration its bounds."""
     if regime not in AY_BANDS:
         return regime
     low, high = AY_BANDS[regime]
@@ -191,7 +193,7 @@ def band_blocks(
     lines: Mapping[Name, Line],
     file: str,
 ) -> list[Block]:
-    """Table ``bands_FILE`` and figure ``reliability_FILE``.
+    """Table ``bands_FILE`` and figure ``reliability_FILE`` on the calibrated bands.
 
     Nothing where no estimator has bands.
 

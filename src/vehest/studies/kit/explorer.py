@@ -21,7 +21,8 @@ from vehest.trust.health import health_rows
 from vehest.trust.record import TRUST, read_trust
 
 MAX_INPUTS = 16  # channels that the page can draw; further ones are left out
-DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
+DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")  # those that are shown at first
+# note of the page where the course is dead-reckoned
 RECKONED = (
     "No positions were recorded: the course is integrated from speed, reference and yaw rate, and "
     "drifts with time."
@@ -35,7 +36,7 @@ def explorer_of(
     scored: Mapping[Name, Sequence[Scored]],
     axis: tuple[float, str, int, tuple[float, float]],
 ) -> str:
-    """What the page draws of a test set, as `explorer_json`.
+    """Content that the page draws of a test set, as `explorer_json`.
 
     Parameters
     ----------
@@ -126,11 +127,11 @@ def explorer_of(
     return explorer_json({**content, "candidates": candidates, "courseNote": RECKONED}, columns)
 
 
-_BANDS = ("vy", "sideslip")
+_BANDS = ("vy", "sideslip")  # quantities with calibrated bands
 
 
 def chained(pieces: Sequence[FloatArray], gap: int) -> FloatArray:
-    """Pieces one after another with a gap of NaN between two.
+    """Concatenate pieces with a gap of NaN between two.
 
     Parameters
     ----------
@@ -150,8 +151,8 @@ def health_over(
     artefacts: PartArtefacts,
     gap: int,
 ) -> FloatArray | None:
-    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2
-    invalid, over all ranges.
+    """Health status of a model over all ranges, by the channels that it reads: 0 valid, 1 degraded,
+    2 invalid.
 
     None where the model has no health, or reads another rate than that of the evaluation.
 

@@ -20,7 +20,7 @@ from vehest.studies.kit.warnings import cannot_rank
 
 @dataclass(frozen=True)
 class Recommendation:
-    """The outcome of one test set.
+    """Estimator that a comparison recommends by one test set, with the ranking it rests on.
 
     Parameters
     ----------
@@ -57,7 +57,9 @@ class Recommendation:
         return [best_sentence(ranking, self.titles), self._describe_choice(condition)]
 
     def _describe_choice(self, condition: str) -> str:
-        """What is recommended and why, with the expected error; or why nothing is."""
+        """A paragraph on what is recommended and why, with the expected error; or why nothing
+        is.
+        """
         ranking = self.ranking
         baselines = " and ".join(BASELINE_TITLES[baseline] for baseline in BASELINES)
         if self.model is None:
@@ -92,7 +94,7 @@ class Recommendation:
 
 
 def recommendation_of(part: PartArtefacts, test_set: str) -> Recommendation:
-    """Which estimator to recommend, decided by one test set.
+    """Recommendation of an estimator, decided by one test set.
 
     Recommended is the estimator that is significantly better than all others (`Ranking.winner`);
     without one, of those in `Ranking.recommendable`, the one with the lowest RMSE(v) on validation.

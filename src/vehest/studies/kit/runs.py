@@ -1,4 +1,4 @@
-"""Metrics of a comparison by run, and the seed that stands for an estimator."""
+"""Metrics of a comparison by run, and the seed by which an estimator is represented."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def value_of_run(runs: Runs, name: Name, seed: int, test_set: str, metric: str) 
 
 
 def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
-    """A metric of the model itself, under whatever test set it was noted.
+    """A metric of the model itself, which does not depend on the test set under which it is stored.
 
     Parameters
     ----------
@@ -84,14 +84,14 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
     name : Name
         Estimator and variant.
     seed : int
-        Of the model.
+        Seed of the model.
     metric : str
-        Such as ``n_parameters`` or ``epochs``.
+        Name of the metric, such as ``n_parameters`` or ``epochs``.
 
     Returns
     -------
     float
-        NaN where the metric was never noted.
+        NaN where the metric is stored under no test set.
     """
     values = (
         run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run
@@ -100,7 +100,9 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed that stands for an estimator: that with the lowest RMSE(v) on the validation range.
+    """The seed by which an estimator is represented: that with the lowest RMSE(v) on the validation
+    range.
+
 
     Test data choose nothing.
 
@@ -146,5 +148,5 @@ def by_name(models: Iterable[EvaluatedModel]) -> dict[Name, list[EvaluatedModel]
 
 
 def _text(value: object) -> str:
-    """Empty for the NaN that pandas reads an empty field as."""
+    """Text of a field of a table; empty for NaN, as which pandas reads an empty field."""
     return value if isinstance(value, str) else ""

@@ -14,8 +14,9 @@ from vehest.report.style import MISSING, decimals_for, fixed, listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name
 
-BEST = "best"
+BEST = "best"  # cell of the estimator with the lowest error
 NOT_SIGNIFICANT = "not significant"  # a difference, as cells of tables state it
+# baseline -> how sentences name it
 BASELINE_TITLES = {"zero": "the zero-sideslip baseline", "static_map": "the static map"}
 
 
@@ -43,8 +44,8 @@ def ranking_of(artefacts: PartArtefacts, test_set: str) -> Ranking:
 
 
 def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
-    """``low`` and ``high`` of a candidate's RMSE(β) over seeds [deg], ``beats_zero``,
-    ``beats_static_map``, and ``against_best`` in words.
+    """Columns of a table on a candidate's standing: ``low`` and ``high`` of its RMSE(β) over seeds
+    [deg], ``beats_zero``, ``beats_static_map``, and ``against_best`` as text.
 
     Returns
     -------
@@ -69,16 +70,16 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
     return columns
 
 
-def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
-    """The interval of a row with `standing_columns`: ``0.31 … 0.38``."""
+def describe_interval(row: Mapping[Any, Any], decimals: int) -> str:
+    """Text of the interval of a row with `standing_columns`, such as ``0.31 … 0.38``."""
     low = row["rmse_sideslip_low"]
     high = row["rmse_sideslip_high"]
     return f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
 
 
 def _against_best(ranking: Ranking, name: Name) -> str:
-    """The difference to the best [deg] with its interval, positive where the candidate is worse; or
-    that it is the best, or not significantly different.
+    """Cell ``against_best`` of a candidate: the difference to the best [deg] with its interval,
+    positive where the candidate is worse; or `BEST`, or `NOT_SIGNIFICANT`.
     """
     if not ranking.order:
         return MISSING
@@ -91,7 +92,9 @@ def _against_best(ranking: Ranking, name: Name) -> str:
 
 
 def figure_of(ranking: Ranking, name: Name) -> str:
-    """RMSE(β) of an estimator over all its seeds with its 95 % interval: ``0.19° [0.16, 0.23]``.
+    """Text of an estimator's RMSE(β) over all its seeds with its 95 % interval, such as ``0.19°
+    [0.16, 0.23]``.
+
 
     At least two decimals; the interval is left out where the test is too short for one.
     """
@@ -104,8 +107,8 @@ def figure_of(ranking: Ranking, name: Name) -> str:
 
 
 def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    """The estimator with the lowest RMSE(β) and those that are not significantly worse, in
-    Markdown.
+    """A sentence, in Markdown, on the estimator with the lowest RMSE(β) and those that are not
+    significantly worse.
     """
     best = ranking.order[0]
     words = f"**Best: {titles[best]}, {figure_of(ranking, best)}.**"
@@ -123,8 +126,8 @@ def best_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
 
 
 def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: str) -> str:
-    """The best estimator, those that are not significantly worse, and whether it beats the
-    baselines.
+    """Sentences on the best estimator, on those that are not significantly worse, and on whether it
+    beats the baselines.
 
     Parameters
     ----------
@@ -146,7 +149,7 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], test_text: s
 
 
 def _baselines_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
-    """Whether the best, which is named, is significantly better than the baselines."""
+    """A sentence on whether the best estimator is significantly better than the baselines."""
     best = ranking.order[0]
     title = titles[best]
     if best[0] in BASELINES:
@@ -164,7 +167,7 @@ def _baselines_sentence(ranking: Ranking, titles: Mapping[Name, str]) -> str:
 
 
 def basis_sentence(ranking: Ranking, test_text: str) -> str:
-    """What the figures are and how they were compared."""
+    """Sentences on what the errors are and how they were compared, for the end of a verdict."""
     figures = f"RMSE(β) over all seeds with its 95 % interval, on {test_text}"
     if ranking.n_blocks < MIN_BLOCKS:
         return f"{figures}."

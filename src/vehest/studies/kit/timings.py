@@ -1,5 +1,5 @@
-"""What trainings and online steps took, for the page alone: a time is never the same twice, and so
-no published file holds one.
+"""Times of trainings and online steps, for the HTML page alone: since a time is never the same
+twice, no published file contains one.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import pandas as pd
 
 from vehest.report.document import Column, Table
 
-NAME = ("estimator", "variant")
+NAME = ("estimator", "variant")  # columns that identify a candidate
+# caption of the table of times
 CAPTION = (
     "Medians over seeds, wall time on the machine that `provenance.json` names, where others may "
     "have worked at the same time; an online "
@@ -22,14 +23,14 @@ CAPTION = (
 def timings_of_study(
     parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]],
 ) -> list[str | Table]:
-    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title).
+    """Heading and table of the times that each estimator took; empty where none are known.
 
-    Nothing where it is not known.
 
     Parameters
     ----------
     parts : sequence of tuple
-        The table of a part is long: estimator, variant, seed, metric (a time's name), value [s].
+        Of each part its title, its times, and (estimator, variant) -> title. The table of times is
+        long: estimator, variant, seed, metric (a time's name), value [s].
 
     Returns
     -------
@@ -64,7 +65,9 @@ def timings_of_study(
 def _rows(
     part: str, table: pd.DataFrame, titles: Mapping[tuple[str, str], str]
 ) -> list[dict[str, object]]:
-    """A row an estimator of one part: number of fits, and medians over seeds of every time."""
+    """Rows of the table, one for each estimator of a part: number of fits, and medians over seeds
+    of every time.
+    """
     seeds = table.drop_duplicates(
         subset=[*NAME, "seed", "metric"]
     )  # a time of the fit is noted under every test set

@@ -19,7 +19,7 @@ from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
 # deg, root mean square of the reference, below which a test hardly distinguishes estimators
 MIN_SIDESLIP_DEG = 0.5
-# lowest error over the noise of the reference, below which errors of the reference may decide the
+# lowest error over the noise of the reference below which errors of the reference may decide the
 # order of estimators
 MIN_ERROR_OVER_NOISE = 2.0
 MAX_BOUND_OVER_SIGNAL = (
@@ -50,7 +50,9 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
 
 
 def _slow_tests(artefacts: PartArtefacts) -> list[str]:
-    """Tests in which the car is too slow throughout for sideslip to be scored."""
+    """A sentence for each test set in which the car is too slow throughout for sideslip to be
+    scored.
+    """
     runs = runs_of(artefacts)
     sentences = []
     for test_set, spans in artefacts.split.tests.items():
@@ -100,7 +102,7 @@ def _lowest(runs: Runs, test_set: str, metric: str) -> float:
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
-    """Root mean square of the reference sideslip [deg]."""
+    """Root mean square of the reference sideslip of ranges where it is scored [deg]."""
     return float(np.sqrt(np.mean(np.square(sizes_of_sideslip(artefacts, spans)))))
 
 
@@ -113,7 +115,7 @@ def sizes_of_sideslip(artefacts: PartArtefacts, spans: Sequence[Span]) -> FloatA
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
-    """Tests whose reference sideslip is below MIN_SIDESLIP_DEG (rms)."""
+    """A sentence for each test set whose reference sideslip is below MIN_SIDESLIP_DEG (rms)."""
     sentences = []
     for test_set, spans in artefacts.split.tests.items():
         level = _level(artefacts, spans)
@@ -128,8 +130,8 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
 
 
 def _floors(artefacts: PartArtefacts) -> list[str]:
-    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs contain
-    little information on v.
+    """A sentence for each test set whose reference is about as noisy as the lowest error is large,
+    or whose inputs contain little information on v.
     """
     runs = runs_of(artefacts)
     sentences = list[str]()
@@ -157,7 +159,9 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
 
 
 def _kinds(artefacts: PartArtefacts) -> list[str]:
-    """Where a test goes beyond the training ranges in lateral acceleration, sideslip or speed."""
+    """A sentence for each test set that exceeds the training ranges in lateral acceleration,
+    sideslip or speed.
+    """
     if not artefacts.split.train:
         return []
     learnt = _reference(artefacts, artefacts.split.train)
@@ -200,7 +204,7 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
-    """Estimators some of whose trainings ended at their largest number of epochs."""
+    """Sentences on estimators some of whose trainings ended at their largest number of epochs."""
     runs = runs_of(artefacts)
     estimators = list[str]()
     for name, models in by_name(artefacts.models).items():
@@ -225,7 +229,9 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
 
 
 def _divergence(artefacts: PartArtefacts) -> list[str]:
-    """Estimators some of whose trainings diverged with their smallest step size too."""
+    """Sentences on estimators some of whose trainings diverged with their smallest step size
+    too.
+    """
     diverged = []
     for models in by_name(artefacts.models).values():
         ended = sum(bool(model.fit_metrics().get("ended_by_divergence")) for model in models)
