@@ -125,18 +125,9 @@ class SelfCalibrating(SelfCalibratingSettings):
     @property
     def decay(self) -> FloatArray:
         """Factors by which states return to the prior in a sample, (8,)."""
-        times = np.array(
-            [
-                np.inf,
-                np.inf,
-                self.offset_ay_time,
-                self.offset_ax_time,
-                np.inf,
-                np.inf,
-                np.inf,
-                self.axle_error_time,
-            ]
-        )
+        times = np.full(kernel.STATES, np.inf)
+        times[[kernel.OFFSET_Y, kernel.OFFSET_X]] = self.offset_ay_time, self.offset_ax_time
+        times[kernel.ERROR] = self.axle_error_time
         return np.exp(-1.0 / (self.rate_hz * times * math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)))
 
     @property

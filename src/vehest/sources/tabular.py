@@ -184,15 +184,8 @@ class TabularSource(FileSource):
         table.
         """
         time = self.time
-        needs_all_rows = (
-            self._cuts
-            or self.options.runs
-            or self.held
-            or self.pose
-            or self.dropped
-            or self.transforms
-            or self.reference_point
-        )
+        needing_all_rows = (self._cuts, self.options.runs, self.held, self.pose, self.dropped)
+        needs_all_rows = any((*needing_all_rows, self.transforms, self.reference_point))
         if time is None or needs_all_rows or time.wraps_at or time.sort:
             return None
         is_strict = self.options.clock == "strict"

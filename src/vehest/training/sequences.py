@@ -449,9 +449,7 @@ class PhaseTraining:
         return Checkpoint(tensors, values)
 
     def _save_now_and_then(self, in_any_case: bool = False) -> None:
-        """Store a checkpoint if the last one is older than ``checkpoint_seconds``, or in any
-        case.
-        """
+        """Store a checkpoint in any case, or if the last is older than ``checkpoint_seconds``."""
         if in_any_case or time.monotonic() - self.saved > self.checkpoint_seconds:
             self._save(self._checkpoint())
 

@@ -137,19 +137,10 @@ class GuardedRun:
         DataError
             A channel is missing.
         """
-        estimator = self.estimator
-        missing = [name for name in estimator.channels if name not in samples]
-        if missing:
-            raise DataError(
-                f"recording '{recording.id}' has no channel '{missing[0]}', which estimator "
-                f"'{estimator.name}' needs"
-            )
-        rows = np.ascontiguousarray(
-            np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1)
-        )
+        rows = _rows_read(samples, self.estimator, recording.id)
         self.recording, self.cleaned, steps = recording, self.guard(rows), len(rows)
         verdict = self.monitor.before(rows, self.cleaned)
-        self.motion = motion_of(estimator.channels, self.cleaned)
+        self.motion = motion_of(self.estimator.channels, self.cleaned)
         self.out = np.full(steps, np.nan)
         self.marks = np.zeros(steps, np.int8)
         self.vx = np.full(steps, np.nan)
@@ -328,6 +319,22 @@ class GuardedRun:
             mode,
             *covariance,
         )
+
+
+def _rows_read(
+    samples: Mapping[str, FloatArray], estimator: Estimator, recording_id: str
+) -> FloatArray:
+    """Samples of the C channels that an estimator reads, in its order, (T, C); raises `DataError`
+    where one is missing.
+    """
+    missing = [name for name in estimator.channels if name not in samples]
+    if missing:
+        raise DataError(
+            f"recording '{recording_id}' has no channel '{missing[0]}', which estimator "
+            f"'{estimator.name}' needs"
+        )
+    columns = [np.asarray(samples[name], np.float64) for name in estimator.channels]
+    return np.ascontiguousarray(np.stack(columns, axis=1))
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
