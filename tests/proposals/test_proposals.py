@@ -1737,9 +1737,12 @@ def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path):
     deg/s without a word.
     """
     d = drive()
-    table = usual(d).drop(columns=["LongAcc", "Steer", "Beta"]).assign(Speed=4300.0 * d["vx"])
-    by_channel = proposed(tmp_path, table)
+    table = usual(d).drop(columns=["LongAcc", "Steer", "Beta"])
+    by_channel = proposed(tmp_path, table.assign(Speed=3600.0 * d["vx"]))
     assert all("other units explain" in by_channel[name].question for name in ("vx", "yaw_rate"))
+    by_channel = proposed(tmp_path, table.assign(Speed=4300.0 * d["vx"]))  # which no units explain
+    assert "wrong by a factor of 1.19e+03" in by_channel["vx"].question
+    assert by_channel["yaw_rate"].unit == "deg/s"
 
 
 def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path):

@@ -63,6 +63,7 @@ USUAL_STEP_QUANTILE = 0.995  # quantile of |steps between samples| that is the u
 SPIKE_STEP = 3.0
 # smallest jump away and back of an excursion within the usual range, in usual steps
 JUMP_STEP = 20.0
+MIN_CODES = 3  # smallest number of equal samples that may be a code other than zero
 JUMP_SECONDS = 1.0  # s; a longer excursion within the usual range is not reported
 STRAIGHT_YAW_RATE = 0.02  # rad/s, largest yaw rate that counts as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, lowest speed of samples that count as straight ahead
@@ -530,7 +531,7 @@ def _usual_step(measured: FloatArray) -> tuple[float, set[float]]:
     whose jumps may be so frequent that they do not count.
     """
     values, counts = np.unique(measured, return_counts=True)
-    codes = {0.0, float(values[np.argmax(counts)])}
+    codes = {0.0, *values[counts == max(counts.max(), MIN_CODES)].tolist()}
     others = measured[~np.isin(measured, [*codes])]
     steps = np.abs(np.diff(others if len(others) > 0.5 * len(measured) else measured))
     return float(np.quantile(steps, USUAL_STEP_QUANTILE)), codes
