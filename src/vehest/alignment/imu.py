@@ -754,8 +754,8 @@ def _uncertainties(
 
     Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving,
     or following the accelerations where that is not fitted, and of the road. The slow part of the
-    residuals shows how much the road tilts; that it looks like the effect of a parameter is
-    assumed.
+    residuals shows how much the road tilts; the worst case is assumed, a tilt that looks like the
+    effect of a parameter. ``tilt`` is the body's [rad], ``blocks`` the number of blocks of time.
     """
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
     if tilt == 0.0:

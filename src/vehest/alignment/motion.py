@@ -14,7 +14,7 @@ from vehest.data.recording import Recording
 # largest sample over the largest that a vehicle can do; beyond lies no wrong unit
 MAX_EXCESS = 100.0
 MAX_MISSING_SHARE = 0.05  # largest share of missing samples of a channel, which a line then bridges
-# channels of the four wheels
+# channels of the speeds of the four wheels [rad/s]
 WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr")
 
 

@@ -50,7 +50,7 @@ IN_DEGREES: dict[str, str] = {"sideslip_deg": "sideslip", "band_sideslip_deg": "
 COLUMN_UNITS: dict[str, str] = {"time": "s", **QUANTITIES, **dict.fromkeys(IN_DEGREES, "deg")}
 """Columns of written tables, with units; entries of a covariance have theirs by `column_units`."""
 
-COVARIANCE = "covariance"  # column of entry (i, j): covariance_i_j
+COVARIANCE = "covariance"  # start of the name of the column of entry (i, j), covariance_i_j
 
 
 def time_cell(seconds: float) -> str:

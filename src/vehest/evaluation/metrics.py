@@ -137,8 +137,9 @@ class Protocol:
     def with_wheelbases(self, wheelbases: Mapping[str, float | None]) -> Protocol:
         """The protocol with a `min_sideslip_speed` for every data set, by its car's wheelbase.
 
-        ``wheelbases`` is data set -> wheelbase [m], None where it is not known. Speeds that are set
-        stay.
+        The function `min_sideslip_speed` gives the speed [m/s] from which on sideslip is scored.
+        ``wheelbases`` is data set -> wheelbase [m], None where it is not known, for which the speed
+        of a full-size car holds. Speeds that are set stay.
         """
         declared_speed = self.min_sideslip_speed
         if not (declared_speed is None or isinstance(declared_speed, dict)):

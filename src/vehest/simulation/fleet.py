@@ -52,7 +52,8 @@ class Variation:
             )
 
     def drawn(self, generator: np.random.Generator) -> float:
-        """Draw a scale for all of the parameters.
+        """Draw the factor by which all ``parameters`` are multiplied, uniformly within ``factor``
+        or its logarithms.
 
         Parameters
         ----------

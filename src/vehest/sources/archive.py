@@ -24,7 +24,8 @@ from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9  # bytes to which no archive may unpack, unless a caller allows more
-ALLOWED_BYTES = 64 * 2**20  # bytes to which any archive may unpack
+# bytes to which an archive may unpack however well it is packed: no protection is needed below
+ALLOWED_BYTES = 64 * 2**20
 # largest ratio of unpacked to packed size of an archive that unpacks to more than `ALLOWED_BYTES`
 MOST_EXPANSION = 250
 MOST_FILES = 10_000  # entries of an archive; one with more is refused

@@ -28,7 +28,8 @@ from vehest.studies.kit.recommendation import Recommendation, plain_text, recomm
 from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"  # data that pipelines of this study name (`vehest.studies.registry`)
-SHOWS_FAILED = True  # the report leaves out what failed, and says so (`registry`)
+# whether the report is written where some trainings failed: it names them and shows the others
+SHOWS_FAILED = True
 HARD_DRIVING_AY = 4.0  # m/s², above which the tyres leave their linear range
 PLAIN_ESTIMATORS = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 

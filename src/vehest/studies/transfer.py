@@ -150,7 +150,9 @@ def _values(
 
 
 def _beats_both(board: pd.DataFrame) -> pd.Series:
-    """Mask of the rows of a board that are significantly better than zero and the static map."""
+    """Mask of the rows of a leaderboard that are significantly better than both baselines, zero
+    lateral velocity and the map of speed and yaw rate.
+    """
     return (board["beats_zero"] == "yes") & (board["beats_static_map"] == "yes")
 
 

@@ -30,7 +30,7 @@ CLOCK_JUMPED = 34  # time stamps jump
 CLOCK_UNEVEN = 35  # time stamps are unevenly spaced
 """Kinds of reasons that follow from time stamps (`vehest.trust.health.REASONS`)."""
 
-REPEATED = -1  # the sample repeats the last one and is skipped
+REPEATED = -1  # the time stamp is the last sample's again, and the sample is skipped
 STOPPED = -2  # the clock has stopped, and the sample counts as missing
 """Results of `SampleClock.missing_before` for a sample that is not new."""
 

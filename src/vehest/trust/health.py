@@ -406,8 +406,9 @@ class HealthModel:
 
 
 def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Reduce the limits of files of earlier versions, of 23 C + 4 R or 17 C + 3 R statistics for C
-    channels and R relations, to the present 7 C + R; limits of another number stay as they are.
+    """Limits of the statistics of health that this version uses, 7 C + R for C channels and R
+    relations between them, picked out of those of a file of an earlier version, which has 23 C +
+    4 R or 17 C + 3 R; limits of another number stay as they are.
     """
     forms = {
         23 * channels + 4 * relations: 7 * channels,

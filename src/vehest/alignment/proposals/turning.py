@@ -33,8 +33,8 @@ RARITY = 0.25  # penalty of a rare unit on its mismatch
 CLOSE_MISMATCH = 0.3  # largest |logarithm| of a gain that units explain
 FAR_MISMATCH = 0.6  # smallest |logarithm| of a gain that units do not explain
 MAX_EVIDENT_MISMATCH = 0.1  # largest |logarithm| of a gain that alone indicates an acceleration
-# smallest difference of the cost (|logarithm of a gain| and penalties) of the next best units with
-# which they are not asked for
+# smallest cost by which the second best units are worse than the best, so that these are proposed
+# without a question; the cost of units is |natural logarithm of the gain| and penalties
 MIN_COST_MARGIN = 0.2
 # channel -> range of its 99th percentile, SI units; a size outside is implausible
 RANGES = {

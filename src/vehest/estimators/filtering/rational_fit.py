@@ -241,7 +241,8 @@ def mean_squared_error(
 
 
 def drives_of(recordings: Sequence[Recording], channels: Sequence[str]) -> list[Drive]:
-    """Samples of channels and reference sideslip of recordings, for the search of levels.
+    """Samples of channels, (T, C), and reference sideslip [rad], (T,), of each recording, by which
+    the filter's noise levels are searched.
 
     Raises
     ------

@@ -208,7 +208,7 @@ def loop(flat, constants, series, starts, targets, batch, values, gradient, loss
 
 @part(_nrt=False)
 def _forward(car, room, k, v, u):
-    """Compute v and û [m/s] after step k in all lanes.
+    """Compute lateral velocity v and longitudinal velocity û [m/s] after step k in all lanes.
 
     Leaves ``saved`` rows and neurons' ``outputs`` for `_backward`.
 

@@ -294,7 +294,8 @@ def _backward(
 
 @compiled
 def _activate(values, bias, seed, layer, dropped_parts):
-    """relu(values + bias), masked and scaled, in place.
+    """Write relu(values + bias) with dropout into ``values``, (B, O): each value is dropped with
+    a probability of ``dropped_parts``/256, and the others are scaled by the inverse of the rest.
 
     Eight bytes of every random word decide of eight values (SplitMix64).
     """
@@ -339,7 +340,7 @@ def _gate(values, bars, dropped_parts, bias_bar):
 
 @compiled
 def _summed(bars, total):
-    """Write the sum over samples, (B, O) -> (O,)."""
+    """Write the sum over samples of the gradients ``bars``, (B, O) -> (O,)."""
     total[:] = total.dtype.type(0.0)
     for row in range(bars.shape[0]):
         for column in range(bars.shape[1]):

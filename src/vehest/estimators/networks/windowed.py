@@ -115,7 +115,9 @@ class WindowedEstimator(Network):
             )
 
     def seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
-        """A network to train, with initial weights from the member's seed."""
+        """The network of the drives ``train`` before its training, with initial weights drawn by
+        the seed of this estimator, a member of a group that is trained together.
+        """
         from torch import Generator
 
         from vehest.training.members import random_numbers

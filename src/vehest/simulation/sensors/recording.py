@@ -65,8 +65,9 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
 
 
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
-    """Sensors that measured a motion, for provenance; without those of a motor, and a vibration,
-    that are not there.
+    """Errors of the sensors that measured a motion, for provenance.
+
+    Sensors of the motor are left out where the car has none, and the vibration where there is none.
 
     Parameters
     ----------

@@ -91,7 +91,7 @@ ENCODINGS = {
     "cp949": (rb"[\xa1-\xfe]{4}", "[가-힣]", 0.95),  # EUC-KR
     "gb18030": (rb"[\xa1-\xfe]{4}", "[一-鿿]", 0.5),
 }
-# control characters that texts do not have
+# control characters that texts do not have; many of them say that a file is no table of text
 CONTROLS = bytes([*range(0x09), 0x0B, *range(0x0E, 0x20)])
 MOST_CONTROLS = 0.01  # largest share of these in the first bytes of a text
 # matches a number with a decimal point
