@@ -122,8 +122,31 @@ def test_fine_held_missing_and_constant_speeds_are_not_coarse(samples):
     assert not found_by("coarse", changed(drive, vx=samples, gappy=["vx"]))
 
 
-def test_a_fast_recording_of_a_coarse_speed_is_low_passed_anyway():
-    assert not found_by("coarse", changed(broadband_drive(), vx=rounded_to(1.0 / 3.6)))
+@pytest.mark.parametrize(
+    ("channel", "step", "cutoff_hz"),
+    [("vx", 1.0, 0.5), ("vx", 1.0 / 3.6, 1.8), ("yaw_rate", np.deg2rad(2.0), 3.0)],
+)
+def test_a_fast_recording_is_coarse_too_and_coarser_speeds_need_lower_cut_offs(
+    channel, step, cutoff_hz
+):
+    drive = broadband_drive()
+    coarse = changed(drive, **{channel: rounded_to(step)})
+    findings = found_by("coarse", coarse)
+    assert set(findings) == {channel}
+    (remedy,) = re.findall(r"transform (\{.*\}) removes", findings[channel].message)
+    low_pass = yaml.safe_load(remedy)
+    assert low_pass["cutoff_hz"] == cutoff_hz
+    smooth = transform_from_config(low_pass)(coarse)
+    inside = slice(500, -500)
+    slope, exact = (np.gradient(drive_[channel])[inside] for drive_ in (smooth, drive))
+    steps = np.gradient(coarse[channel])[inside]
+    assert np.std(slope - exact) < 0.3 * np.std(steps - exact)
+    assert not found_by("coarse", smooth)
+
+
+@pytest.mark.parametrize("step", [0.004, 0.01])
+def test_fine_steps_of_a_fast_recording_are_averaged_out_by_the_rate_of_a_model(step):
+    assert not found_by("coarse", changed(broadband_drive(noise=0.0), vx=rounded_to(step)))
 
 
 def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):

@@ -125,7 +125,8 @@ def test_a_speed_in_whole_kmh_is_estimated_from(log, rows_held):
     lap.drop(columns="SlipAngle").to_csv("lap.csv", index=False)
     _, err = log.new("lap.csv", "--yes", "--wheelbase", "2.4")
     transforms = segment_of_test(0)["transforms"]
-    assert {"name": "low_pass", "cutoff_hz": 3.0, "channels": ["vx"]} in transforms
+    cutoff_hz = 1.8 if rows_held == 1 else 3.0  # lines between the samples have smaller steps
+    assert {"name": "low_pass", "cutoff_hz": cutoff_hz, "channels": ["vx"]} in transforms
     assert segment_of_test(0).get("held") == (None if rows_held == 1 else {"channels": ["vx"]})
     code, out, err = log("estimate", "lap.csv", "dataset=my_car", "--json")
     assert code == 0, err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -28,10 +29,12 @@ MAX_ADJACENT_SHARE = 0.1
 MAX_SINGLE_STEP_SHARE = 0.5
 # channels that may be coarse; health expects these to change all the time
 COARSE_CHANNELS = ("vx", "yaw_rate", "ay", "ax")
-# Hz, highest rate of a recording in which coarse channels matter; a faster one is low-passed where
-# it is brought to the rate of a model
+# Hz, highest rate of a recording of which every sample counts; of a faster one every n-th sample
+# does, as a model of a lower rate sees it
 MAX_COARSE_RATE_HZ = 30.0
 MAX_LEVELS = 5000.0  # largest number of steps in the range of a coarse channel
+# the same of a faster recording, whose fine steps a model's rate averages out
+MAX_LEVELS_OF_FAST = 500.0
 # smallest share of the changes of a coarse channel that are whole numbers of its step
 MIN_WHOLE_STEP_SHARE = 0.99
 STEP_TOLERANCE = 0.02  # largest distance of such a change from whole numbers of the step, in steps
@@ -39,8 +42,11 @@ REPEAT_SECONDS = 0.5  # s around a sample in which repeated samples are counted
 MIN_REPEAT_SHARE = 0.3  # share of repeated samples from which on health calls them held
 # smallest share of the moving time in which a coarse channel repeats samples so
 MIN_COARSE_SHARE = 0.05
-COARSE_CUTOFF_HZ = 3.0  # Hz, cut-off of the low-pass that removes the steps of a coarse channel
+# Hz, highest cut-off of the low-pass that removes the steps of a coarse channel
+COARSE_CUTOFF_HZ = 3.0
 MAX_CUTOFF_SHARE = 0.4  # largest ratio of this cut-off to the sampling rate
+# m/s²; speeds change at about twice this, so that coarser steps need lower cut-offs
+SPEED_CHANGE = 0.5
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
@@ -208,8 +214,9 @@ def coarse_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
             name,
             f"in steps of {step:.3g} {CHANNELS[name].unit}, between which samples repeat: a model "
             "that was calibrated on finer ones takes this for a fault; the transform "
-            f"{{name: low_pass, cutoff_hz: {coarse_cutoff_hz(recording.rate_hz):g}, "
-            f"channels: [{name}]}} removes the steps; it uses samples of up to half a second later",
+            f"{{name: low_pass, cutoff_hz: {coarse_cutoff_hz(recording.rate_hz, name, step):g},"
+            f" channels: [{name}]}} removes the steps; it uses samples of some periods of the "
+            "cut-off later",
         )
         for name, step in coarse_steps(recording, moving).items()
     ]
@@ -222,12 +229,15 @@ def coarse_steps(recording: Recording, moving: BoolArray) -> dict[str, float]:
     those where the car is ``moving``, (T,), count.
     """
     steps = {}
-    n_samples = max(round(REPEAT_SECONDS * recording.rate_hz), 1)
     names = [name for name in COARSE_CHANNELS if name in recording]
-    for name in names if recording.rate_hz <= MAX_COARSE_RATE_HZ else ():
-        samples = recording[name][moving]
+    stride = math.ceil(recording.rate_hz / MAX_COARSE_RATE_HZ)
+    n_samples = max(round(REPEAT_SECONDS * recording.rate_hz / stride), 1)
+    for name in names:
+        at_full_rate = recording[name][moving]
+        samples = at_full_rate[::stride]
         changes = np.abs(np.diff(samples))
-        is_change = changes > np.ptp(samples) / MAX_LEVELS if len(samples) else changes > 0.0
+        width = np.ptp(samples) if len(samples) else 0.0
+        is_change = changes > width / MAX_LEVELS
         if np.isnan(recording[name]).any() or np.count_nonzero(is_change) < MIN_CHANGES:
             continue
         step = float(changes[is_change].min())
@@ -235,17 +245,19 @@ def coarse_steps(recording: Recording, moving: BoolArray) -> dict[str, float]:
         is_whole = np.abs(in_steps - np.rint(in_steps)) < STEP_TOLERANCE
         repeated = np.convolve(changes == 0.0, np.ones(n_samples) / n_samples, mode="same")
         if (
-            is_whole.mean() >= MIN_WHOLE_STEP_SHARE
+            step > width / (MAX_LEVELS if stride == 1 else MAX_LEVELS_OF_FAST)
+            and is_whole.mean() >= MIN_WHOLE_STEP_SHARE
             and np.mean(repeated >= MIN_REPEAT_SHARE) >= MIN_COARSE_SHARE
-            and update_rate_hz(samples, recording.rate_hz) is None
+            and update_rate_hz(at_full_rate, recording.rate_hz) is None
         ):
             steps[name] = step
     return steps
 
 
-def coarse_cutoff_hz(rate_hz: float) -> float:
-    """Cut-off of the low-pass that removes the steps of a coarse channel [Hz]."""
-    return float(f"{min(COARSE_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz):.2g}")
+def coarse_cutoff_hz(rate_hz: float, name: str, step: float) -> float:
+    """Cut-off of the low-pass that removes the steps (SI) of a coarse channel [Hz]."""
+    slow = SPEED_CHANGE / step if name == "vx" else math.inf
+    return float(f"{min(COARSE_CUTOFF_HZ, MAX_CUTOFF_SHARE * rate_hz, slow):.2g}")
 
 
 def update_rate_hz(samples: FloatArray, rate_hz: float) -> float | None:

@@ -70,6 +70,7 @@ REMARKS = (
     "dropout",
     "stuck",
     "held",
+    "bandwidth",
     "coarse",
     "reverse",
     "offset",
@@ -167,13 +168,20 @@ def draft(examined: Examined) -> Draft:
         )
     steps = _coarse(recordings)
     if steps:
-        cutoff = coarse_cutoff_hz(min(recording.rate_hz for recording in recordings))
-        speed.append({"name": "low_pass", "cutoff_hz": cutoff, "channels": list(steps)})
+        rate_hz = min(recording.rate_hz for recording in recordings)
+        by_cutoff: dict[float, list[str]] = {}
+        for name, step in steps.items():
+            by_cutoff.setdefault(coarse_cutoff_hz(rate_hz, name, step), []).append(name)
+        speed += [
+            {"name": "low_pass", "cutoff_hz": cutoff, "channels": names}
+            for cutoff, names in by_cutoff.items()
+        ]
         recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
         sizes = [f"{name} {step:.3g} {CHANNELS[name].unit}" for name, step in steps.items()]
         notes.append(
             f"coarse steps ({', '.join(sizes)}) are removed by the transform low_pass at "
-            f"{cutoff:g} Hz, which uses samples of up to half a second later"
+            f"{' and '.join(f'{cutoff:g}' for cutoff in by_cutoff)} Hz, which uses samples of some "
+            "periods of the cut-off later"
         )
     longest = _longest(recordings)
     late = late_channels(longest)
