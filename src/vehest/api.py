@@ -32,9 +32,13 @@ from vehest.estimators.base import FitData
 from vehest.estimators.model_files import model_digest
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.estimators.registry import new_estimator
-from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.evaluation import metrics
-from vehest.inference.car_values import ASSUMED, adapted, with_car_values
+from vehest.inference.car_values import (
+    ASSUMED,
+    adapted,
+    settings_for_channels,
+    with_car_values,
+)
 from vehest.inference.estimation import (
     estimate_recording,
     prepared_recording,
@@ -240,7 +244,7 @@ def score(
         return metrics.accuracy([metrics.score_whole(estimate, drives[0])])
     parts = []
     for drive in drives:
-        of_car, _ = _for_car(estimate, drive.car, _settings_for(estimate, drive))
+        of_car, _ = _for_car(estimate, drive.car, settings_for_channels(estimate, drive))
         needed = prepared_recording(of_car, drive.without_references())
         made = require_estimate(of_car, drive, of_car.estimate([needed])[0])
         parts.append(metrics.score_whole(made, drive, estimate.preparation))
@@ -346,10 +350,10 @@ def estimate(
     Returns
     -------
     Estimate
-        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not
-        full yet. ``health`` (0 valid, 1 degraded, 2 invalid) and ``health_reason``
-        (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``, where
-        the model was calibrated.
+        Its channels ``vy`` [m/s] and ``sideslip`` [rad], as ``estimate["sideslip"]``, each of shape
+        (T,); NaN where the model's window is not full yet. ``health`` (0 valid, 1 degraded,
+        2 invalid) and ``health_reason`` (`reason_in_words`); half widths of the 90 % band,
+        ``band_vy`` and ``band_sideslip``, where the model was calibrated.
 
     Raises
     ------
@@ -370,20 +374,13 @@ def estimate(
         model = load_model()
     elif not isinstance(model, Estimator):
         model = load_model(model)
-    of_car, trust = _for_car(model, recording.car, _settings_for(model, recording))
+    of_car, trust = _for_car(model, recording.car, settings_for_channels(model, recording))
     return Estimate(**_fields_of(estimate_recording(of_car, recording, trust, same_vehicle)))
 
 
 def _fields_of(series: PlainRecording | PlainEstimate) -> dict[str, Any]:
     """Name -> value of each field of a recording or an estimate."""
     return {field.name: getattr(series, field.name) for field in fields(series)}
-
-
-def _settings_for(model: Estimator, recording: PlainRecording) -> dict[str, Any]:
-    """Settings with which a model does without a channel that a recording lacks."""
-    if isinstance(model, SelfCalibrating) and "ax" not in recording:
-        return {"measured_ax": False}
-    return {}
 
 
 def _for_car(

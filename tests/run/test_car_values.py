@@ -15,11 +15,13 @@ import yaml
 import vehest
 from conftest import planar_drive
 from vehest.data.car import CarValues
+from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_estimate
 from vehest.estimators.model_files import load_model
 from vehest.inference.car_values import CarRecord, Number, adapted, with_car_values
 from vehest.inference.models import pretrained_folder
+from vehest.run.estimate_summary import describe_use
 from vehest.sources.base import car_of
 from vehest.trust.record import describe_band, is_other_vehicle, read_trust
 
@@ -374,3 +376,32 @@ def test_places_that_no_car_of_this_wheelbase_has_are_refused(values, message):
     with pytest.raises(ValueError, match=message.replace("(", r"\(").replace(")", r"\)")):
         CarValues(wheelbase=2.6, **values)
     CarValues(**values)
+
+
+def test_the_filter_does_not_use_an_ax_that_was_made_of_the_speed(place):
+    write_lap()
+    lap = pd.read_csv("lap.csv")
+    lap.drop(columns="ax").to_csv("lap.csv", index=False)
+    channels = {
+        name: {"column": name, "unit": CHANNELS[name].unit}
+        for name in lap.columns
+        if name not in ("time", "ax")
+    }
+    write_dataset("without", path=".", channels=channels)
+    write_dataset(
+        "derived", path=".", channels=channels, transforms=[{"name": "acceleration_from_speed"}]
+    )
+    estimates = []
+    for name in ("without", "derived"):
+        options = ("lap.csv", f"dataset={name}", "estimator.wheelbase=2.5")
+        code, out, err = place("estimate", *options, "-o", f"{name}.parquet", "--json")
+        assert code == 0, err
+        assert "no longitudinal acceleration ax is measured" in err
+        assert "faults and samples outside" in describe_use(json.loads(out))
+        estimates.append(pd.read_parquet(f"{name}.parquet")["vy"].to_numpy())
+        record = f"{name}.yaml"
+        assert place("identify", *options, "-o", record)[0] == 0
+    assert np.array_equal(*estimates)
+    assert Path("without.yaml").read_text() == Path("derived.yaml").read_text()
+    recording = vehest.read_recording("lap.csv", ["dataset=derived"])
+    assert np.array_equal(vehest.estimate(recording, wheelbase=2.5)["vy"], estimates[0])

@@ -7,7 +7,7 @@ channels are missing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -38,14 +38,13 @@ from vehest.alignment.signs import (
 from vehest.alignment.standstill import BoolArray, standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
-from vehest.data.derived import STANDSTILL_SPEED
+from vehest.data.derived import STANDSTILL_SPEED, has_measured_ax
 from vehest.data.errors import DataError, number_of
-from vehest.data.recording import DERIVED, MISSING, PART, Recording, part_slices
+from vehest.data.recording import MISSING, PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
 
-AX_OF_SPEED = "acceleration_from_speed"  # name of the transform that derives ax from the speed
 MAX_WRONG_UNITS = 3  # units that are corrected one after another; further ones are not reported
 STUCK_SECONDS = 1.0  # s of driving with one value, from which on a channel counts as stuck
 MIN_STUCK_SAMPLES = 3  # equal samples in a row; shorter runs do not count as stuck
@@ -254,9 +253,7 @@ def _without_ax_of_speed(recording: Recording) -> Recording:
     """The recording without an ax that a transform made from its speed: that one is late by the
     transform's filter, as it has to be on a car, and says nothing of the log.
     """
-    derived = recording.provenance.get(DERIVED)
-    transforms = derived.get("transforms", ()) if isinstance(derived, Mapping) else ()
-    if not any(entry.get("name") == AX_OF_SPEED for entry in transforms):
+    if has_measured_ax(recording):
         return recording
     return recording.select([name for name in recording.channels if name != "ax"])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
@@ -14,12 +15,13 @@ from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import DERIVED, Recording
 
 WHEELS = ("fl", "fr", "rl", "rr")  # suffixes of the channels of the four wheels
 # m/s, speed below which a sideslip angle of 90 degrees or more has no meaning and gives ``vy_ref``
 # 0
 STANDSTILL_SPEED = 0.1
+AX_OF_SPEED = "acceleration_from_speed"  # name of the transform that derives ax from the speed
 
 
 def _checked_channel(name: str) -> str:
@@ -30,6 +32,17 @@ def _checked_channel(name: str) -> str:
 
 
 ChannelName = Annotated[str, AfterValidator(_checked_channel)]  # name of a channel of the table
+
+
+def has_measured_ax(recording: Recording) -> bool:
+    """Whether a recording has an ax that no transform of its data set made from the speed.
+
+    d(vx)/dt lacks the term -vy·yaw_rate of a measured acceleration: to a filter that compares both
+    it says that the car does not slip.
+    """
+    derived = recording.provenance.get(DERIVED)
+    transforms = derived.get("transforms", ()) if isinstance(derived, Mapping) else ()
+    return "ax" in recording and all(entry.get("name") != AX_OF_SPEED for entry in transforms)
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:

@@ -17,7 +17,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from vehest.data.car import CarValues
+from vehest.data.derived import has_measured_ax
 from vehest.data.errors import ConfigurationError, DataError, unknown_option
+from vehest.data.recording import Recording
 from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.text_files import read_yaml
 from vehest.estimators.base import Estimator
@@ -134,6 +136,15 @@ def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     new.load_weights(model.weights())
     new.preparation = model.preparation
     return new
+
+
+def settings_for_channels(model: Estimator, recording: Recording) -> dict[str, bool]:
+    """Setting -> value with which the self-calibrating filter does without an ax that is missing or
+    made of the speed; empty for other models.
+    """
+    if isinstance(model, SelfCalibrating) and not has_measured_ax(recording):
+        return {"measured_ax": False}
+    return {}
 
 
 def adapted(

@@ -28,7 +28,12 @@ from vehest.data.resampling import resampled_parts
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.evaluation.metrics import min_sideslip_speed, moves_forward
-from vehest.inference.car_values import adapted, read_car, stated_wheelbase
+from vehest.inference.car_values import (
+    adapted,
+    read_car,
+    settings_for_channels,
+    stated_wheelbase,
+)
 from vehest.inference.estimation import estimate_parts, too_short_error
 from vehest.inference.models import (
     SELF_CALIBRATING,
@@ -108,9 +113,14 @@ def estimate_file(
         )
         first, first_findings = next(parts)
         remarks: list[str] = []
-        if name == SELF_CALIBRATING and "ax" not in first and "measured_ax" not in settings:
-            settings["measured_ax"] = False
-            remarks.append("there is no channel ax: estimator.measured_ax=false")
+        if name == SELF_CALIBRATING and "measured_ax" not in settings:
+            settings |= settings_for_channels(model, first)
+            if "measured_ax" in settings:
+                remarks.append(
+                    "no longitudinal acceleration ax is measured: estimator.measured_ax=false; "
+                    "with a measured ax large sideslip has about half the error, and samples have "
+                    "a health"
+                )
         record = None if car is None else read_car(car)
         model, trust, of_car = adapted(model, trust, first.car, settings, record)
         remarks += of_car
@@ -349,6 +359,7 @@ class _Report:
         self.min_sideslip_speed = min_sideslip_speed
         self.strict = strict
         self.health = trust.health if trust is not None else None
+        self.has_calibrated_bands = trust is not None and trust.bands is not None
         self.findings: list[list[Finding]] = []
         self.outside: Any = 0
         self.seconds = 0.0
@@ -474,7 +485,9 @@ class _Report:
     def verdict(self) -> str:
         """One line on the share of valid samples and on what makes others invalid."""
         if self.health is None:
-            bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
+            bands = "no band" if "band_vy" not in self.last.channels else "its bands are its own"
+            if self.has_calibrated_bands:
+                return "health is not calibrated for these channels: from gaps and speeds alone"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
         reasons = self.invalid_reasons
         valid = f"valid in {self.valid_percent:.3g} % of the drive" + (

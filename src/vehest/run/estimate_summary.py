@@ -19,6 +19,7 @@ from vehest.trust.health import HOLD_SECONDS
 from vehest.trust.health_kernel import CLEAR
 
 LABEL_WIDTH = 10  # characters before the text of a line
+NO_CALIBRATION = "the model has no calibration"  # text of a model without bands and health
 
 
 def point_of_estimate(model: Estimator, model_folder: Path) -> str:
@@ -107,7 +108,9 @@ def _valid(outcome: Mapping[str, Any]) -> str:
     """
     share = f"{outcome['valid_percent']:.3g} % of the estimated samples"
     if not outcome["has_calibration"]:
-        return f"{share}, by gaps and speeds alone: the model has no calibration"
+        has_band = bool(outcome.get("band"))
+        cause = "health is not calibrated for these channels" if has_band else NO_CALIBRATION
+        return f"{share}, by gaps and speeds alone: {cause}"
     return share
 
 
@@ -120,9 +123,9 @@ def describe_use(outcome: Mapping[str, Any]) -> str:
         ``only the samples with health 0 (97 %); …``: which samples, how large their errors are, and
         why others are left out.
     """
-    if not outcome["has_calibration"]:
+    if not outcome["has_calibration"] and not outcome.get("band"):
         return (
-            "not before a comparison with a reference: the model has no calibration, so that "
+            f"not before a comparison with a reference: {NO_CALIBRATION}, so that "
             "neither its error nor its range is known"
         )
     condition = "once the warnings above are settled, " if outcome["findings"] else ""
@@ -142,7 +145,12 @@ def describe_use(outcome: Mapping[str, Any]) -> str:
         if band
         else "no band says how large their errors are"
     )
-    return f"{condition}{where}; {error}{limits and f'; the others: {limits}'}"
+    unmarked = (
+        ""
+        if outcome["has_calibration"]
+        else "; faults and samples outside the range of the training are not marked"
+    )
+    return f"{condition}{where}; {error}{limits and f'; the others: {limits}'}{unmarked}"
 
 
 def _grouped(reasons: Sequence[str]) -> list[str]:

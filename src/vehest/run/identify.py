@@ -31,6 +31,7 @@ from vehest.inference.car_values import (
     Number,
     adapted,
     read_car,
+    settings_for_channels,
     with_settings,
 )
 from vehest.inference.estimation import prepared_recording
@@ -112,7 +113,9 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
         for finding in findings_of(drive, model, options.dataset.get("accept") or ()):
             complain(f"warning: {drive.id}: {describe_finding(finding)}")
-        drives[drive.id] = posterior_of(model, drive)
+        drives[drive.id] = posterior_of(
+            with_settings(model, settings_for_channels(model, drive)), drive
+        )
     record = record_of(model, drives)
     for remark in remarks:
         note(remark)

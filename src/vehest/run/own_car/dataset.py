@@ -29,7 +29,7 @@ from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
-from vehest.data.derived import speed_of_reference
+from vehest.data.derived import AX_OF_SPEED, speed_of_reference
 from vehest.data.errors import ConfigurationError, DataError, VehestError, counted
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
@@ -120,6 +120,12 @@ class Draft:
     def channels(self) -> frozenset[str]:
         """Channels that all recordings have."""
         return common_channels(self.contents)
+
+    @property
+    def has_measured_ax(self) -> bool:
+        """Whether all recordings have an ax that is not made of the speed."""
+        transforms = self.dataset.get("transforms") or ()
+        return "ax" in self.channels and all(entry["name"] != AX_OF_SPEED for entry in transforms)
 
 
 def draft(examined: Examined) -> Draft:

@@ -30,6 +30,7 @@ from vehest.estimators.registry import (
     estimator_classes,
     estimator_names,
 )
+from vehest.inference.models import SELF_CALIBRATING
 from vehest.run.own_car.dataset import Draft, draft, is_certain
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
@@ -426,6 +427,8 @@ def _plan_of(drafted: Draft, added: Sequence[str]) -> Plan:
             for word in overrides.replace("{car}", car).format(**values).split()
             if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)
         ]
+        if SELF_CALIBRATING in names and not drafted.has_measured_ax:
+            words.append("estimator.measured_ax=false")
         options = ", ".join(f"--{name}" for name in unknown)
         of_car = f"requires the car's {' and '.join(unknown)} ({options})" if unknown else ""
         by_settings: dict[tuple[str, ...], list[str]] = {}
