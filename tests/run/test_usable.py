@@ -236,7 +236,7 @@ def test_supplying_all_missing_channels_makes_estimators_usable(channels):
         unsupplied = {
             *before[name]["missing_to_estimate"],
             *before[name]["missing_to_train"],
-        } - set(before[name]["supplies"])
+        } - {*before[name]["supplies"], *estimator_class(name).measured_only}
         assert {*after[name]["missing_to_estimate"], *after[name]["missing_to_train"]} == unsupplied
 
 
@@ -354,6 +354,12 @@ def test_table_names_all_estimators_and_json_says_the_same(place):
         "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: "
         "acceleration_from_speed}]" in words
     )
+
+
+def test_the_self_calibrating_filter_is_offered_without_ax_not_with_one_of_the_speed():
+    row = rows(log(FULL - {"ax"}))["self_calibrating"]
+    assert (row["usable"], row["supplies"]) == ("with settings", {})
+    assert row["settings"] == ["estimator.measured_ax=false"]
 
 
 def test_bare_files_are_assessed_by_their_columns(place):

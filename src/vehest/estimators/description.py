@@ -70,6 +70,8 @@ class Description(ABC):
     settings_type: ClassVar[Any] = EstimatorSettings
     # channels of ``channels`` that may have gaps, because the method does without a sample
     skippable: ClassVar[tuple[str, ...]] = ()
+    # channels that it must not get from a transform that derives them from others
+    measured_only: ClassVar[tuple[str, ...]] = ()
     # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
     refuses: ClassVar[tuple[str, ...]] = ()
     # sampling intervals after a sample for which the estimate made with it holds

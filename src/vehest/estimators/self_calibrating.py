@@ -68,6 +68,7 @@ class SelfCalibrating(SelfCalibratingSettings):
         ),
     )
     version = "7"
+    measured_only = ("ax",)  # d(vx)/dt would say that the car does not slip
     covariance_of = ("vy",)
     # ax may be absent
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]

@@ -387,7 +387,7 @@ def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSumma
     them.
     """
     missing = [name for summary in recordings for name in channels if name not in summary.channels]
-    return _with_supplies(missing, missing, recordings)
+    return _with_supplies(missing, missing, (), recordings)
 
 
 def _recordings(
@@ -430,7 +430,7 @@ def _missing(
         for summary in to_train
         for name in lacking_to_train(estimator, training, summary.channels)
     ]
-    return _with_supplies(read, learnt, [*to_train, *to_estimate])
+    return _with_supplies(read, learnt, estimator.measured_only, [*to_train, *to_estimate])
 
 
 def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
@@ -444,15 +444,21 @@ def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[s
 
 
 def _with_supplies(
-    read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]
+    read: Sequence[str],
+    learnt: Sequence[str],
+    measured_only: Collection[str],
+    recordings: Sequence[RecordingSummary],
 ) -> Missing:
     """Missing channels, each once, with transforms that derive them from the channels that all
-    recordings have.
+    recordings have; None for those that have to be measured.
     """
     common = common_channels(recordings)
     gappy = frozenset(name for summary in recordings for name in summary.gappy)
     rate = min((summary.rate_hz for summary in recordings), default=0.0)
-    supplies = {name: derivation_of(name, common, gappy, rate) for name in (*read, *learnt)}
+    supplies = {
+        name: None if name in measured_only else derivation_of(name, common, gappy, rate)
+        for name in (*read, *learnt)
+    }
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
 
 
