@@ -136,11 +136,19 @@ def test_a_speed_in_whole_kmh_is_estimated_from(log, rows_held):
     assert np.sqrt(np.mean(error[30:] ** 2)) < (0.35 if rows_held < 10 else 0.41)  # of 0.32
 
 
-def test_without_ax_the_filter_makes_none_of_the_speed(log):
-    """An ax of d(vx)/dt says that the car does not slip: RMSE(β) was 0.87°, coverage 0.83."""
+@pytest.mark.parametrize("is_computed", [False, True])
+def test_without_a_measured_ax_the_filter_uses_none_of_the_speed(log, is_computed):
+    """An ax of d(vx)/dt says that the car does not slip: RMSE(β) was 0.87°, coverage 0.83; with one
+    that the logger computed 0.90° and 0.79.
+    """
     lap = pd.read_csv(LAP)
-    lap.drop(columns="AccX").to_csv("lap.csv", index=False)
-    log.new("lap.csv", "--yes", "--wheelbase", "2.4")
+    if is_computed:
+        lap["AccX"] = (20.0 * np.gradient(lap["Speed"] / 3.6)).round(2)
+    else:
+        lap = lap.drop(columns="AccX")
+    lap.to_csv("lap.csv", index=False)
+    remarks = "".join(log.new("lap.csv", "--yes", "--wheelbase", "2.4"))
+    assert ("'AccX' (ax) is left out: it is d(vx)/dt" in remarks) == is_computed
     pipeline = Path("pipelines/my_car.yaml").read_text()
     assert "estimator=self_calibrating, estimator.wheelbase=2.4, estimator.measured_ax" in pipeline
     code, _, err = log("estimate", "lap.csv", "dataset=my_car")

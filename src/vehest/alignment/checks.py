@@ -20,6 +20,7 @@ from vehest.alignment.bandwidth import (
     low_passed,
     repetition_findings,
 )
+from vehest.alignment.computed import computed_findings
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import WHEELS, Motion, motion_of
@@ -238,8 +239,10 @@ def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     spectra = spectra_of(motion)
     if spectra is not None:
         slow = low_passed(motion, spectra)
-        clocks = low_pass_findings(motion, spectra, slow) + delay_findings(
-            delays_of(motion, spectra, frozenset(slow))
+        clocks = (
+            low_pass_findings(motion, spectra, slow)
+            + delay_findings(delays_of(motion, spectra, frozenset(slow)))
+            + computed_findings(motion, spectra)
         )
     explained = any(finding.channel in ("ay", "yaw_rate", "vy_ref") for finding in clocks)
     kinematics = [

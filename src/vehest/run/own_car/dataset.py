@@ -21,6 +21,7 @@ from vehest.alignment.bandwidth import (
     held_channels,
 )
 from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.computed import computed_in
 from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.motion import rms
 from vehest.alignment.proposals.proposal import Proposal
@@ -72,6 +73,7 @@ REMARKS = (
     "held",
     "bandwidth",
     "coarse",
+    "computed",
     "reverse",
     "offset",
     "rotation",
@@ -158,6 +160,15 @@ def draft(examined: Examined) -> Draft:
         else []
     )
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
+    if "ax" in proposals.by_channel and "ax" in computed_in(_longest(recordings)):
+        measured = [proposal for proposal in proposals.channels if proposal.channel != "ax"]
+        note = (
+            f"'{proposals.by_channel['ax'].column}' (ax) is left out: it is d(vx)/dt, computed by "
+            "the logger and not measured, and says that the car does not slip"
+        )
+        proposals = proposals.keeping(measured, [note])
+        examined = replace(examined, proposals=proposals)
+        dataset, recordings = _read_strictest(_dataset(examined) | {"transforms": speed})
     bridging = _bridging(examined, recordings)
     notes = [*proposals.notes]
     if bridging:
