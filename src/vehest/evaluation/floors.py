@@ -54,7 +54,9 @@ import numpy as np
 
 from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
+from vehest.data.derived import derivative
 from vehest.data.recording import Recording
+from vehest.data.runs import filled
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import (
     BoolArray,
@@ -63,7 +65,6 @@ from vehest.evaluation.metrics import (
     pieces_of,
     scored_range,
 )
-from vehest.evaluation.regimes import filled
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
@@ -553,7 +554,7 @@ def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
     u = drive.inputs["vx"]
     yaw_rate = drive.inputs["yaw_rate"]
     a = drive.inputs["ay"] if "ay" in inputs else u * yaw_rate
-    change = np.gradient(yaw_rate) * drive.rate_hz if len(u) > 1 else np.zeros_like(u)
+    change = derivative(yaw_rate, drive.rate_hz)
     return np.stack([yaw_rate, u * a, u * change, u * a**3, *([u] if front else [])], 1)
 
 
