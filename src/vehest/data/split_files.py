@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, first_of
 from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
@@ -383,13 +383,9 @@ class _Ranges:
         recordings = self._recordings(dataset)
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
-            available = ", ".join(
-                [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
-            )
             raise ConfigurationError(
                 f"{self._subject}: no recording of data set '{dataset}' matches '{pattern}' (it "
-                "has "
-                f"{available})"
+                f"has {first_of(sorted(recordings), 5)})"
             )
         return names
 
