@@ -69,13 +69,8 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 
-INPUTS = (
-    "vx",
-    "yaw_rate",
-    "ay",
-    "ax",
-    "steer",
-)  # channels that a bound knows what to make of; the first two are needed
+# channels that a bound knows what to make of; the first two are needed
+INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")
 SETS = (
     ("vx", "yaw_rate"),
     ("vx", "yaw_rate", "ay"),
@@ -86,9 +81,8 @@ SETS = (
 )
 """Sets of inputs whose bounds reports compare."""
 
-STIFFNESS_DEVIATION = (
-    math.log(15.0 / 6.0) / 4.0
-)  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+# 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+STIFFNESS_DEVIATION = math.log(15.0 / 6.0) / 4.0
 BLOCK_SECONDS = 1.0  # s over which residuals are averaged to separate slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # s, shortest and longest time constant of slow noise
 MIN_SAMPLES = 20  # samples of all drives together; with fewer there is no floor
@@ -99,11 +93,8 @@ UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which no
 MIN_POSITIVE = 1e-9  # least standard deviation of a noise or squared speed, so that none is 0
 
 _SPEEDS = ("motor_speed", "wheel_speed_")  # prefixes of channels that count as the speed
-_SILENT = (
-    "motor_current",
-    "wheel_torque_",
-    "brake_pressure_",
-)  # thrust and brakes say nothing of v that the speed does not
+# thrust and brakes say nothing of v that the speed does not
+_SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")
 
 
 @dataclass(frozen=True)
