@@ -356,12 +356,10 @@ class _Ranges:
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
-            problem = (
-                f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
-            )
+            found = f"{len(laps)} complete laps were found"
             raise ConfigurationError(
-                f"{self._subject}: recording '{name}' has no '{words.strip()}': {problem}; name "
-                "times instead"
+                f"{self._subject}: recording '{name}' has no '{words.strip()}': "
+                f"{found if laps else 'its course does not repeat'}; name times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
 
